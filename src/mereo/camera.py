@@ -1,0 +1,114 @@
+"""Pinhole cameras, depth images and point clouds.
+
+Notation: the camera frame is OpenCV/ROS optical, x right, y down, z forward. Depth is z, not ray length. The centre of
+pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` are each other's inverse.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole intrinsics in pixels.
+
+    Attributes:
+        width, height: image size in pixels.
+        focal_x_px, focal_y_px: focal lengths.
+        center_x_px, center_y_px: principal point, with pixel centres at +0.5.
+    """
+
+    width: int
+    height: int
+    focal_x_px: float
+    focal_y_px: float
+    center_x_px: float
+    center_y_px: float
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"image size is {self.width} x {self.height}; both must be positive: check the intrinsics")
+        if not (0 < self.focal_x_px < np.inf and 0 < self.focal_y_px < np.inf):
+            raise ValueError(
+                f"focal length is {self.focal_x_px} x {self.focal_y_px} pixels; both must be positive: "
+                "check the intrinsics file"
+            )
+        if not (np.isfinite(self.center_x_px) and np.isfinite(self.center_y_px)):
+            raise ValueError("the principal point is not finite; check the intrinsics file")
+
+    @classmethod
+    def from_fov(cls, width: int, height: int, fov_rad: float) -> "Camera":
+        """Square pixels, principal point in the middle, ``fov_rad`` the full horizontal angle of view."""
+        focal_px = 0.5 * width / float(np.tan(0.5 * fov_rad))
+        return cls(width, height, focal_px, focal_px, 0.5 * width, 0.5 * height)
+
+    def directions(self) -> Float[np.ndarray, "h w 3"]:
+        """Ray through each pixel centre, scaled to z = 1, so that depth times direction is the point."""
+        x = (np.arange(self.width) + 0.5 - self.center_x_px) / self.focal_x_px
+        y = (np.arange(self.height) + 0.5 - self.center_y_px) / self.focal_y_px
+        grid_y, grid_x = np.meshgrid(y, x, indexing="ij")
+        return np.stack([grid_x, grid_y, np.ones_like(grid_x)], axis=-1)
+
+    def project(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Pixel coordinates (u, v) of points in the camera frame, z > 0."""
+        u = self.focal_x_px * points[:, 0] / points[:, 2] + self.center_x_px
+        v = self.focal_y_px * points[:, 1] / points[:, 2] + self.center_y_px
+        return np.stack([u, v], axis=-1)
+
+    def unproject(
+        self, pixels: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n 3"]:
+        """Points in the camera frame from pixel coordinates and depth (z)."""
+        x = (pixels[:, 0] - self.center_x_px) / self.focal_x_px * depth
+        y = (pixels[:, 1] - self.center_y_px) / self.focal_y_px * depth
+        return np.stack([x, y, depth], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Observed surface points in the camera frame, in the sensor's units. Order carries no meaning."""
+
+    points: Float[np.ndarray, "n 3"]
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.points).all():
+            bad = int((~np.isfinite(self.points).all(axis=1)).sum())
+            raise ValueError(f"{bad} of {len(self.points)} points are NaN or infinite; drop them before reconstructing")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """Depth along z for each pixel; 0 means no measurement.
+
+    Attributes:
+        depth: in the sensor's units, finite and not negative.
+        camera: the intrinsics it was taken with.
+    """
+
+    depth: Float[np.ndarray, "h w"]
+    camera: Camera
+
+    def __post_init__(self) -> None:
+        expected = (self.camera.height, self.camera.width)
+        if self.depth.shape != expected:
+            raise ValueError(
+                f"the depth image is {self.depth.shape[1]} x {self.depth.shape[0]} pixels but the intrinsics say "
+                f"{expected[1]} x {expected[0]}; they must agree: use the intrinsics of this stream"
+            )
+        if not np.isfinite(self.depth).all() or (self.depth < 0).any():
+            raise ValueError("the depth image has negative, NaN or infinite values; use 0 where nothing was measured")
+
+    @property
+    def valid(self) -> Bool[np.ndarray, "h w"]:
+        return self.depth > 0
+
+    def to_points(self, mask: Bool[np.ndarray, "h w"] | None = None) -> PointCloud:
+        """Unproject every measured pixel (inside ``mask`` when given), row by row."""
+        keep = self.valid if mask is None else self.valid & mask
+        points = self.camera.directions()[keep] * self.depth[keep][:, None]
+        return PointCloud(points.astype(np.float64))
