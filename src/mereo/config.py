@@ -4,7 +4,7 @@ Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) u
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypedDict
 
 TEST_SEED_START = 1_000_000
 """Seeds from here up are for testing; generation for training refuses them."""
@@ -50,3 +50,194 @@ class GenerateConfig:
     noise_std: float = 0.1
     points: int = 1024
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Encoder and decoder (paper, section 3.1 and appendix B; PointNet++ sizes from its reference implementation).
+
+    Attributes:
+        points: the network sees at most this many points, the first in farthest-point order.
+        neighbors: largest number of neighbours in a ball, the first in farthest-point order.
+        ratio1, radius1, mlp1: first set abstraction: share of points kept as centres, ball radius, layer widths.
+        ratio2, radius2, mlp2: second set abstraction, the ratio relative to the first level's centres.
+        mlp_global: layer widths before the global max pool; the last one is the latent size.
+        width, depth, skip_after: the decoder's layer width, layer count, and after which layer the query returns.
+        encode_positions: frequency encoding of the query position; off means the three coordinates themselves.
+        lowest_exponent, highest_exponent: of the frequencies 2^e * pi, both included.
+        local_neighbors: set-abstraction centres per level that a query attends to; 0 switches local features off.
+        local_width: channels of that attention.
+        sight_neighbors: observed points nearest to the query's line of sight that it compares depth with; 0 is off.
+    """
+
+    points: int = 1024
+    neighbors: int = 64
+    ratio1: float = 0.5
+    radius1: float = 0.2
+    mlp1: tuple[int, ...] = (64, 64, 128)
+    ratio2: float = 0.25
+    radius2: float = 0.4
+    mlp2: tuple[int, ...] = (128, 128, 256)
+    mlp_global: tuple[int, ...] = (256, 512, 1024)
+    width: int = 512
+    depth: int = 7
+    skip_after: int = 4
+    encode_positions: bool = True
+    lowest_exponent: int = -4
+    highest_exponent: int = 5
+    local_neighbors: int = 0
+    local_width: int = 128
+    sight_neighbors: int = 0
+
+    @property
+    def latent(self) -> int:
+        return self.mlp_global[-1]
+
+
+Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+@dataclass(frozen=True)
+class AugmentConfig:
+    """Changes made to each training cloud as it is read; all off in the paper's recipe.
+
+    Attributes:
+        keep_points: each point survives with a probability drawn from this range.
+        hole_probability: chance of cutting one ball out of the cloud (sensor shadows, reflections).
+        hole_radius: largest radius of that ball, in normalized units.
+        jitter_std: extra depth noise, up to this standard deviation in normalized units.
+        roll: turn view and queries about the optical axis, where the scene allows any roll.
+    """
+
+    keep_points: tuple[float, float] = (1.0, 1.0)
+    hole_probability: float = 0.0
+    hole_radius: float = 0.4
+    jitter_std: float = 0.0
+    roll: bool = False
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The training recipe; defaults are the paper's.
+
+    Attributes:
+        network: the architecture.
+        loss: which terms: cross-entropy, L1 on the distance, cosine on the direction.
+        l1_weight: the paper's lambda.
+        batch: examples per step, over all processes together.
+        queries: query points per example and step, a random subset; 0 means all of them.
+        epochs: passes over the dataset.
+        learning_rate: peak rate.
+        weight_decay: decoupled (AdamW); 0 is the paper's Adam.
+        schedule: constant, or linear warm-up followed by a half cosine to zero.
+        warmup: fraction of all steps spent warming up.
+        clip_norm: largest gradient norm; 0 means no clipping.
+        ema_decay: decay of the exponential moving average of the weights that is saved; 0 is off.
+        augment: changes to the observed clouds.
+        holdout: examples at the end of the dataset kept for the validation curve.
+        precision: auto takes bfloat16 on CUDA and on CPUs with AMX, else float32.
+        compile: torch.compile of the network; auto means on CUDA only, where it pays.
+        seed: initialization, shuffling and augmentation.
+    """
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    loss: Loss = "ce+l1"
+    l1_weight: float = 100.0
+    batch: int = 40
+    queries: int = 0
+    epochs: float = 300.0
+    learning_rate: float = 5e-4
+    weight_decay: float = 0.0
+    schedule: Literal["constant", "cosine"] = "constant"
+    warmup: float = 0.0
+    clip_norm: float = 0.0
+    ema_decay: float = 0.0
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    holdout: int = 128
+    precision: Precision = "auto"
+    compile: Literal["auto", "on", "off"] = "auto"
+    seed: int = 0
+
+
+_MODERN = AugmentConfig(keep_points=(0.5, 1.0), hole_probability=0.4, jitter_std=0.005, roll=True)
+
+_HALF = NetworkConfig(
+    points=512,
+    neighbors=24,
+    mlp1=(32, 32, 64),
+    mlp2=(64, 64, 128),
+    mlp_global=(128, 256, 512),
+    width=256,
+    local_neighbors=6,
+    local_width=64,
+    sight_neighbors=4,
+)
+
+
+class _Recipe(TypedDict):
+    loss: Loss
+    l1_weight: float
+    queries: int
+    learning_rate: float
+    weight_decay: float
+    schedule: Literal["constant", "cosine"]
+    warmup: float
+    clip_norm: float
+    ema_decay: float
+    augment: AugmentConfig
+
+
+_MODERN_RECIPE = _Recipe(
+    loss="ce+l1+cd",
+    l1_weight=10.0,
+    queries=384,
+    learning_rate=2e-3,
+    weight_decay=0.01,
+    schedule="cosine",
+    warmup=0.05,
+    clip_norm=1.0,
+    ema_decay=0.999,
+    augment=_MODERN,
+)
+
+PRESETS: dict[str, TrainConfig] = {
+    # as published
+    "paper": TrainConfig(),
+    # what to train for real, also on a CPU: the paper's network at half its widths, local features at the query, and a
+    # modern schedule (docs/design/0002-learning.md)
+    "base": TrainConfig(network=_HALF, epochs=60, **_MODERN_RECIPE),
+    # the same with the paper's widths, for a GPU
+    "large": TrainConfig(
+        network=NetworkConfig(points=1024, neighbors=32, local_neighbors=6, sight_neighbors=4),
+        epochs=100,
+        **_MODERN_RECIPE,
+    ),
+    # two minutes on two CPU cores: for tests and for a first look at one's own object
+    "tiny": TrainConfig(
+        network=NetworkConfig(
+            points=256,
+            neighbors=16,
+            mlp1=(32, 32, 64),
+            mlp2=(64, 64, 128),
+            mlp_global=(128, 256),
+            width=128,
+            local_neighbors=4,
+            local_width=64,
+            sight_neighbors=4,
+        ),
+        loss="ce+l1+cd",
+        l1_weight=10.0,
+        batch=32,
+        queries=256,
+        epochs=10,
+        learning_rate=4e-3,
+        weight_decay=0.01,
+        schedule="cosine",
+        warmup=0.05,
+        clip_norm=1.0,
+        ema_decay=0.99,
+        augment=_MODERN,
+        holdout=32,
+    ),
+}

@@ -1,0 +1,159 @@
+"""The occupancy predictor's decoder (paper, section 3.1) with optional local features at the query.
+
+Every layer that reads the latent vector is split, ``W [z; x] = W_z z + W_x x``: the latent half is computed once per
+cloud and broadcast over its queries, which is exact and removes the (queries x 1084) buffers.
+
+Notation: b clouds, q queries, k neighbours, z latent channels, h hidden channels.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mereo.config import NetworkConfig
+from mereo.encoders.pointnet2 import Encoding, Level
+from mereo.neighbors import gather, nearest
+
+
+@dataclass(frozen=True, eq=False)
+class Code:
+    """All that a query needs to know of a cloud; computed once.
+
+    Attributes:
+        latent1, latent2: the latent half of the first layer and of the layer after the skip connection.
+        levels: set-abstraction centres with features projected for attention; empty without local features.
+        cloud: the observed points, farthest-point order, normalized.
+        viewpoint: the camera's position in normalized coordinates.
+    """
+
+    latent1: Float[Tensor, "b h"]
+    latent2: Float[Tensor, "b h"]
+    levels: tuple[Level, ...]
+    cloud: Float[Tensor, "b n 3"]
+    viewpoint: Float[Tensor, "b 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Raw outputs at each query: class logits (0 is empty), signed distance, direction (not yet unit length)."""
+
+    logits: Float[Tensor, "b q c"]
+    distance: Float[Tensor, "b q"]
+    direction: Float[Tensor, "b q 3"]
+
+
+class FrequencyEncoding(nn.Module):
+    """``sin(2^e pi x), cos(2^e pi x)`` for every exponent e (paper, equation 2, with negative exponents)."""
+
+    def __init__(self, lowest: int, highest: int) -> None:
+        super().__init__()
+        frequency = torch.pi * 2.0 ** torch.arange(lowest, highest + 1)
+        self.frequency: Tensor
+        self.register_buffer("frequency", frequency, persistent=False)
+        self.channels = 6 * len(frequency)
+
+    def forward(self, points: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q e"]:
+        phase = (points[..., None] * self.frequency).flatten(-2)
+        return torch.cat([phase.sin(), phase.cos()], dim=-1)
+
+
+class LocalAttention(nn.Module):
+    """Attention of a query over its nearest set-abstraction centres of one level.
+
+    ``h_k = relu(A f_k + B (x - c_k))``, weights softmax_k(w h_k) for each of four heads, answer sum_k w_k h_k. ``A f_k``
+    is computed once per centre, so a neighbour costs the query only a gather and the small product with B.
+    """
+
+    HEADS = 4
+
+    def __init__(self, channels: int, width: int, neighbors: int) -> None:
+        super().__init__()
+        self.neighbors = neighbors
+        self.project = nn.Linear(channels, width)
+        self.offset = nn.Linear(4, width, bias=False)
+        self.score = nn.Linear(width, self.HEADS)
+
+    def forward(self, level: Level, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q w"]:
+        """``level.features`` are already projected."""
+        index = nearest(queries, level.centers, self.neighbors)
+        offset = queries[:, :, None] - gather(level.centers, index)
+        offset = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], dim=-1)
+        hidden = torch.relu(gather(level.features, index) + self.offset(offset))
+        weight = self.score(hidden).softmax(dim=2)
+        heads = hidden.unflatten(-1, (self.HEADS, -1))
+        return (weight[..., None] * heads).sum(dim=2).flatten(-2)
+
+
+def line_of_sight(
+    queries: Float[Tensor, "b q 3"], cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], count: int
+) -> Float[Tensor, "b q f"]:
+    """Free-space evidence: lateral offset and depth difference to the observed points nearest in the image.
+
+    A query in front of them is in seen empty space; one behind is hidden; one with none nearby is outside the
+    silhouette. Both the plain values and eight times them, clipped to [-1, 1], so that near is resolved finely.
+    """
+    rays, seen = queries - viewpoint[:, None], cloud - viewpoint[:, None]
+    query_depth, seen_depth = rays[..., 2:].clamp(min=1e-3), seen[..., 2:].clamp(min=1e-3)
+    query_image, seen_image = rays[..., :2] / query_depth, seen[..., :2] / seen_depth
+    index = nearest(query_image, seen_image, count)
+    lateral = (gather(seen_image, index) - query_image[:, :, None]) * query_depth[:, :, None]
+    depth = gather(seen_depth, index) - query_depth[:, :, None]
+    evidence = torch.cat([lateral, depth], dim=-1).flatten(-2)
+    return torch.cat([evidence.clamp(-3.0, 3.0), (8.0 * evidence).clamp(-1.0, 1.0)], dim=-1)
+
+
+class Decoder(nn.Module):
+    """Code and query points -> class logits, signed distance, direction."""
+
+    def __init__(self, config: NetworkConfig, classes: int) -> None:
+        super().__init__()
+        self.config = config
+        self.encode = FrequencyEncoding(config.lowest_exponent, config.highest_exponent)
+        query, width = self.encode.channels if config.encode_positions else 3, config.width
+        self.latent1 = nn.Linear(config.latent, width, bias=False)
+        self.latent2 = nn.Linear(config.latent, width, bias=False)
+        self.query1 = nn.Linear(query, width, bias=False)
+        self.query2 = nn.Linear(query, width, bias=False)
+        self.hidden = nn.ModuleList(nn.Linear(width, width, bias=False) for _ in range(config.depth - 1))
+        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for _ in range(config.depth))
+        self.local = nn.ModuleList()
+        if config.local_neighbors:
+            self.local.extend(
+                LocalAttention(widths[-1], config.local_width, config.local_neighbors)
+                for widths in (config.mlp1, config.mlp2)
+            )
+            self.local1 = nn.Linear(2 * config.local_width, width, bias=False)
+        if config.sight_neighbors:
+            self.sight1 = nn.Linear(6 * config.sight_neighbors, width, bias=False)
+        self.head = nn.Linear(width, classes + 4)
+        self.classes = classes
+
+    def prepare(
+        self, encoding: Encoding, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]
+    ) -> Code:
+        """The part of the work that does not depend on the queries."""
+        levels = tuple(
+            Level(level.centers, attention.project(level.features))  # type: ignore[operator]
+            for level, attention in zip(encoding.levels, self.local, strict=False)
+        )
+        return Code(self.latent1(encoding.latent), self.latent2(encoding.latent), levels, cloud, viewpoint)
+
+    def forward(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Prediction:
+        encoded = self.encode(queries) if self.config.encode_positions else queries
+        hidden = self.query1(encoded) + code.latent1[:, None]
+        if self.config.local_neighbors:
+            local = [layer(level, queries) for layer, level in zip(self.local, code.levels, strict=True)]
+            hidden = hidden + self.local1(torch.cat(local, dim=-1))
+        if self.config.sight_neighbors:
+            sight = line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors)
+            hidden = hidden + self.sight1(sight)
+        for number, norm in enumerate(self.norms):  # layer `number` is counted from 0
+            if number > 0:
+                hidden = self.hidden[number - 1](hidden)
+            if number == self.config.skip_after:
+                hidden = hidden + self.query2(encoded) + code.latent2[:, None]
+            hidden = torch.relu(norm(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
+        logits, distance, direction = self.head(hidden).float().split([self.classes, 1, 3], dim=-1)
+        return Prediction(logits, distance[..., 0], direction)

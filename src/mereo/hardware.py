@@ -1,0 +1,47 @@
+"""What this machine offers: device, precision, and an allocator setting that matters."""
+
+import ctypes
+import sys
+
+import torch
+
+from mereo.config import Precision
+
+
+def pick_device(rank: int = 0) -> torch.device:
+    """A CUDA device where there is one, else the CPU."""
+    if torch.cuda.is_available():
+        return torch.device("cuda", rank % torch.cuda.device_count())
+    return torch.device("cpu")
+
+
+def has_amx() -> bool:
+    """Whether the CPU multiplies bfloat16 tiles (Intel AMX), about five times faster than float32."""
+    check = getattr(torch.cpu, "_is_amx_tile_supported", None)
+    return bool(check is not None and check())
+
+
+def pick_precision(precision: Precision, device: torch.device) -> torch.dtype | None:
+    """The autocast type, or None for float32: bfloat16 without AMX is no faster on a CPU."""
+    if precision == "float32":
+        return None
+    if precision == "bfloat16" or device.type == "cuda" or has_amx():
+        return torch.bfloat16
+    return None
+
+
+def keep_freed_memory() -> None:
+    """Tell glibc to reuse large freed blocks instead of returning them to the system.
+
+    A training step frees and allocates the same hundreds of megabytes; returning them costs a page fault for each 4 kB,
+    measured as half of the time of a float32 CPU step. Does nothing where the C library is not glibc.
+    """
+    if sys.platform != "linux":
+        return
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):
+        return
+    trim_threshold, mmap_max = -1, -4  # M_TRIM_THRESHOLD, M_MMAP_MAX in malloc.h
+    mallopt(mmap_max, 0)
+    mallopt(trim_threshold, 2**31 - 1)

@@ -1,0 +1,41 @@
+"""The paper's metrics (appendix B): IoU and mIoU from one confusion matrix over a whole test set."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, Integer
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Intersections over union, each in 0..1; NaN where a class occurs neither in truth nor in prediction.
+
+    Attributes:
+        iou: all segments as one class, against empty space.
+        miou: mean over the segments, empty space left out.
+        per_segment: one value per segment.
+    """
+
+    iou: float
+    miou: float
+    per_segment: Float[np.ndarray, " s"]
+
+
+def confusion_matrix(
+    truth: Integer[np.ndarray, "*n"], prediction: Integer[np.ndarray, "*n"], classes: int
+) -> Int[np.ndarray, "c c"]:
+    """Counts of points by true class (row) and predicted class (column)."""
+    index = truth.astype(np.int64).ravel() * classes + prediction.astype(np.int64).ravel()
+    return np.bincount(index, minlength=classes * classes).reshape(classes, classes)
+
+
+def intersection_over_union(confusion: Int[np.ndarray, "c c"]) -> Scores:
+    """``TP / (TP + FP + FN)``; class 0 is empty space, whose false positives count against the segments."""
+    with np.errstate(invalid="ignore"):
+        hit = np.diag(confusion)[1:].astype(float)
+        union = confusion[1:].sum(axis=1) + confusion[:, 1:].sum(axis=0) - hit
+        per_segment = hit / union
+        occupied = confusion[1:, 1:].sum().astype(float)
+        iou = occupied / (confusion.sum() - confusion[0, 0])
+    present = per_segment[~np.isnan(per_segment)]
+    return Scores(float(iou), float(present.mean()) if len(present) else float("nan"), per_segment)

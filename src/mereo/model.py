@@ -1,0 +1,195 @@
+"""The network, and the trained model that a user holds.
+
+``Network`` works on normalized batches; ``Model`` takes clouds and points in the user's frame and units, and answers
+in them. The code of a cloud is computed once and then queried as often as one likes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from mereo.camera import PointCloud
+from mereo.config import NetworkConfig
+from mereo.decoder import Code, Decoder, Prediction
+from mereo.encoders.pointnet2 import PointNet2
+from mereo.frame import Normalizer
+from mereo.mesh import Color
+from mereo.ordering import farthest_point_order
+
+MIN_POINTS = 32
+"""Fewer observed points say too little about an object; training views with fewer are drawn again."""
+
+DENSE_FACTOR = 8
+"""Clouds this many times denser than the network's input are thinned at random first: ordering all is quadratic."""
+
+QUERY_CHUNK = 32768
+"""Queries evaluated at once: bounds memory without costing speed."""
+
+
+class Network(nn.Module):
+    """Encoder and decoder on normalized coordinates."""
+
+    def __init__(self, config: NetworkConfig, segments: int) -> None:
+        super().__init__()
+        self.config, self.segments = config, segments
+        self.encoder = PointNet2(config)
+        self.decoder = Decoder(config, segments + 1)
+
+    def encode(self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
+        """``cloud`` in farthest-point order."""
+        return self.decoder.prepare(self.encoder(cloud), cloud, viewpoint)
+
+    def query(self, code: Code, points: Float[Tensor, "b q 3"]) -> Prediction:
+        prediction: Prediction = self.decoder(code, points)
+        return prediction
+
+    def forward(
+        self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], points: Float[Tensor, "b q 3"]
+    ) -> tuple[Float[Tensor, "b q c"], Float[Tensor, "b q"], Float[Tensor, "b q 3"]]:
+        prediction = self.query(self.encode(cloud, viewpoint), points)
+        return prediction.logits, prediction.distance, prediction.direction
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedCloud:
+    """One observed cloud, ready to be queried.
+
+    Attributes:
+        code: the network's side.
+        normalizer: between the user's frame and the network's.
+        cloud: the points the network saw, in the user's frame and units.
+    """
+
+    code: Code
+    normalizer: Normalizer
+    cloud: Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the model says about each point, in the user's frame and units.
+
+    Attributes:
+        label: 0 for empty space, i + 1 for the model's segment i.
+        probability: of empty space and each segment; rows sum to one.
+        distance: to the nearest segment surface, negative inside.
+        direction: unit vector towards it.
+    """
+
+    label: UInt8[np.ndarray, " n"]
+    probability: Float[np.ndarray, "n c"]
+    distance: Float[np.ndarray, " n"]
+    direction: Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A trained network with everything needed to use it.
+
+    Attributes:
+        network: in evaluation mode.
+        names, colors: of the segments; label i + 1 is names[i].
+        provenance: how it was trained: scene, seeds, dataset, recipe, versions.
+        loss: the terms it was trained with; "l1" alone knows inside from outside but no segments.
+    """
+
+    network: Network
+    names: tuple[str, ...]
+    colors: tuple[Color, ...]
+    loss: str = "ce+l1"
+    provenance: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.network.parameters()).device
+
+    def encode(self, cloud: PointCloud | Float[np.ndarray, "n 3"]) -> EncodedCloud:
+        """Points in a camera frame (z forward), any unit, any density. Raises ``ValueError`` on unusable clouds."""
+        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
+        points = checked_points(cloud)
+        normalizer = Normalizer.fit(points)
+        limit = self.network.config.points
+        normalized = normalizer.apply(thin(points, limit * DENSE_FACTOR)).astype(np.float32)
+        order = farthest_point_order(normalized, limit)
+        seen = normalized[order]
+        padded = seen[np.arange(limit) % len(seen)]
+        with torch.inference_mode():
+            tensors = [torch.from_numpy(a[None].astype(np.float32)) for a in (padded, normalizer.viewpoint)]
+            code = self.network.encode(*(tensor.to(self.device) for tensor in tensors))
+        return EncodedCloud(code, normalizer, normalizer.invert(seen.astype(np.float64)))
+
+    def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
+        """Segment, probabilities, signed distance and direction at each point."""
+
+        def answer(prediction: Prediction) -> tuple[Tensor, Tensor, Tensor]:
+            logits = self._class_logits(prediction)
+            direction = nn.functional.normalize(prediction.direction, dim=-1)
+            return logits.softmax(dim=-1), prediction.distance, direction
+
+        probability, distance, direction = self._chunked(code, points, answer)
+        return Answer(
+            label=probability.argmax(axis=-1).astype(np.uint8),
+            probability=probability,
+            distance=distance / np.float32(code.normalizer.scale),
+            direction=direction,
+        )
+
+    def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+        """Class logits only: what surface extraction needs."""
+        return self._chunked(code, points, lambda prediction: (self._class_logits(prediction),))[0]
+
+    def _class_logits(self, prediction: Prediction) -> Tensor:
+        if "ce" in self.loss:
+            return prediction.logits
+        # trained on distances alone: inside is one class, and -distance its margin (paper, section 4.4)
+        return torch.stack([prediction.distance, -prediction.distance], dim=-1)
+
+    def _chunked(
+        self,
+        code: EncodedCloud,
+        points: Float[np.ndarray, "n 3"],
+        answer: Callable[[Prediction], tuple[Tensor, ...]],
+    ) -> list[np.ndarray]:
+        normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
+        chunks = []
+        with torch.inference_mode():
+            for start in range(0, max(len(normalized), 1), QUERY_CHUNK):
+                queries = torch.from_numpy(normalized[start : start + QUERY_CHUNK])[None].to(self.device)
+                chunks.append([part[0].cpu() for part in answer(self.network.query(code.code, queries))])
+        return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
+
+
+def checked_points(cloud: PointCloud) -> Float[np.ndarray, "n 3"]:
+    """The cloud's points as float64, or one sentence on why they cannot be used."""
+    points = np.asarray(cloud.points, dtype=np.float64)
+    if len(points) < MIN_POINTS:
+        raise ValueError(
+            f"the cloud has {len(points)} points; the encoder needs at least {MIN_POINTS}: "
+            "move closer, or check the mask and the depth range"
+        )
+    if (points[:, 2] <= 0).any():
+        raise ValueError(
+            f"{int((points[:, 2] <= 0).sum())} of {len(points)} points have z <= 0, behind the camera; the cloud must "
+            "be in a camera frame (x right, y down, z forward): turn it, or pass --frame scanner for y-up scans"
+        )
+    return points
+
+
+def thin(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.ndarray, "m 3"]:
+    """At most ``limit`` of the points, chosen at random but always the same way."""
+    if len(points) <= limit:
+        return points
+    return points[np.random.default_rng(0).choice(len(points), limit, replace=False)]
+
+
+def config_from_dict(values: dict[str, object]) -> NetworkConfig:
+    """Inverse of ``dataclasses.asdict`` after a trip through JSON; unknown or missing keys raise ``ValueError``."""
+    known = {f.name for f in fields(NetworkConfig)}
+    if set(values) != known:
+        odd = sorted(set(values) ^ known)
+        raise ValueError(f"the network settings differ in {odd[0]!r} from this version of mereo; train again")
+    return NetworkConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})  # type: ignore[arg-type]

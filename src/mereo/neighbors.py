@@ -1,0 +1,56 @@
+"""Ball query and nearest neighbours on batched point sets, in plain PyTorch: no compiled extension.
+
+Points arrive in farthest-point order (``mereo.ordering``). The greedy order makes the first m points exactly the
+farthest-point sample of size m, so the centres of every set-abstraction level are a prefix and cost nothing, and "the
+first K neighbours in order" are a well-spread subset of a crowded ball.
+"""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@torch.no_grad()
+def ball_query(
+    centers: Float[Tensor, "b m 3"], points: Float[Tensor, "b n 3"], radius: float, limit: int
+) -> Int[Tensor, "b m k"]:
+    """Indices of the first ``limit`` points, in order, within ``radius`` of each centre.
+
+    Balls with fewer points repeat their first one, which a max pool does not notice. Every centre must itself be one
+    of the points, so no ball is empty (PointNet++, section 3.3).
+    """
+    count = points.shape[1]
+    limit = min(limit, count)
+    near = squared_distances(centers, points) <= radius * radius
+    rank = near.cumsum(dim=-1, dtype=torch.int32)
+    # slot `limit` collects what is not wanted: points outside, and those beyond the limit
+    slot = torch.where(near & (rank <= limit), rank - 1, limit).long()
+    index = torch.arange(count, device=points.device).expand_as(slot)
+    found = torch.full((*near.shape[:2], limit + 1), -1, dtype=torch.long, device=points.device)
+    found = found.scatter_(-1, slot, index)[..., :limit]
+    return torch.where(found < 0, found[..., :1], found)
+
+
+@torch.no_grad()
+def nearest(
+    queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], count: int
+) -> Int[Tensor, "b q k"]:
+    """Indices of the ``count`` nearest points to each query, nearest first."""
+    distance = squared_distances(queries, points)
+    return distance.topk(min(count, points.shape[1]), dim=-1, largest=False).indices
+
+
+def squared_distances(a: Float[Tensor, "b m d"], b: Float[Tensor, "b n d"]) -> Float[Tensor, "b m n"]:
+    """All pairwise squared distances, by summed squares: the expanded product loses digits where they matter."""
+    total = (a[:, :, None, 0] - b[:, None, :, 0]).square()
+    for axis in range(1, a.shape[-1]):
+        total = total + (a[:, :, None, axis] - b[:, None, :, axis]).square()
+    return total
+
+
+def gather(values: Float[Tensor, "b n c"], index: Int[Tensor, "b m k"]) -> Float[Tensor, "b m k c"]:
+    """``values[b, index[b, m, k]]``."""
+    batch, count, channels = values.shape
+    offset = torch.arange(batch, device=values.device).view(-1, 1, 1) * count
+    flat = (index + offset).reshape(-1)
+    return values.reshape(batch * count, channels).index_select(0, flat).reshape(*index.shape, channels)

@@ -1,0 +1,309 @@
+"""Training: a plain loop over batches. Running the same command again continues where it stopped.
+
+Everything random in step t is drawn from (seed, t), so a resumed run repeats an uninterrupted one exactly. Under
+``torchrun`` each process takes its share of every batch; process 0 writes.
+"""
+
+import json
+import math
+import os
+import time
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from mereo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mereo.config import TrainConfig
+from mereo.curves import MetricsLog
+from mereo.dataset import Batch, Dataset
+from mereo.decoder import Prediction
+from mereo.hardware import keep_freed_memory, pick_device, pick_precision
+from mereo.losses import occupancy_loss
+from mereo.metrics import confusion_matrix, intersection_over_union
+from mereo.model import Model, Network
+from mereo.output import write_json
+from mereo.weights import save_model
+
+
+@dataclass(frozen=True)
+class Process:
+    """This process's place among those that train together."""
+
+    rank: int = 0
+    world: int = 1
+
+    @property
+    def is_main(self) -> bool:
+        return self.rank == 0
+
+
+def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_every_s: float = 120.0) -> Path:
+    """Train on a generated dataset; returns the path of the weights (``run_dir/weights.safetensors``).
+
+    ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors. If it
+    holds a checkpoint of the same settings, training continues from it; other settings raise ``ValueError``.
+    """
+    process = _join_processes()
+    device = pick_device(process.rank)
+    data = Dataset.load(dataset_dir, device)
+    config = _fit_config(config, data)
+    _claim_run(run_dir, dataset_dir, config, data, process)
+    keep_freed_memory()
+    trainer = Trainer(config, data, run_dir, process, device)
+    if trainer.resume():
+        trainer.say(f"continuing from step {trainer.step} of {trainer.total}")
+    last_save = time.monotonic()
+    for batch in trainer.batches():
+        trainer.train_step(batch)
+        finished = trainer.step == trainer.total
+        if finished or trainer.agree(time.monotonic() - last_save > checkpoint_every_s):
+            trainer.validate_and_save()
+            last_save = time.monotonic()
+    if process.world > 1:
+        dist.destroy_process_group()
+    return run_dir / "weights.safetensors"
+
+
+class Trainer:
+    """The mutable state of a run: network, optimizer, averaged weights, step."""
+
+    def __init__(
+        self, config: TrainConfig, data: Dataset, run_dir: Path, process: Process, device: torch.device
+    ) -> None:
+        self.config, self.data, self.run_dir, self.process, self.device = config, data, run_dir, process, device
+        torch.manual_seed(config.seed)
+        self.network = Network(config.network, len(data.manifest["segments"])).to(device)
+        self.average = Network(config.network, len(data.manifest["segments"])).to(device)
+        self.average.load_state_dict(self.network.state_dict())
+        self.optimizer = torch.optim.AdamW(_parameter_groups(self.network, config), lr=config.learning_rate, fused=True)
+        self.examples = len(data) - config.holdout
+        self.total = max(1, math.ceil(config.epochs * self.examples / config.batch))
+        self.step = 0
+        self.log = MetricsLog(run_dir) if process.is_main else None
+        self.autocast = pick_precision(config.precision, device)
+        self.module: nn.Module = self.network
+        if process.world > 1:
+            self.module = nn.parallel.DistributedDataParallel(self.network)
+        if config.compile == "on" or (config.compile == "auto" and device.type == "cuda"):
+            self.module = torch.compile(self.module)  # type: ignore[assignment]
+        self.started, self.first_step = time.monotonic(), 0
+
+    def say(self, text: str) -> None:
+        if self.process.is_main:
+            print(text, flush=True)
+
+    def agree(self, wish: bool) -> bool:
+        """Process 0 decides for all: clocks differ, and validation is collective."""
+        if self.process.world == 1:
+            return wish
+        flag = torch.tensor([float(wish)])
+        dist.broadcast(flag, src=0)
+        return bool(flag.item())
+
+    def batches(self) -> Iterator[Batch]:
+        """This process's share of every remaining batch."""
+        per_process = self.config.batch // self.process.world
+        while self.step < self.total:
+            index = self._batch_index(self.step)[self.process.rank * per_process :][:per_process]
+            rng = torch.Generator().manual_seed(_mix(self.config.seed, self.step, self.process.rank))
+            yield self.data.batch(
+                index, self.config.network.points, self.config.queries, self.config.augment, rng
+            )
+
+    def _batch_index(self, step: int) -> Tensor:
+        """Batches run through one shuffled pass after another; a batch may straddle two passes."""
+        first = step * self.config.batch
+        positions = range(first, first + self.config.batch)
+        passes = {p // self.examples for p in positions}
+        orders = {
+            number: torch.randperm(
+                self.examples, generator=torch.Generator().manual_seed(_mix(self.config.seed, number, 1 << 20))
+            )
+            for number in passes
+        }
+        return torch.stack([orders[p // self.examples][p % self.examples] for p in positions])
+
+    def train_step(self, batch: Batch) -> None:
+        """One optimizer step."""
+        self.network.train()
+        rate = self._learning_rate()
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        loss, terms = self._loss(batch)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        if self.config.clip_norm:
+            nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip_norm)
+        self.optimizer.step()
+        self.step += 1
+        self._update_average()
+        if self.log is not None:
+            self.log.add_step(self.step, rate, float(loss.detach()), {k: float(v) for k, v in terms.items()})
+            self._report_progress(float(loss.detach()))
+
+    def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        with torch.autocast(self.device.type, self.autocast) if self.autocast else nullcontext():
+            outputs = self.module(batch.cloud, batch.viewpoint, batch.positions)
+        return occupancy_loss(
+            Prediction(*outputs), batch.labels, batch.distances, batch.directions, self.config.loss,
+            self.config.l1_weight,
+        )
+
+    def _learning_rate(self) -> float:
+        config = self.config
+        progress = self.step / self.total
+        if progress < config.warmup:
+            return config.learning_rate * (self.step + 1) / math.ceil(config.warmup * self.total)
+        if config.schedule == "constant":
+            return config.learning_rate
+        return 0.5 * config.learning_rate * (1 + math.cos(math.pi * (progress - config.warmup) / (1 - config.warmup)))
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        # a young average follows closely, so that the random initialization is forgotten
+        decay = min(self.config.ema_decay, (1 + self.step) / (10 + self.step)) if self.config.ema_decay else 0.0
+        for mean, value in zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(value, 1 - decay)
+            else:
+                mean.copy_(value)
+
+    def _report_progress(self, loss: float) -> None:
+        if self.step % 20 and self.step != self.total:
+            return
+        rate = (self.step - self.first_step) / (time.monotonic() - self.started)
+        left_s = (self.total - self.step) / max(rate, 1e-9)
+        self.say(
+            f"step {self.step}/{self.total}  loss {loss:.4f}  {rate * self.config.batch:.1f} examples/s  "
+            f"{left_s / 60:.1f} min left"
+        )
+
+    @torch.no_grad()
+    def validate(self) -> tuple[float, float]:
+        """IoU and mIoU of the averaged weights on the queries of the held-out examples (not the paper's grid metric)."""
+        classes = self.network.segments + 1
+        total = torch.zeros(classes, classes, dtype=torch.long)
+        self.average.eval()
+        quiet = TrainConfig().augment
+        for start in range(self.examples, len(self.data), self.config.batch):
+            index = torch.arange(start, min(start + self.config.batch, len(self.data)))
+            batch = self.data.batch(index, self.config.network.points, 0, quiet, torch.Generator().manual_seed(0))
+            logits, distance, _ = self.average(batch.cloud, batch.viewpoint, batch.positions)
+            guess = logits.argmax(-1) if "ce" in self.config.loss else (distance < 0).long()
+            truth = batch.labels if "ce" in self.config.loss else (batch.labels > 0).long()
+            total += torch.from_numpy(confusion_matrix(truth.cpu().numpy(), guess.cpu().numpy(), classes))
+        scores = intersection_over_union(total.numpy())
+        return scores.iou, scores.miou
+
+    def validate_and_save(self) -> None:
+        """Write metrics, curves, the checkpoint and the weights; every file atomically."""
+        if self.log is not None:
+            if self.config.holdout:
+                self.log.add_validation(self.step, *self.validate())
+            self.log.write()
+            save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
+            save_model(self.model(), self.run_dir / "weights.safetensors")
+            self.say(f"saved at step {self.step}: {self.log.summary()}")
+        if self.process.world > 1:
+            dist.barrier()
+
+    def model(self) -> Model:
+        """The averaged network with the header that travels with its weights."""
+        manifest = self.data.manifest
+        provenance: dict[str, object] = {
+            "scene": manifest["scene"],
+            "training_seed": manifest["seed"],
+            "training_examples": manifest["examples"],
+            "steps": self.step,
+            "mereo": manifest["version"],
+            "recipe": asdict(self.config),
+        }
+        return Model(
+            network=self.average,
+            names=tuple(s["name"] for s in manifest["segments"]),
+            colors=tuple(tuple(s["color"]) for s in manifest["segments"]),
+            loss=self.config.loss,
+            provenance=provenance,
+        )
+
+    def resume(self) -> bool:
+        """Load the checkpoint when there is one."""
+        step = load_checkpoint(self.run_dir, Checkpoint(0, self.network, self.average, self.optimizer))
+        if step is None:
+            return False
+        self.step = self.first_step = step
+        if self.log is not None:
+            self.log.read_until(step)
+        return True
+
+
+def _parameter_groups(network: nn.Module, config: TrainConfig) -> list[dict[str, object]]:
+    """Weight decay acts on matrices only: shrinking biases and norms would only slow them."""
+    matrices = [p for p in network.parameters() if p.ndim >= 2]
+    others = [p for p in network.parameters() if p.ndim < 2]
+    return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
+
+
+def _mix(*numbers: int) -> int:
+    """One 63-bit seed from several numbers."""
+    mixed = 0x9E3779B97F4A7C15
+    for number in numbers:
+        mixed = ((mixed ^ number) * 0xBF58476D1CE4E5B9 + 0x94D049BB133111EB) & 0x7FFFFFFFFFFFFFFF
+    return mixed
+
+
+def _fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
+    """Settings that the dataset decides: how much can be held out, and whether a roll keeps a view plausible."""
+    holdout = min(config.holdout, len(data) // 10)
+    augment = replace(config.augment, roll=config.augment.roll and bool(data.manifest["any_roll"]))
+    return replace(config, holdout=holdout, augment=augment)
+
+
+def _join_processes() -> Process:
+    """Join the group that torchrun started, if any."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    if world == 1:
+        return Process()
+    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    return Process(dist.get_rank(), world)
+
+
+def _claim_run(run_dir: Path, dataset_dir: Path, config: TrainConfig, data: Dataset, process: Process) -> None:
+    """Create the run directory, or check that it belongs to the same settings and dataset."""
+    if config.batch % process.world:
+        raise ValueError(
+            f"the batch of {config.batch} cannot be shared by {process.world} processes; it must be a multiple: "
+            "change --batch or the number of processes"
+        )
+    dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
+    settings = json.loads(json.dumps({"dataset": dataset, "train": asdict(config)}))
+    path = run_dir / "config.json"
+    if path.is_file():
+        before = json.loads(path.read_text())
+        if before != settings:
+            odd = _first_difference(before, settings)
+            raise ValueError(
+                f"{run_dir} holds a run with another {odd}; continuing needs equal settings: "
+                "use them, or another --output"
+            )
+    elif run_dir.exists() and any(run_dir.iterdir()):
+        raise FileExistsError(f"{run_dir} exists and is not a training run; choose another --output")
+    elif process.is_main:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        write_json(path, settings)
+    if process.world > 1:
+        dist.barrier()
+
+
+def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:
+    for group in now:
+        for key, value in now[group].items():
+            if before.get(group, {}).get(key) != value:
+                return f"{group} setting {key} ({before.get(group, {}).get(key)!r} instead of {value!r})"
+    return "format"

@@ -1,0 +1,87 @@
+"""Trained models on disk: one safetensors file whose header holds everything needed to run without the dataset."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from mereo.model import Model, Network, config_from_dict
+
+FORMAT_VERSION = 1
+SHIPPED = Path(__file__).parent / "weights"
+
+
+def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> None:
+    """Write weights and header atomically; ``float16`` halves the file and is read back as float32."""
+    header = {
+        "version": FORMAT_VERSION,
+        "network": asdict(model.network.config),
+        "names": model.names,
+        "colors": model.colors,
+        "loss": model.loss,
+        "normalizer": "center and half of the longest side of the observed cloud's box",
+        "provenance": model.provenance,
+    }
+    tensors = {
+        name: (value.to(dtype) if value.is_floating_point() else value).contiguous()
+        for name, value in model.network.state_dict().items()
+    }
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        save_file(tensors, temporary, metadata={"mereo": json.dumps(header)})
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def shipped_names() -> tuple[str, ...]:
+    """Names that ``load_model`` knows without a path."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
+
+
+def find_weights(name: str | Path) -> Path:
+    """A shipped name or a path to an existing file."""
+    path = Path(name)
+    shipped = SHIPPED / f"{name}.safetensors"
+    if path.suffix == "" and not path.exists() and shipped.is_file():
+        return shipped
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"there are no weights {str(name)!r}; give a .safetensors file from mereo train or one of the shipped "
+            f"names: {', '.join(shipped_names()) or 'none'}"
+        )
+    return path
+
+
+def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
+    """A shipped model by name, or a file. Raises ``ValueError`` when it is not weights of this version."""
+    path = find_weights(name)
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path} is not a safetensors file ({error}); give the weights written by mereo train") from None
+    if "mereo" not in metadata:
+        raise ValueError(f"{path} holds tensors but no mereo header; give the weights.safetensors of a mereo run")
+    header = json.loads(metadata["mereo"])
+    if header.get("version") != FORMAT_VERSION:
+        raise ValueError(
+            f"{path} has weights format {header.get('version')}; this mereo reads format {FORMAT_VERSION}: "
+            "train again, or install the matching version"
+        )
+    network = Network(config_from_dict(header["network"]), len(header["names"]))
+    try:
+        network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not fit its own header ({str(error).splitlines()[0]}); train again") from None
+    return Model(
+        network=network.eval().requires_grad_(False).to(device),
+        names=tuple(header["names"]),
+        colors=tuple(tuple(color) for color in header["colors"]),
+        loss=header["loss"],
+        provenance=header["provenance"],
+    )

@@ -1,0 +1,120 @@
+"""Batches: augmentation moves everything together, and every batch depends on its generator alone."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from toy_data import write_toy_dataset
+
+from mereo.config import AugmentConfig
+from mereo.dataset import Dataset, augment_batch, choose_points
+
+NONE = AugmentConfig()
+FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.01, roll=True)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return Dataset.load(write_toy_dataset(tmp_path_factory.mktemp("toy") / "data"))
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_without_augmentation_a_batch_is_the_stored_data(data: Dataset) -> None:
+    batch = data.batch(torch.arange(4), 96, 0, NONE, rng())
+    assert torch.allclose(batch.cloud, data.cloud[:4], atol=1e-5)
+    assert torch.allclose(batch.positions, data.positions[:4], atol=1e-5)
+    assert torch.allclose(batch.viewpoint, data.viewpoint[:4], atol=1e-4)
+    assert torch.equal(batch.labels, data.labels[:4].long())
+
+
+def test_same_generator_same_batch(data: Dataset) -> None:
+    first, second = (data.batch(torch.arange(8), 64, 32, FULL, rng(3)) for _ in range(2))
+    other = data.batch(torch.arange(8), 64, 32, FULL, rng(4))
+    assert torch.equal(first.cloud, second.cloud) and torch.equal(first.positions, second.positions)
+    assert not torch.equal(first.cloud, other.cloud)
+
+
+def test_query_subset_keeps_labels_with_positions(data: Dataset) -> None:
+    batch = data.batch(torch.tensor([2, 5]), 96, 16, NONE, rng())
+    assert batch.positions.shape == (2, 16, 3)
+    for row, example in enumerate((2, 5)):
+        for position, label in zip(batch.positions[row], batch.labels[row], strict=True):
+            match = (data.positions[example] - position).norm(dim=-1).argmin()
+            assert data.labels[example, match] == label
+
+
+def test_augmented_cloud_fills_the_unit_box_and_camera_stays_in_front(data: Dataset) -> None:
+    batch = data.batch(torch.arange(16), 64, 0, FULL, rng())
+    extent = batch.cloud.amax(dim=1) - batch.cloud.amin(dim=1)
+    assert torch.allclose(extent.amax(dim=1), torch.full((16,), 2.0), atol=1e-4)
+    assert (batch.viewpoint[:, 2] < batch.cloud[..., 2].amin(dim=1)).all()
+
+
+def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
+    """Distances between queries, cloud and camera keep their ratios, and depth order is unchanged."""
+    plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
+    rolled = augment_batch(plain, AugmentConfig(roll=True), rng(1))
+
+    def gaps(batch: object) -> torch.Tensor:
+        positions, cloud, eye = batch.positions, batch.cloud, batch.viewpoint  # type: ignore[attr-defined]
+        everything = torch.cat([positions[:, :20], cloud[:, :20], eye[:, None]], dim=1).double()
+        distances = torch.cdist(everything, everything)
+        return distances / distances.amax(dim=(1, 2), keepdim=True)
+
+    assert torch.allclose(gaps(plain), gaps(rolled), atol=1e-5)
+    assert torch.equal(plain.positions[..., 2].argsort(dim=1), rolled.positions[..., 2].argsort(dim=1))
+    assert not torch.allclose(plain.positions, rolled.positions, atol=0.1)
+
+
+def test_distances_scale_with_positions(data: Dataset) -> None:
+    plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
+    changed = augment_batch(plain, FULL, rng(2))
+    ratio = (changed.positions[:, 0] - changed.positions[:, 1]).norm(dim=-1) / (
+        plain.positions[:, 0] - plain.positions[:, 1]
+    ).norm(dim=-1)
+    assert torch.allclose(changed.distances, plain.distances * ratio[:, None], rtol=1e-3)
+
+
+def test_directions_turn_with_the_view(data: Dataset) -> None:
+    """Walking the signed distance along the direction still ends where it did relative to the cloud."""
+    plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
+    rolled = augment_batch(plain, AugmentConfig(roll=True), rng(1))
+    feet = [b.positions + b.distances.abs()[..., None] * b.directions for b in (plain, rolled)]
+    gaps = [torch.cdist(f, b.cloud) * b.distances.abs().amax(dim=1)[:, None, None] ** -1
+            for f, b in zip(feet, (plain, rolled), strict=True)]
+    assert torch.allclose(gaps[0], gaps[1], rtol=2e-2, atol=2e-2)
+
+
+def test_padding_is_never_chosen_before_it_must_be() -> None:
+    cloud = torch.arange(10.0)[None, :, None].repeat(1, 1, 3)
+    chosen = choose_points(cloud, torch.tensor([7]), 10, NONE, rng())
+    assert chosen[0, :, 0].tolist() == [0, 1, 2, 3, 4, 5, 6, 0, 1, 2]
+
+
+def test_a_small_cloud_survives_any_hole() -> None:
+    cloud = torch.zeros(1, 40, 3)
+    huge = AugmentConfig(hole_probability=1.0, hole_radius=1e6)
+    assert choose_points(cloud, torch.tensor([40]), 40, huge, rng()).shape == (1, 40, 3)
+
+
+def test_incomplete_dataset_is_refused(tmp_path: Path) -> None:
+    directory = write_toy_dataset(tmp_path / "data")
+    (directory / "shard-00001.safetensors").unlink()
+    with pytest.raises(ValueError, match="holds 32 of 64 examples; training needs all of them"):
+        Dataset.load(directory)
+
+
+def test_truncated_shard_is_named(tmp_path: Path) -> None:
+    directory = write_toy_dataset(tmp_path / "data")
+    shard = directory / "shard-00001.safetensors"
+    shard.write_bytes(shard.read_bytes()[:500])
+    with pytest.raises(ValueError, match=r"shard-00001\.safetensors cannot be read"):
+        Dataset.load(directory)
+
+
+def test_a_directory_without_manifest_is_not_a_dataset(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"has no manifest\.json; a dataset is a directory made by"):
+        Dataset.load(tmp_path)

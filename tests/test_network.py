@@ -1,0 +1,149 @@
+"""The network's structure: what it must ignore, what it must share, and its paper sizes."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from mereo.config import PRESETS, NetworkConfig
+from mereo.decoder import FrequencyEncoding, Prediction
+from mereo.encoders.pointnet2 import PointNet2
+from mereo.losses import occupancy_loss
+from mereo.model import Network
+
+TINY = PRESETS["tiny"].network
+
+
+def cloud_of(config: NetworkConfig, batch: int = 2, seed: int = 0) -> torch.Tensor:
+    points = torch.randn(batch, config.points, 3, generator=torch.Generator().manual_seed(seed))
+    return F.normalize(points, dim=-1)
+
+
+def viewpoint_of(batch: int = 2) -> torch.Tensor:
+    return torch.tensor([[0.2, -0.1, -8.0]]).repeat(batch, 1)
+
+
+def settled(config: NetworkConfig, segments: int = 3) -> Network:
+    """A network whose batch statistics are not the trivial initial ones."""
+    torch.manual_seed(3)
+    network = Network(config, segments)
+    network.train()
+    network(cloud_of(config), viewpoint_of(), torch.randn(2, 40, 3))
+    return network.eval()
+
+
+@pytest.mark.parametrize("name", ["paper", "base", "tiny", "large"])
+def test_every_preset_answers_with_its_shapes(name: str) -> None:
+    network = settled(PRESETS[name].network, segments=5)
+    with torch.inference_mode():
+        logits, distance, direction = network(
+            cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3)
+        )
+    assert logits.shape == (2, 11, 6) and distance.shape == (2, 11) and direction.shape == (2, 11, 3)
+
+
+def test_paper_preset_has_the_papers_sizes() -> None:
+    config = PRESETS["paper"].network
+    network = Network(config, 5)
+    assert config.latent == 1024
+    assert network.decoder.encode.channels == 60
+    assert [layer.in_features for layer in network.decoder.hidden] == [512] * 6
+    assert len(network.decoder.norms) == 7
+    assert network.decoder.latent2.in_features == 1024 and network.decoder.query2.in_features == 60
+    assert not network.decoder.local and config.sight_neighbors == 0
+
+
+def test_encoder_ignores_the_order_within_its_last_half() -> None:
+    """Centres are the first half (a farthest-point sample); the rest is a set, whatever its order."""
+    config = replace(TINY, neighbors=TINY.points)
+    encoder = settled(config).encoder
+    cloud = cloud_of(config)
+    half = config.points // 2
+    shuffled = torch.cat([cloud[:, :half], cloud[:, half:][:, torch.randperm(half)]], dim=1)
+    with torch.inference_mode():
+        assert torch.allclose(encoder(cloud).latent, encoder(shuffled).latent, atol=1e-5)
+
+
+def test_encoder_ignores_repeated_points() -> None:
+    config = replace(TINY, neighbors=TINY.points)
+    encoder = PointNet2(config).eval()
+    cloud = cloud_of(config)
+    doubled = torch.cat([cloud, cloud[:, : config.points // 4]], dim=1)
+    doubled = torch.cat([doubled[:, : config.points // 2], doubled[:, config.points // 2 :]], dim=1)
+    encoder.ratio1 = 0.5
+    with torch.inference_mode():
+        plain = encoder(cloud).latent
+        encoder.ratio1 = (config.points // 2) / doubled.shape[1]
+        assert torch.allclose(plain, encoder(doubled).latent, atol=1e-5)
+
+
+def test_split_latent_layer_equals_concatenation() -> None:
+    """W [z; x] = W_z z + W_x x: the paper's concatenated query vector, without building it."""
+    network = settled(replace(TINY, local_neighbors=0, sight_neighbors=0))
+    decoder, cloud = network.decoder, cloud_of(TINY)
+    points = torch.randn(2, 9, 3)
+    with torch.inference_mode():
+        latent = network.encoder(cloud).latent
+        vector = torch.cat([latent[:, None].expand(-1, 9, -1), decoder.encode(points)], dim=-1)
+        first = torch.cat([decoder.latent1.weight, decoder.query1.weight], dim=1)
+        skip = torch.cat([decoder.latent2.weight, decoder.query2.weight], dim=1)
+        hidden = vector @ first.T
+        for number, norm in enumerate(decoder.norms):
+            if number > 0:
+                hidden = hidden @ decoder.hidden[number - 1].weight.T
+            if number == 4:  # after four layers
+                hidden = hidden + vector @ skip.T
+            hidden = torch.relu(norm(hidden.flatten(0, 1))).view_as(hidden)
+        expected = decoder.head(hidden)[..., :4]
+        logits, _, _ = network(cloud, viewpoint_of(), points)
+    assert torch.allclose(logits, expected, atol=1e-4)
+
+
+def test_queries_do_not_influence_each_other() -> None:
+    network = settled(TINY)
+    points = torch.randn(2, 12, 3)
+    with torch.inference_mode():
+        code = network.encode(cloud_of(TINY), viewpoint_of())
+        together = network.query(code, points).logits
+        alone = torch.cat([network.query(code, points[:, i : i + 1]).logits for i in range(12)], dim=1)
+    assert torch.allclose(together, alone, atol=1e-5)
+
+
+def test_frequency_encoding_is_the_papers() -> None:
+    encode = FrequencyEncoding(-4, 5)
+    x = torch.tensor([[[0.07, -0.4, 1.3]]])
+    expected = torch.cat(
+        [torch.stack([f(2.0**e * torch.pi * c) for c in x[0, 0] for e in range(-4, 6)]) for f in (torch.sin, torch.cos)]
+    )
+    assert torch.allclose(encode(x)[0, 0], expected, atol=1e-5)
+
+
+def test_negative_exponents_tell_far_points_apart() -> None:
+    """The reason for them: with exponents from 0, points two units apart would be encoded alike."""
+    a, b = torch.tensor([[[0.5, 0.0, 0.0]]]), torch.tensor([[[2.5, 0.0, 0.0]]])
+    assert torch.allclose(FrequencyEncoding(0, 5)(a), FrequencyEncoding(0, 5)(b), atol=1e-4)
+    assert not torch.allclose(FrequencyEncoding(-4, 5)(a), FrequencyEncoding(-4, 5)(b), atol=0.1)
+
+
+def example_prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(0)
+    prediction = Prediction(torch.randn(2, 5, 4), torch.randn(2, 5), torch.randn(2, 5, 3))
+    return prediction, torch.randint(0, 4, (2, 5)), torch.randn(2, 5), F.normalize(torch.randn(2, 5, 3), dim=-1)
+
+
+def test_loss_variants_add_up() -> None:
+    prediction, labels, distances, directions = example_prediction()
+    full, terms = occupancy_loss(prediction, labels, distances, directions, "ce+l1+cd", 100.0)
+    assert torch.isclose(full, terms["ce"] + 100.0 * terms["l1"] + terms["cd"])
+    for loss, names in (("ce", {"ce"}), ("l1", {"l1"}), ("ce+l1", {"ce", "l1"})):
+        _, part = occupancy_loss(prediction, labels, distances, directions, loss, 100.0)  # type: ignore[arg-type]
+        assert set(part) == names
+        assert all(torch.isclose(part[name], terms[name]) for name in names)
+
+
+def test_cosine_term_is_minus_one_for_the_right_direction_of_any_length() -> None:
+    prediction, labels, distances, directions = example_prediction()
+    right = Prediction(prediction.logits, prediction.distance, 7.0 * directions)
+    _, terms = occupancy_loss(right, labels, distances, directions, "ce+l1+cd", 100.0)
+    assert torch.isclose(terms["cd"], torch.tensor(-1.0))

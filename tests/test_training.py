@@ -1,0 +1,168 @@
+"""Training: it learns, and stopping, resuming or sharing the work changes nothing."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from toy_data import NAMES, write_toy_dataset
+
+from mereo import training
+from mereo.config import PRESETS, AugmentConfig, TrainConfig
+from mereo.weights import load_model
+
+SMALL = replace(
+    PRESETS["tiny"],
+    network=replace(PRESETS["tiny"].network, points=64, width=48, neighbors=8, mlp_global=(32, 48)),
+    batch=8,
+    queries=48,
+    epochs=2,
+    holdout=8,
+    augment=AugmentConfig(keep_points=(0.6, 1.0), hole_probability=0.3),
+)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_dataset(tmp_path_factory.mktemp("toy") / "data")
+
+
+class Killed(Exception):
+    pass
+
+
+def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    original = training.Trainer.train_step
+
+    def step(self: training.Trainer, batch: object) -> None:
+        if self.step == steps:
+            raise Killed
+        original(self, batch)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(training.Trainer, "train_step", step)
+
+
+def without_wall_clock(run: Path) -> dict[str, torch.Tensor]:
+    return load_file(run / "checkpoint.safetensors")
+
+
+def test_killed_and_resumed_equals_uninterrupted(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training.train(dataset, tmp_path / "whole", SMALL, checkpoint_every_s=0.0)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        kill_after(patch, 5)
+        training.train(dataset, tmp_path / "parts", SMALL, checkpoint_every_s=0.0)
+    assert not (tmp_path / "parts" / "checkpoint.safetensors.tmp").exists()
+    training.train(dataset, tmp_path / "parts", SMALL, checkpoint_every_s=0.0)
+    whole, parts = without_wall_clock(tmp_path / "whole"), without_wall_clock(tmp_path / "parts")
+    assert whole.keys() == parts.keys()
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    assert (tmp_path / "whole" / "metrics.csv").read_text() == (tmp_path / "parts" / "metrics.csv").read_text()
+
+
+def test_a_finished_run_is_left_alone(dataset: Path, tmp_path: Path) -> None:
+    first = training.train(dataset, tmp_path / "run", SMALL).read_bytes()
+    assert training.train(dataset, tmp_path / "run", SMALL).read_bytes() == first
+
+
+def test_other_settings_do_not_continue_a_run(dataset: Path, tmp_path: Path) -> None:
+    training.train(dataset, tmp_path / "run", SMALL)
+    with pytest.raises(ValueError, match=r"another train setting learning_rate \(0\.004 instead of 0\.1\)"):
+        training.train(dataset, tmp_path / "run", replace(SMALL, learning_rate=0.1))
+
+
+def test_a_directory_with_other_things_is_not_a_run(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(FileExistsError, match="exists and is not a training run"):
+        training.train(dataset, tmp_path, SMALL)
+    assert os.listdir(tmp_path) == ["thesis.tex"]
+
+
+def test_run_directory_tells_the_story(dataset: Path, tmp_path: Path) -> None:
+    training.train(dataset, tmp_path / "run", SMALL)
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows] == list(range(1, 15))  # 58 examples, batches of 8, two passes
+    assert 0 <= float(rows[-1]["val_iou"]) <= 1
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["train"]["batch"] == 8
+    assert (tmp_path / "run" / "curves.png").read_bytes().startswith(b"\x89PNG")
+    model = load_model(tmp_path / "run" / "weights.safetensors")
+    assert model.names == NAMES
+    assert model.provenance["training_seed"] == 5 and model.provenance["scene"] == "toy"
+
+
+def test_batches_visit_every_example_once_per_pass(dataset: Path, tmp_path: Path) -> None:
+    data = training.Dataset.load(dataset)
+    config = replace(SMALL, holdout=4, epochs=4)
+    trainer = training.Trainer(config, data, tmp_path, training.Process(), torch.device("cpu"))
+    seen = torch.cat([trainer._batch_index(step) for step in range(trainer.total)])
+    assert trainer.total * 8 == 4 * 60
+    assert torch.equal(seen.bincount(), torch.full((60,), 4))
+
+
+def test_it_learns_the_two_halves(dataset: Path, tmp_path: Path) -> None:
+    """Thirty passes over 58 examples suffice to beat any constant answer by far."""
+    training.train(dataset, tmp_path / "run", replace(SMALL, epochs=40, augment=AugmentConfig()))
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        last = list(csv.DictReader(file))[-1]
+    assert float(last["val_iou"]) > 0.85 and float(last["val_miou"]) > 0.75
+    model = load_model(tmp_path / "run" / "weights.safetensors")
+    rng = np.random.default_rng(0)
+    front = rng.normal(size=(300, 3))
+    front *= 8.0 / np.linalg.norm(front, axis=1, keepdims=True)
+    front[:, 2] = -np.abs(front[:, 2])
+    center = np.array([3.0, -2.0, 150.0])
+    answer = model.query(model.encode(center + front), center + np.array([[-4.0, 0, 0], [4.0, 0, 0], [0, 0, 20.0]]))
+    assert answer.label.tolist() == [1, 2, 0]
+    assert np.allclose(answer.probability.sum(axis=1), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("loss", ["ce", "l1", "ce+l1", "ce+l1+cd"])
+def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, loss: str) -> None:
+    config = replace(SMALL, loss=loss, epochs=0.2)  # type: ignore[arg-type]
+    model = load_model(training.train(dataset, tmp_path / "run", config))
+    cloud = np.random.default_rng(0).normal(size=(80, 3)) + [0, 0, 50]
+    answer = model.query(model.encode(cloud), cloud[:7])
+    assert answer.label.shape == (7,) and np.isfinite(answer.distance).all()
+
+
+def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:
+    """Under torchrun, both halves of every batch count: the result is finite, complete, and resumable."""
+    script = tmp_path / "run.py"
+    script.write_text(
+        "import sys\nfrom dataclasses import replace\nfrom pathlib import Path\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "from test_training import SMALL\nfrom mereo.training import train\n"
+        "train(Path(sys.argv[1]), Path(sys.argv[2]), replace(SMALL, epochs=1))\n"
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
+    done = subprocess.run(
+        [*command, str(dataset), str(tmp_path / "run")], env=environment, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    tensors = load_file(tmp_path / "run" / "checkpoint.safetensors")
+    assert all(torch.isfinite(value).all() for value in tensors.values())
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 7
+
+
+def test_batch_must_be_divisible(dataset: Path, tmp_path: Path) -> None:
+    data = training.Dataset.load(dataset)
+    with pytest.raises(ValueError, match="batch of 8 cannot be shared by 3 processes"):
+        training._claim_run(tmp_path / "run", dataset, SMALL, data, training.Process(0, 3))
+
+
+def test_paper_preset_is_the_papers_recipe() -> None:
+    paper = PRESETS["paper"]
+    assert paper == TrainConfig()
+    assert (paper.batch, paper.learning_rate, paper.epochs, paper.l1_weight) == (40, 5e-4, 300.0, 100.0)
+    assert paper.augment == AugmentConfig() and paper.schedule == "constant" and paper.loss == "ce+l1"

@@ -1,0 +1,65 @@
+"""A closed-form dataset, written as `mereo generate` writes it: two half balls seen from one side.
+
+Segment `left` is the half of the unit ball with x < 0, `right` the other; the ball has a random radius and place. It
+needs no renderer and no sampler, so the tests of learning stand on their own.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from safetensors.numpy import save_file
+
+NAMES = ("left", "right")
+SHARD = 32
+
+
+def write_toy_dataset(directory: Path, examples: int = 64, points: int = 96, queries: int = 128) -> Path:
+    """Write the dataset and return its directory."""
+    directory.mkdir(parents=True)
+    rng = np.random.default_rng(5)
+    for number in range(0, examples, SHARD):
+        rows = [_example(rng, points, queries) for _ in range(min(SHARD, examples - number))]
+        tensors = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+        save_file(tensors, directory / f"shard-{number // SHARD:05d}.safetensors")
+    manifest = {
+        "scene": "toy",
+        "seed": 5,
+        "examples": examples,
+        "version": "0",
+        "any_roll": False,
+        "segments": [{"name": name, "color": [50 * i, 90, 200]} for i, name in enumerate(NAMES)],
+    }
+    (directory / "manifest.json").write_text(json.dumps(manifest))
+    return directory
+
+
+def _example(rng: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
+    radius, center = rng.uniform(5.0, 10.0), np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), rng.uniform(100, 200)])
+    front = rng.normal(size=(points, 3))
+    front /= np.linalg.norm(front, axis=1, keepdims=True)
+    front[:, 2] = -np.abs(front[:, 2])
+    cloud = center + radius * front
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    middle, scale = (low + high) / 2, 2 / (high - low).max()
+    places = center + radius * rng.uniform(-1.4, 1.4, size=(queries, 3))
+    offset = (places - center) / radius
+    reach = np.linalg.norm(offset, axis=1)
+    # distance to the nearest of the sphere and, inside, the wall between the halves
+    wall = np.where(reach < 1, np.abs(offset[:, 0]), np.inf)
+    distance = np.minimum(np.abs(reach - 1), wall) * np.where(reach < 1, -1, 1) * radius * scale
+    labels = np.where(reach >= 1, 0, np.where(offset[:, 0] < 0, 1, 2))
+    radial = offset / reach[:, None] * np.where(reach < 1, 1, -1)[:, None]
+    across = np.stack([-np.sign(offset[:, 0]), 0 * reach, 0 * reach], axis=1)
+    direction = np.where((wall < np.abs(reach - 1))[:, None], across, radial)
+    return {
+        "cloud": ((cloud - middle) * scale).astype(np.float32),
+        "cloud_count": np.array(points, dtype=np.int32),
+        "center": middle,
+        "scale": np.array(scale),
+        "positions": ((places - middle) * scale).astype(np.float32),
+        "labels": labels.astype(np.uint8),
+        "distances": distance.astype(np.float32),
+        "directions": direction.astype(np.float16),
+        "rest": offset.astype(np.float16),
+    }
