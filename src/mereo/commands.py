@@ -1,0 +1,292 @@
+"""The command line: one dataclass per command, its fields the options, ``run`` the work.
+
+``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
+"""
+
+from dataclasses import dataclass, field, make_dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union
+
+import tyro
+from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
+
+from mereo.config import PRESETS, GenerateConfig, TrainConfig
+
+Preset = Literal["paper", "base", "large", "tiny"]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Reconstruct a real scan and shipped depth frames, and compare them with the truth.
+
+    Attributes:
+        output: folder for meshes, pictures and reports.
+    """
+
+    output: Path = Path("out/demo")
+
+    def run(self) -> None:
+        from mereo import demo
+
+        demo.main(self.output)
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Show versions, device, CPU features and extras, and how to install what is missing."""
+
+    def run(self) -> None:
+        from mereo.doctor import diagnose
+
+        diagnose()
+
+
+@dataclass(frozen=True)
+class SceneList:
+    """Name the built-in scenes."""
+
+    def run(self) -> None:
+        from mereo.scene import SCENES
+
+        for name in SCENES:
+            print(name)
+
+
+@dataclass(frozen=True)
+class SceneCheck:
+    """Check that every segment is closed and outward oriented and that no two overlap.
+
+    Attributes:
+        scene: a name from `mereo scene list`.
+    """
+
+    scene: Positional[str]
+
+    def run(self) -> None:
+        from mereo.scene import load_scene
+        from mereo.solid import check_overlap
+
+        scene = load_scene(self.scene)
+        scene.rest.check()
+        check_overlap(scene.rest)
+        for segment in scene.rest.segments:
+            print(f"{segment.name:<20} {len(segment.faces):>7} faces   volume {segment.volume:.4g} cubic units")
+        print(f"{scene.name}: {len(scene.rest.segments)} segments, closed, outward oriented, without overlap")
+        print(f"source: {scene.source}")
+
+
+@dataclass(frozen=True)
+class ScenePreview:
+    """Draw nine random states of a scene, each with its camera and depth image.
+
+    Attributes:
+        scene: a name from `mereo scene list`.
+        output: the picture, a PNG file.
+        seed: another seed shows other states.
+    """
+
+    scene: Positional[str]
+    output: Path
+    seed: int = 0
+
+    def run(self) -> None:
+        from mereo.pictures import preview_scene
+        from mereo.scene import load_scene
+
+        preview_scene(load_scene(self.scene), self.output, self.seed)
+        print(f"wrote {self.output}")
+
+
+@dataclass(frozen=True)
+class AssetsList:
+    """Name the downloadable meshes and scans, with licence and credit."""
+
+    def run(self) -> None:
+        from mereo.assets import ASSETS, location
+
+        for asset in ASSETS.values():
+            print(f"{asset.name}\n  {asset.description}\n  {asset.licence}; credit: {asset.credit}")
+            print(f"  {location(asset.name) or 'not here yet'}")
+
+
+@dataclass(frozen=True)
+class AssetsGet:
+    """Download assets, check them, and print where they are.
+
+    Attributes:
+        names: from `mereo assets list`; none means all of them.
+    """
+
+    names: Positional[tuple[str, ...]] = ()
+
+    def run(self) -> None:
+        from mereo.assets import ASSETS, get
+
+        for name in self.names or ASSETS:
+            print(get(name))
+
+
+@dataclass(frozen=True)
+class Generate:
+    """Make labelled training examples of a scene.
+
+    Attributes:
+        scene: a name from `mereo scene list`.
+        examples: how many.
+        output: folder to create.
+        seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
+        workers: processes; the result does not depend on them. 0 means one per core.
+        shard: make only part i of n, as i/n from 0/n to (n-1)/n, for example on several machines.
+        resume: go on with a run that was stopped.
+        test: allow a test seed.
+        settings: how one example is made.
+    """
+
+    scene: Positional[str]
+    examples: int
+    output: Path
+    seed: int = 0
+    workers: int = 0
+    shard: str = "0/1"
+    resume: bool = False
+    test: bool = False
+    settings: OmitArgPrefixes[GenerateConfig] = field(default_factory=GenerateConfig)
+
+    def run(self) -> None:
+        from mereo.generation import generate
+        from mereo.scene import load_scene
+
+        generate(load_scene(self.scene), self.output, self.settings)
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a network on generated examples; the same command again continues a stopped run.
+
+    Attributes:
+        dataset: folder written by `mereo generate`.
+        output: folder of the run.
+        preset: the settings that the options below start from: as published, recommended on any machine, the same for a GPU, or a two-minute trial.
+        config: the recipe; defaults are the chosen preset's.
+    """
+
+    dataset: Positional[Path]
+    output: Path
+    preset: Preset = "base"
+    config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+
+    def run(self) -> None:
+        from mereo.training import train
+
+        print(f"weights: {train(self.dataset, self.output, self.config)}")
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score weights on test examples of their scene: IoU, mIoU, per segment, with pictures of the errors.
+
+    Attributes:
+        weights: a shipped name or a file.
+        output: folder to create.
+        examples: how many.
+        seed: test seeds start at 1,000,000.
+        scene: the scene, where it is not the one that the weights were trained on.
+    """
+
+    weights: Positional[str]
+    output: Path
+    examples: int = 128
+    seed: int = 1_000_000
+    scene: str | None = None
+
+    def run(self) -> None:
+        from mereo.evaluation import evaluate_weights
+
+        evaluate_weights(self.weights, self.output, examples=self.examples, seed=self.seed, scene=self.scene)
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Reconstruct all segments from a point cloud (PLY, PCD, XYZ, NPY, NPZ) or a 16-bit depth image (PNG).
+
+    Attributes:
+        input: the file; results are in its frame and units.
+        weights: a shipped name or a file.
+        output: folder to create.
+        resolution: grid cells along the longest side.
+        intrinsics: the depth camera, JSON or YAML.
+        depth_scale: pixel value of one metre.
+        mask: image that is not 0 on the object.
+        frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
+        drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
+        force: replace an existing output folder.
+    """
+
+    input: Positional[Path]
+    weights: str
+    output: Path
+    resolution: int = 128
+    intrinsics: Path | None = None
+    depth_scale: float = 1000.0
+    mask: Path | None = None
+    frame: Literal["camera", "scanner"] = "camera"
+    drop_invalid: bool = False
+    force: bool = False
+
+    def run(self) -> None:
+        from mereo.reconstruction import reconstruct_file
+
+        reconstruct_file(self.input, self.weights, self.output)
+
+
+Command = (
+    Demo | Doctor | SceneList | SceneCheck | ScenePreview | AssetsList | AssetsGet | Generate | Train | Evaluate
+    | Reconstruct
+)  # fmt: skip
+
+
+def parse(arguments: list[str]) -> Command:
+    """The command that these arguments mean; exits with 2 after a message when they mean none."""
+    command: Command = tyro.cli(
+        _syntax(_chosen_preset(arguments)),
+        args=arguments or ["--help"],
+        prog="mereo",
+        description="Reconstruct deformable objects with all their segments from one depth image or point cloud. "
+        "`mereo COMMAND --help` explains a command, `mereo --version` prints the version.",
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    return command
+
+
+def _syntax(preset: str) -> Any:
+    """All commands as a type that tyro reads; the defaults of ``train`` are those of the preset."""
+    scene = (SceneList, "list"), (SceneCheck, "check"), (ScenePreview, "preview")
+    assets = (AssetsList, "list"), (AssetsGet, "get")
+    return (
+        Annotated[Demo, subcommand("demo")]
+        | Annotated[Doctor, subcommand("doctor")]
+        | Annotated[_group(scene), subcommand("scene", description="List, check or draw the built-in scenes.")]
+        | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
+        | Annotated[Generate, subcommand("generate")]
+        | Annotated[_train_from(preset), subcommand("train")]
+        | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Reconstruct, subcommand("reconstruct")]
+    )
+
+
+def _train_from(preset: str) -> type[Train]:
+    """``Train`` whose options default to the preset's values."""
+    recipe = ("config", Annotated[TrainConfig, arg(name="")], field(default=PRESETS[preset]))
+    return make_dataclass("Train", [recipe], bases=(Train,), frozen=True, namespace={"__doc__": Train.__doc__})
+
+
+def _group(members: tuple[tuple[type, str], ...]) -> Any:
+    return Union[*(Annotated[command, subcommand(name)] for command, name in members)]
+
+
+def _chosen_preset(arguments: list[str]) -> str:
+    """The value of --preset, which must be known before parsing because the other defaults depend on it."""
+    values = [a.partition("=")[2] for a in arguments if a.startswith("--preset=")]
+    values += [after for option, after in pairwise(arguments) if option == "--preset"]
+    return values[-1] if values and values[-1] in PRESETS else "base"

@@ -1,0 +1,198 @@
+"""The registry: where a file comes from, what is checked, and what is said when it cannot be had."""
+
+import functools
+import hashlib
+import http.server
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import requests
+import trimesh
+
+from mereo import assets
+from mereo.assets import ASSETS, BUNNY_SCAN_POSES, Asset, AssetUnavailable
+
+CONTENT = b"OFF\n0 0 0\n"
+
+
+@pytest.fixture(autouse=True)
+def empty_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """No mirror, no cached files: the state of a fresh machine (real files are asked for before)."""
+    if "require_asset" not in request.fixturenames:
+        monkeypatch.delenv(assets.MIRROR_VARIABLE, raising=False)
+        monkeypatch.setattr(assets, "_cache", lambda: tmp_path / "cache")
+    return tmp_path / "cache"
+
+
+class QuietHandler(http.server.SimpleHTTPRequestHandler):
+    """Serves files without a line per request in the test output."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[str]:
+    """A web server on this machine that serves ``tmp_path / "web"``; yields its address."""
+    (tmp_path / "web").mkdir()
+    handler = functools.partial(QuietHandler, directory=tmp_path / "web")
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as web:
+        thread = threading.Thread(target=web.serve_forever, args=(0.01,))
+        thread.start()
+        yield f"http://127.0.0.1:{web.server_port}"
+        web.shutdown()
+        thread.join()
+
+
+def register(monkeypatch: pytest.MonkeyPatch, url: str) -> Asset:
+    digest = hashlib.sha256(CONTENT).hexdigest()
+    asset = replace(ASSETS["bunny/bunny.off"], name="toy/toy.off", url=url, sha256=digest)
+    monkeypatch.setattr(assets, "ASSETS", {asset.name: asset})
+    return asset
+
+
+def test_every_entry_is_complete_and_pinned_to_a_commit() -> None:
+    for name, asset in ASSETS.items():
+        assert name == asset.name
+        assert re.fullmatch(r"[a-z]+/[A-Za-z0-9_]+\.[a-z]+", name)
+        assert re.fullmatch(r"[0-9a-f]{64}", asset.sha256)
+        assert re.fullmatch(r"https://[^ ]+/[0-9a-f]{40}/[^ ]+", asset.url)
+        assert asset.url.rsplit(".", 1)[1] == name.rsplit(".", 1)[1]
+        assert asset.licence
+        assert asset.credit
+        assert asset.description
+    assert len({asset.sha256 for asset in ASSETS.values()}) == len(ASSETS)
+    assert len({asset.url for asset in ASSETS.values()}) == len(ASSETS)
+
+
+@pytest.mark.parametrize("name", sorted(ASSETS))
+def test_real_files_have_the_declared_hash(name: str, require_asset: Callable[[str], Path]) -> None:
+    assert hashlib.sha256(require_asset(name).read_bytes()).hexdigest() == ASSETS[name].sha256
+
+
+def test_mirror_comes_first_and_is_checked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asset = register(monkeypatch, "http://127.0.0.1:9/toy.off")
+    monkeypatch.setenv("MEREO_ASSETS", str(tmp_path / "mirror"))
+    path = tmp_path / "mirror" / asset.name
+    path.parent.mkdir(parents=True)
+    path.write_bytes(CONTENT)
+    assert assets.get(asset.name) == path
+    assert assets.location(asset.name) == path
+    path.write_bytes(CONTENT + b"changed")
+    found = hashlib.sha256(CONTENT + b"changed").hexdigest()
+    with pytest.raises(ValueError, match="delete it to download the right one") as caught:
+        assets.get(asset.name)
+    assert all(part in str(caught.value) for part in (str(path), found, asset.sha256))
+
+
+def test_mirror_that_is_no_folder_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("MEREO_ASSETS", str(tmp_path / "absent"))
+    with pytest.raises(AssetUnavailable, match="not a folder: correct or unset it"):
+        assets.get("bunny/bunny.off")
+
+
+def test_download_once_then_from_the_cache(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, server: str, empty_cache: Path
+) -> None:
+    asset = register(monkeypatch, f"{server}/toy.off")
+    (tmp_path / "web" / "toy.off").write_bytes(CONTENT)
+    assert assets.location(asset.name) is None
+    path = assets.get(asset.name)
+    assert path == empty_cache / asset.name
+    assert path.read_bytes() == CONTENT
+    (tmp_path / "web" / "toy.off").unlink()
+    assert assets.get(asset.name) == path == assets.location(asset.name)
+
+
+def test_damaged_cache_is_downloaded_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, server: str, empty_cache: Path
+) -> None:
+    asset = register(monkeypatch, f"{server}/toy.off")
+    (tmp_path / "web" / "toy.off").write_bytes(CONTENT)
+    (empty_cache / "toy").mkdir(parents=True)
+    (empty_cache / asset.name).write_bytes(b"truncat")
+    assert assets.get(asset.name).read_bytes() == CONTENT
+
+
+def test_wrong_or_missing_download_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, server: str, empty_cache: Path
+) -> None:
+    asset = register(monkeypatch, f"{server}/toy.off")
+    with pytest.raises(AssetUnavailable, match=r"download of toy/toy.off failed \(HTTPError\).*MEREO_ASSETS"):
+        assets.get(asset.name)
+    (tmp_path / "web" / "toy.off").write_bytes(b"a log-in page")
+    with pytest.raises(AssetUnavailable, match="is not toy/toy.off"):
+        assets.get(asset.name)
+    assert not [path for path in empty_cache.rglob("*") if path.is_file()]
+
+
+def test_no_network_is_one_sentence_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asset = register(monkeypatch, "http://127.0.0.1:9/toy.off")  # the discard port: refused
+    start = time.monotonic()
+    with pytest.raises(
+        AssetUnavailable, match="cannot be reached: put the file from .* and set MEREO_ASSETS"
+    ) as caught:
+        assets.get(asset.name)
+    assert time.monotonic() - start < 2
+    assert "\n" not in str(caught.value)
+
+
+def test_silent_network_is_given_up_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A look-up that hangs has no time limit of its own, so the limit must hold without its help."""
+    asset = register(monkeypatch, "http://127.0.0.1:9/toy.off")
+    release = threading.Event()
+
+    def hang(*_: object, **__: object) -> None:
+        release.wait(30)
+        raise requests.ConnectionError
+
+    monkeypatch.setattr(assets, "ANSWER_SECONDS", 0.2)
+    monkeypatch.setattr(requests, "head", hang)
+    start = time.monotonic()
+    with pytest.raises(AssetUnavailable, match="cannot be reached"):
+        assets.get(asset.name)
+    assert time.monotonic() - start < 2
+    release.set()
+
+
+def test_unwritable_cache_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, server: str) -> None:
+    asset = register(monkeypatch, f"{server}/toy.off")
+    (tmp_path / "web" / "toy.off").write_bytes(CONTENT)
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setattr(assets, "_cache", lambda: tmp_path / "file")
+    with pytest.raises(AssetUnavailable, match="cannot be stored at .*file.*XDG_CACHE_HOME"):
+        assets.get(asset.name)
+
+
+def test_unknown_name_points_to_the_list() -> None:
+    with pytest.raises(ValueError, match="no asset 'bunny'; known names are printed by: mereo assets list"):
+        assets.get("bunny")
+
+
+@pytest.mark.parametrize("scan", sorted(BUNNY_SCAN_POSES))
+def test_scan_poses_are_rigid_and_constant(scan: str) -> None:
+    pose = BUNNY_SCAN_POSES[scan]
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=2e-6)
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
+    with pytest.raises(ValueError, match="read-only"):
+        pose[0, 0] = 2.0
+
+
+@pytest.mark.parametrize("scan", sorted(BUNNY_SCAN_POSES))
+def test_posed_scans_lie_on_the_bunny(scan: str, require_asset: Callable[[str], Path]) -> None:
+    bunny = trimesh.load_mesh(require_asset("bunny/bunny.off"), process=False)
+    points = np.asarray(trimesh.load(require_asset(f"bunny/{scan}.ply"), process=False).vertices)[::20]
+    pose = BUNNY_SCAN_POSES[scan]
+    posed = points @ pose[:3, :3].T + pose[:3, 3]
+    squared, *_ = igl.point_mesh_squared_distance(posed, np.asarray(bunny.vertices), np.asarray(bunny.faces))
+    distance_mm = 1000 * np.sqrt(squared)
+    assert np.median(distance_mm) < 0.12
+    assert np.quantile(distance_mm, 0.95) < 0.5

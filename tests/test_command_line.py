@@ -1,0 +1,246 @@
+"""The command line as a user meets it: help at once, one line for every error, the exit codes of a good citizen."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import mereo.__main__ as command_line
+from mereo import commands
+from mereo.config import PRESETS, GenerateConfig, SamplingConfig
+
+WITHOUT_NETWORK = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+
+
+def mereo(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line in its own process, without the shape checks of the tests."""
+    command = [sys.executable, "-m", "mereo", *arguments]
+    variables = {**os.environ, "COLUMNS": "120", **environment}
+    return subprocess.run(command, capture_output=True, text=True, env=variables, timeout=120, check=False)
+
+
+def assert_one_line_error(result: subprocess.CompletedProcess[str], *parts: str) -> None:
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith("mereo: error: ")
+    assert result.stderr.count("\n") == 1
+    assert all(part in result.stderr for part in parts), result.stderr
+
+
+def raising(error: BaseException) -> SimpleNamespace:
+    """A command whose work raises ``error``."""
+
+    def run() -> None:
+        raise error
+
+    return SimpleNamespace(run=run)
+
+
+# --- help and version -------------------------------------------------------------------------------------------------
+
+
+def test_help_is_instant_and_names_every_command() -> None:
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        result = mereo("--help")
+        seconds.append(time.perf_counter() - start)
+    assert result.returncode == 0
+    names = ("demo", "doctor", "scene", "assets", "generate", "train", "evaluate", "reconstruct")
+    assert all(f"• {name} " in result.stdout for name in names)
+    assert min(seconds) < 0.5
+
+
+@pytest.mark.parametrize("command", ["", "generate", "train", "evaluate", "reconstruct", "scene", "assets"])
+def test_help_loads_no_heavy_library(command: str) -> None:
+    code = (
+        "import sys, mereo.__main__ as m\n"
+        "try: m.main(sys.argv[1:])\n"
+        "except SystemExit as end: assert not end.code\n"
+        "print(sorted({'torch', 'numpy', 'scipy', 'trimesh', 'matplotlib'} & set(sys.modules)))"
+    )
+    arguments = [*command.split(), "--help"]
+    result = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+    assert result.stdout.splitlines()[-1] == "[]", result.stderr
+
+
+def test_no_argument_shows_the_help() -> None:
+    assert mereo().stdout == mereo("--help").stdout
+
+
+@pytest.mark.parametrize("option", ["-V", "--version"])
+def test_version(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line.main([option]) == 0
+    assert capsys.readouterr().out == f"mereo {command_line.version()}\n"
+    assert command_line.version()[0].isdigit()
+
+
+# --- what the options mean --------------------------------------------------------------------------------------------
+
+
+def test_generate_options_reach_the_settings() -> None:
+    text = (
+        "generate rope --examples 7 --seed 3 --output out --workers 2 --shard 1/4 --resume --test "
+        "--noise-std 0.2 --points 512 --sampler nested-sort-sample --oversample 2"
+    )
+    command = commands.parse(text.split())
+    assert command == commands.Generate(
+        scene="rope",
+        examples=7,
+        output=Path("out"),
+        seed=3,
+        workers=2,
+        shard="1/4",
+        resume=True,
+        test=True,
+        settings=GenerateConfig(
+            noise_std=0.2, points=512, sampling=SamplingConfig(sampler="nested-sort-sample", oversample=2)
+        ),
+    )
+    assert commands.parse(["generate", "rope", "--examples", "7", "--output", "out"]).settings == GenerateConfig()  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+@pytest.mark.parametrize("form", ["--preset {}", "--preset={}"])
+def test_preset_sets_every_default_of_train(preset: str, form: str) -> None:
+    command = commands.parse(f"train data --output run {form.format(preset)}".split())
+    assert isinstance(command, commands.Train)
+    assert command.config == PRESETS[preset]
+
+
+def test_train_options_override_the_preset() -> None:
+    text = (
+        "train data --epochs 2 --preset paper --network.width 64 --loss ce --network.no-encode-positions --output run"
+    )
+    command = commands.parse(text.split())
+    assert isinstance(command, commands.Train)
+    assert (command.config.epochs, command.config.loss, command.config.network.width) == (2, "ce", 64)
+    assert not command.config.network.encode_positions
+    assert command.config.learning_rate == PRESETS["paper"].learning_rate
+    assert commands.parse(["train", "data", "--output", "run"]).config == PRESETS["base"]  # type: ignore[union-attr]
+
+
+def test_reconstruct_options() -> None:
+    text = "reconstruct scan.ply --weights bunny --output out --frame scanner --resolution 64 --drop-invalid --force"
+    assert commands.parse(text.split()) == commands.Reconstruct(
+        Path("scan.ply"), "bunny", Path("out"), resolution=64, frame="scanner", drop_invalid=True, force=True
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "paint",
+        "scene",
+        "train",
+        "train data --output run --preset huge",
+        "generate rope --examples many --output out",
+        "generate rope --examples 1 --output out --sampler dense",
+        "reconstruct scan.ply --weights bunny --output out --frame world",
+    ],
+)
+def test_wrong_usage_exits_with_2(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        commands.parse(text.split())
+    assert caught.value.code == 2
+    printed = capsys.readouterr()
+    assert "--help" in printed.out + printed.err
+    assert "Traceback" not in printed.err
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_library_errors_are_one_line() -> None:
+    assert_one_line_error(mereo("assets", "get", "nothing"), "no asset 'nothing'", "mereo assets list")
+    assert_one_line_error(mereo("scene", "check", "cube"), "'cube' is unknown", "bunny, rope")
+
+
+def test_missing_network_is_one_line_at_once(tmp_path: Path) -> None:
+    start = time.perf_counter()
+    result = mereo("assets", "get", "bunny/bunny.off", MEREO_ASSETS="", XDG_CACHE_HOME=str(tmp_path), **WITHOUT_NETWORK)
+    assert_one_line_error(result, "bunny/bunny.off is not here", "set MEREO_ASSETS")
+    assert time.perf_counter() - start < 8
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (ValueError("the scale is -1;\n it must be positive"), "the scale is -1; it must be positive"),
+        (FileNotFoundError("there is no file 'a.ply'"), "there is no file 'a.ply'"),
+        (FileNotFoundError(2, "No such file or directory", "a.ply"), "a.ply: no such file or directory: correct that"),
+        (OSError(28, "No space left on device"), "no space left on device: correct that"),
+        (ImportError("pyvista is missing: pip install pyvista"), "pyvista is missing: pip install pyvista"),
+        (ValueError(), "ValueError"),
+    ],
+)
+def test_each_kind_of_error(
+    error: Exception, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)
+    monkeypatch.setattr(commands, "parse", lambda arguments: raising(error))
+    assert command_line.main([]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith(f"mereo: error: {line}")
+    assert printed.err.count("\n") == 1
+
+
+def test_a_mistake_in_the_program_is_not_dressed_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands, "parse", lambda arguments: raising(TypeError("a bug")))
+    with pytest.raises(TypeError, match="a bug"):
+        command_line.main([])
+
+
+def test_traceback_on_request() -> None:
+    result = mereo("assets", "get", "nothing", MEREO_TRACEBACK="1")
+    assert result.returncode == 1
+    assert "Traceback" in result.stderr
+    assert "no asset 'nothing'" in result.stderr
+
+
+def test_interruption(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(commands, "parse", lambda arguments: raising(KeyboardInterrupt()))
+    assert command_line.main([]) == 128 + signal.SIGINT
+    assert capsys.readouterr().err == "mereo: interrupted\n"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGPIPE"), reason="this system has no SIGPIPE")
+def test_closed_pipe_is_quiet() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "mereo", "assets", "list"]
+    result = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert result.stderr == ""
+    assert result.returncode == 128 + signal.SIGPIPE
+
+
+# --- commands that need no weights ------------------------------------------------------------------------------------
+
+
+def test_assets_list_shows_licence_and_place(tmp_path: Path) -> None:
+    (tmp_path / "bunny").mkdir()
+    (tmp_path / "bunny" / "chin.ply").write_text("")
+    result = mereo("assets", "list", MEREO_ASSETS=str(tmp_path), XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert result.returncode == 0
+    assert "Stanford Computer Graphics Laboratory" in result.stdout
+    assert "CC0 1.0" in result.stdout
+    assert str(tmp_path / "bunny" / "chin.ply") in result.stdout
+    assert "not here yet" in result.stdout
+
+
+def test_scene_list() -> None:
+    assert mereo("scene", "list").stdout.split() == ["bunny", "rope"]
+
+
+def test_doctor_exits_with_0() -> None:
+    result = mereo("doctor")
+    assert result.returncode == 0
+    assert result.stderr == ""
+    assert "torch" in result.stdout

@@ -1,0 +1,60 @@
+"""The report on a machine: facts, and a command for everything that is missing."""
+
+import sys
+
+import pytest
+import torch
+
+from mereo import doctor
+
+
+def test_report_names_versions_device_and_features(capsys: pytest.CaptureFixture[str]) -> None:
+    doctor.diagnose()
+    report = capsys.readouterr().out
+    facts = dict(line.split(maxsplit=1) for line in report.splitlines() if line)
+    assert facts["torch"] == torch.__version__
+    assert facts["python"].startswith(f"{sys.version_info.major}.{sys.version_info.minor}.")
+    assert facts["threads"].startswith(f"{torch.get_num_threads()} of ")
+    assert {"device", "avx512_bf16", "amx", "bfloat16", *doctor.PURPOSES} <= set(facts)
+
+
+def test_every_extra_is_explained_and_every_explanation_has_one() -> None:
+    import importlib.metadata
+
+    declared = importlib.metadata.metadata("mereo").get_all("Provides-Extra")
+    assert set(declared or ()) == set(doctor.PURPOSES)
+    assert all(doctor.requirements(extra) for extra in doctor.PURPOSES)
+    assert any(requirement.startswith("torch") for requirement in doctor.requirements(""))
+    assert not any("tensorboard" in requirement for requirement in doctor.requirements(""))
+
+
+def test_missing_extra_comes_with_the_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    version = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "tensorboard" else version(name))
+    doctor.diagnose()
+    line = next(row for row in capsys.readouterr().out.splitlines() if row.startswith("track"))
+    (requirement,) = doctor.requirements("track")
+    assert "missing, for training curves" in line
+    assert line.endswith(f"-m pip install '{requirement}'")
+
+
+def test_installed_extra_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(doctor, "_version", lambda name: "1.0")
+    doctor.diagnose()
+    report = capsys.readouterr().out
+    assert "missing" not in report
+    assert "installed, for tests and checks" in report
+
+
+def test_probes_that_this_torch_lacks_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(torch.cpu, "_is_amx_tile_supported", raising=False)
+
+    def refuse() -> bool:
+        raise RuntimeError
+
+    monkeypatch.setattr(torch.cpu, "_is_avx2_supported", refuse, raising=False)
+    features = doctor.cpu_features()
+    assert features["amx"] is None
+    assert features["avx2"] is None
