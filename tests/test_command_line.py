@@ -132,6 +132,17 @@ def test_reconstruct_options() -> None:
     )
 
 
+def test_shard_text() -> None:
+    assert commands.part_of("0/1") == (0, 1)
+    assert commands.part_of("3/12") == (3, 12)
+
+
+@pytest.mark.parametrize("shard", ["4/4", "1", "/2", "-1/2", "a/b", "1/2/3", "0/0", ""])
+def test_wrong_shard_is_explained(shard: str) -> None:
+    with pytest.raises(ValueError, match="it must be i/n with i from 0 to n - 1"):
+        commands.part_of(shard)
+
+
 @pytest.mark.parametrize(
     "text",
     [

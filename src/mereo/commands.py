@@ -3,6 +3,7 @@
 ``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
 """
 
+import os
 from dataclasses import dataclass, field, make_dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -155,9 +156,18 @@ class Generate:
 
     def run(self) -> None:
         from mereo.generation import generate
-        from mereo.scene import load_scene
 
-        generate(load_scene(self.scene), self.output, self.settings)
+        generate(
+            self.scene,
+            self.output,
+            self.settings,
+            examples=self.examples,
+            seed=self.seed,
+            workers=self.workers or os.cpu_count() or 1,
+            shard=part_of(self.shard),
+            resume=self.resume,
+            test=self.test,
+        )
 
 
 @dataclass(frozen=True)
@@ -167,7 +177,7 @@ class Train:
     Attributes:
         dataset: folder written by `mereo generate`.
         output: folder of the run.
-        preset: the settings that the options below start from: as published, recommended on any machine, the same for a GPU, or a two-minute trial.
+        preset: what the options below start from: as published, recommended, the same for a GPU, a two-minute trial.
         config: the recipe; defaults are the chosen preset's.
     """
 
@@ -238,6 +248,14 @@ class Reconstruct:
         from mereo.reconstruction import reconstruct_file
 
         reconstruct_file(self.input, self.weights, self.output)
+
+
+def part_of(shard: str) -> tuple[int, int]:
+    """``"1/4"`` is part 1 of 4, counted from 0."""
+    part, _, parts = shard.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
+        raise ValueError(f"the shard is {shard!r}; it must be i/n with i from 0 to n - 1: give for example --shard 0/4")
+    return int(part), int(parts)
 
 
 Command = (
