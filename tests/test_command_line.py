@@ -88,7 +88,7 @@ def test_generate_options_reach_the_settings() -> None:
         "generate rope --examples 7 --seed 3 --output out --workers 2 --shard 1/4 --resume --test "
         "--noise-std 0.2 --points 512 --sampler nested-sort-sample --oversample 2"
     )
-    command = commands.parse(text.split())
+    command = command_line.parse(text.split())
     assert command == commands.Generate(
         scene="rope",
         examples=7,
@@ -102,13 +102,13 @@ def test_generate_options_reach_the_settings() -> None:
             noise_std=0.2, points=512, sampling=SamplingConfig(sampler="nested-sort-sample", oversample=2)
         ),
     )
-    assert commands.parse(["generate", "rope", "--examples", "7", "--output", "out"]).settings == GenerateConfig()  # type: ignore[union-attr]
+    assert command_line.parse(["generate", "rope", "--examples", "7", "--output", "out"]).settings == GenerateConfig()  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 @pytest.mark.parametrize("form", ["--preset {}", "--preset={}"])
 def test_preset_sets_every_default_of_train(preset: str, form: str) -> None:
-    command = commands.parse(f"train data --output run {form.format(preset)}".split())
+    command = command_line.parse(f"train data --output run {form.format(preset)}".split())
     assert isinstance(command, commands.Train)
     assert command.config == PRESETS[preset]
 
@@ -117,17 +117,17 @@ def test_train_options_override_the_preset() -> None:
     text = (
         "train data --epochs 2 --preset paper --network.width 64 --loss ce --network.no-encode-positions --output run"
     )
-    command = commands.parse(text.split())
+    command = command_line.parse(text.split())
     assert isinstance(command, commands.Train)
     assert (command.config.epochs, command.config.loss, command.config.network.width) == (2, "ce", 64)
     assert not command.config.network.encode_positions
     assert command.config.learning_rate == PRESETS["paper"].learning_rate
-    assert commands.parse(["train", "data", "--output", "run"]).config == PRESETS["base"]  # type: ignore[union-attr]
+    assert command_line.parse(["train", "data", "--output", "run"]).config == PRESETS["base"]  # type: ignore[union-attr]
 
 
 def test_reconstruct_options() -> None:
     text = "reconstruct scan.ply --weights bunny --output out --frame scanner --resolution 64 --drop-invalid --force"
-    assert commands.parse(text.split()) == commands.Reconstruct(
+    assert command_line.parse(text.split()) == commands.Reconstruct(
         Path("scan.ply"), "bunny", Path("out"), resolution=64, frame="scanner", drop_invalid=True, force=True
     )
 
@@ -157,7 +157,7 @@ def test_wrong_shard_is_explained(shard: str) -> None:
 )
 def test_wrong_usage_exits_with_2(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        commands.parse(text.split())
+        command_line.parse(text.split())
     assert caught.value.code == 2
     printed = capsys.readouterr()
     assert "--help" in printed.out + printed.err
@@ -194,7 +194,7 @@ def test_each_kind_of_error(
     error: Exception, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)
-    monkeypatch.setattr(commands, "parse", lambda arguments: raising(error))
+    monkeypatch.setattr(command_line, "parse", lambda arguments: raising(error))
     assert command_line.main([]) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -203,7 +203,7 @@ def test_each_kind_of_error(
 
 
 def test_a_mistake_in_the_program_is_not_dressed_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commands, "parse", lambda arguments: raising(TypeError("a bug")))
+    monkeypatch.setattr(command_line, "parse", lambda arguments: raising(TypeError("a bug")))
     with pytest.raises(TypeError, match="a bug"):
         command_line.main([])
 
@@ -216,7 +216,7 @@ def test_traceback_on_request() -> None:
 
 
 def test_interruption(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(commands, "parse", lambda arguments: raising(KeyboardInterrupt()))
+    monkeypatch.setattr(command_line, "parse", lambda arguments: raising(KeyboardInterrupt()))
     assert command_line.main([]) == 128 + signal.SIGINT
     assert capsys.readouterr().err == "mereo: interrupted\n"
 

@@ -4,15 +4,13 @@
 """
 
 import os
-from dataclasses import dataclass, field, make_dataclass
-from itertools import pairwise
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Literal
 
-import tyro
-from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from mereo.config import PRESETS, GenerateConfig, TrainConfig
+from mereo.config import GenerateConfig, TrainConfig
 
 Preset = Literal["paper", "base", "large", "tiny"]
 
@@ -28,9 +26,9 @@ class Demo:
     output: Path = Path("out/demo")
 
     def run(self) -> None:
-        from mereo import demo
+        from mereo.demo import main
 
-        demo.main(self.output)
+        main(self.output)
 
 
 @dataclass(frozen=True)
@@ -256,55 +254,3 @@ def part_of(shard: str) -> tuple[int, int]:
     if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
         raise ValueError(f"the shard is {shard!r}; it must be i/n with i from 0 to n - 1: give for example --shard 0/4")
     return int(part), int(parts)
-
-
-Command = (
-    Demo | Doctor | SceneList | SceneCheck | ScenePreview | AssetsList | AssetsGet | Generate | Train | Evaluate
-    | Reconstruct
-)  # fmt: skip
-
-
-def parse(arguments: list[str]) -> Command:
-    """The command that these arguments mean; exits with 2 after a message when they mean none."""
-    command: Command = tyro.cli(
-        _syntax(_chosen_preset(arguments)),
-        args=arguments or ["--help"],
-        prog="mereo",
-        description="Reconstruct deformable objects with all their segments from one depth image or point cloud. "
-        "`mereo COMMAND --help` explains a command, `mereo --version` prints the version.",
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
-    return command
-
-
-def _syntax(preset: str) -> Any:
-    """All commands as a type that tyro reads; the defaults of ``train`` are those of the preset."""
-    scene = (SceneList, "list"), (SceneCheck, "check"), (ScenePreview, "preview")
-    assets = (AssetsList, "list"), (AssetsGet, "get")
-    return (
-        Annotated[Demo, subcommand("demo")]
-        | Annotated[Doctor, subcommand("doctor")]
-        | Annotated[_group(scene), subcommand("scene", description="List, check or draw the built-in scenes.")]
-        | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
-        | Annotated[Generate, subcommand("generate")]
-        | Annotated[_train_from(preset), subcommand("train")]
-        | Annotated[Evaluate, subcommand("evaluate")]
-        | Annotated[Reconstruct, subcommand("reconstruct")]
-    )
-
-
-def _train_from(preset: str) -> type[Train]:
-    """``Train`` whose options default to the preset's values."""
-    recipe = ("config", Annotated[TrainConfig, arg(name="")], field(default=PRESETS[preset]))
-    return make_dataclass("Train", [recipe], bases=(Train,), frozen=True, namespace={"__doc__": Train.__doc__})
-
-
-def _group(members: tuple[tuple[type, str], ...]) -> Any:
-    return Union[*(Annotated[command, subcommand(name)] for command, name in members)]
-
-
-def _chosen_preset(arguments: list[str]) -> str:
-    """The value of --preset, which must be known before parsing because the other defaults depend on it."""
-    values = [a.partition("=")[2] for a in arguments if a.startswith("--preset=")]
-    values += [after for option, after in pairwise(arguments) if option == "--preset"]
-    return values[-1] if values and values[-1] in PRESETS else "base"
