@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args
 
 import pytest
 
@@ -111,6 +112,10 @@ def test_preset_sets_every_default_of_train(preset: str, form: str) -> None:
     command = command_line.parse(f"train data --output run {form.format(preset)}".split())
     assert isinstance(command, commands.Train)
     assert command.config == PRESETS[preset]
+
+
+def test_every_preset_is_an_option() -> None:
+    assert set(get_args(commands.Preset)) == set(PRESETS)
 
 
 def test_train_options_override_the_preset() -> None:

@@ -245,7 +245,18 @@ class Reconstruct:
     def run(self) -> None:
         from mereo.reconstruction import reconstruct_file
 
-        reconstruct_file(self.input, self.weights, self.output)
+        reconstruct_file(
+            self.input,
+            self.weights,
+            self.output,
+            resolution=self.resolution,
+            intrinsics=self.intrinsics,
+            depth_scale=self.depth_scale,
+            mask=self.mask,
+            frame=self.frame,
+            drop_invalid=self.drop_invalid,
+            force=self.force,
+        )
 
 
 def part_of(shard: str) -> tuple[int, int]:
