@@ -137,7 +137,7 @@ class TrainConfig:
         augment: changes to the observed clouds.
         holdout: examples at the end of the dataset kept for the validation curve.
         precision: auto takes bfloat16 on CUDA and on CPUs with AMX, else float32.
-        compile: torch.compile of the network; auto means on CUDA only, where it pays.
+        compile: torch.compile of the network; auto means where it pays: on CUDA, and for long runs on a CPU.
         seed: initialization, shuffling and augmentation.
     """
 

@@ -1,6 +1,7 @@
 """What this machine offers: device, precision, and an allocator setting that matters."""
 
 import ctypes
+import shutil
 import sys
 
 import torch
@@ -28,6 +29,13 @@ def pick_precision(precision: Precision, device: torch.device) -> torch.dtype | 
     if precision == "bfloat16" or device.type == "cuda" or has_amx():
         return torch.bfloat16
     return None
+
+
+def compiling_pays(device: torch.device, steps: int) -> bool:
+    """Whether torch.compile earns its minute back: always on CUDA, on CPUs in long runs where a C++ compiler exists."""
+    if device.type == "cuda":
+        return True
+    return steps >= 1000 and shutil.which("g++") is not None
 
 
 def keep_freed_memory() -> None:

@@ -23,7 +23,7 @@ from mereo.config import TrainConfig
 from mereo.curves import MetricsLog
 from mereo.dataset import Batch, Dataset
 from mereo.decoder import Prediction
-from mereo.hardware import keep_freed_memory, pick_device, pick_precision
+from mereo.hardware import compiling_pays, keep_freed_memory, pick_device, pick_precision
 from mereo.losses import occupancy_loss
 from mereo.metrics import confusion_matrix, intersection_over_union
 from mereo.model import Model, Network
@@ -90,7 +90,7 @@ class Trainer:
         self.module: nn.Module = self.network
         if process.world > 1:
             self.module = nn.parallel.DistributedDataParallel(self.network)
-        if config.compile == "on" or (config.compile == "auto" and device.type == "cuda"):
+        if config.compile == "on" or (config.compile == "auto" and compiling_pays(device, self.total)):
             self.module = torch.compile(self.module)  # type: ignore[assignment]
         self.started, self.first_step = time.monotonic(), 0
 
