@@ -39,8 +39,9 @@ def readable(path: Path, kind: str) -> Iterator[None]:
 def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
     """The segments of one or more GLB, OBJ, PLY, STL or OFF files, in label order.
 
-    A file with several named parts (GLB nodes, OBJ objects or groups) gives one segment each; a file with one part gives one
-    segment called after its node, or else after the file. A directory stands for the mesh files in it, by name.
+    A file with several named parts (GLB nodes, OBJ objects or groups) gives one segment each; a file with one part
+    gives one segment called after its GLB node, or else after the file. A directory stands for the mesh files in it,
+    by name.
     Node transforms are applied, except the root of GLB files written by mereo: those come back in the camera frame.
     Vertices at the same position are merged, because exporters split them at normals and texture seams, which would
     open a closed mesh. ``SegmentedMesh.check`` is left to the caller.
@@ -120,7 +121,9 @@ def _split_parts(
     parts: list[Part] = []
     for i, name in enumerate(names):
         used, local = np.unique(faces[index == i], return_inverse=True)
-        parts.append((name or stem, None, *merge_positions(vertices[used], local.reshape(-1, 3))))
+        parts.append(
+            (name if name and len(names) > 1 else stem, None, *merge_positions(vertices[used], local.reshape(-1, 3)))
+        )
     return parts
 
 
