@@ -188,5 +188,5 @@ def scene() -> Scene:
         name="rope",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(50.0))),
+        workspace=Workspace(fov_rad=float(np.deg2rad(42.0))),
     )
