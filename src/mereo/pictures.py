@@ -13,7 +13,9 @@ from jaxtyping import Float
 from mereo.camera import PointCloud
 from mereo.config import GenerateConfig
 from mereo.error_pictures import ErrorCase, error_picture
+from mereo.frame import rigid, transform_points
 from mereo.mesh import Segment, SegmentedMesh
+from mereo.output import GLTF_CAMERA_ROTATION
 from mereo.scene import Scene
 from mereo.shading import Viewpoint, shade
 from mereo.sheets import Picture, cloud_picture, contact_sheet, depth_to_rgb, enlarge, legend, save_png
@@ -40,21 +42,29 @@ CAMERA_VIEWS = {
 
 
 def render_cloud_and_segments(
-    path: str | Path, cloud: PointCloud, surfaces: SegmentedMesh, title: str = "", size: int = 420
+    path: str | Path,
+    cloud: PointCloud,
+    surfaces: SegmentedMesh,
+    title: str = "",
+    size: int = 420,
+    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
 ) -> None:
     """Write a preview: the input cloud (top) and the segments (bottom) from the camera, its right and behind.
 
     Args:
         path: the .png file.
-        cloud: what was observed, in the camera frame.
+        cloud: what was observed.
         surfaces: what was reconstructed, in the same frame; segments without faces are left out.
         title: one line above.
         size: width and height of each of the six pictures in pixels.
+        frame_rotation: rotation from the input's frame to x right, y up, z toward the viewer, as for the GLB.
     """
-    solid = _with_faces(surfaces)
-    bounds = _joint_bounds(cloud.points, *(segment.vertices for segment in solid.segments if len(segment.faces)))
+    to_camera = rigid(GLTF_CAMERA_ROTATION.T @ frame_rotation, np.zeros(3))
+    points = transform_points(to_camera, cloud.points)
+    solid = _with_faces(surfaces).transformed(to_camera)
+    bounds = _joint_bounds(points, *(segment.vertices for segment in solid.segments if len(segment.faces)))
     views = {name: Viewpoint.along(bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
-    clouds = [cloud_picture(cloud.points, view, (size, size)) for view in views.values()]
+    clouds = [cloud_picture(points, view, (size, size)) for view in views.values()]
     shaded = [shade(solid, view, (size, size)) for view in views.values()]
     captions = [f"input, {name}" for name in views] + [f"segments, {name}" for name in views]
     sheet = contact_sheet(clouds + shaded, captions, 3, title)
