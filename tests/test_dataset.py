@@ -83,8 +83,10 @@ def test_directions_turn_with_the_view(data: Dataset) -> None:
     plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
     rolled = augment_batch(plain, AugmentConfig(roll=True), rng(1))
     feet = [b.positions + b.distances.abs()[..., None] * b.directions for b in (plain, rolled)]
-    gaps = [torch.cdist(f, b.cloud) * b.distances.abs().amax(dim=1)[:, None, None] ** -1
-            for f, b in zip(feet, (plain, rolled), strict=True)]
+    gaps = [
+        torch.cdist(f, b.cloud) * b.distances.abs().amax(dim=1)[:, None, None] ** -1
+        for f, b in zip(feet, (plain, rolled), strict=True)
+    ]
     assert torch.allclose(gaps[0], gaps[1], rtol=2e-2, atol=2e-2)
 
 

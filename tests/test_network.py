@@ -37,9 +37,7 @@ def settled(config: NetworkConfig, segments: int = 3) -> Network:
 def test_every_preset_answers_with_its_shapes(name: str) -> None:
     network = settled(PRESETS[name].network, segments=5)
     with torch.inference_mode():
-        logits, distance, direction = network(
-            cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3)
-        )
+        logits, distance, direction = network(cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3))
     assert logits.shape == (2, 11, 6) and distance.shape == (2, 11) and direction.shape == (2, 11, 3)
 
 

@@ -130,7 +130,7 @@ def test_it_learns_the_two_halves(dataset: Path, tmp_path: Path) -> None:
 def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, loss: str) -> None:
     config = replace(SMALL, loss=loss, epochs=0.2)  # type: ignore[arg-type]
     model = load_model(training.train(dataset, tmp_path / "run", config))
-    cloud = np.random.default_rng(0).normal(size=(80, 3)) + [0, 0, 50]
+    cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 50.0), size=(80, 3))
     answer = model.query(model.encode(cloud), cloud[:7])
     assert answer.label.shape == (7,) and np.isfinite(answer.distance).all()
 

@@ -57,9 +57,7 @@ class Camera:
         v = self.focal_y_px * points[:, 1] / points[:, 2] + self.center_y_px
         return np.stack([u, v], axis=-1)
 
-    def unproject(
-        self, pixels: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, "n 3"]:
+    def unproject(self, pixels: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Points in the camera frame from pixel coordinates and depth (z)."""
         x = (pixels[:, 0] - self.center_x_px) / self.focal_x_px * depth
         y = (pixels[:, 1] - self.center_y_px) / self.focal_y_px * depth

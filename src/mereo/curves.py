@@ -3,7 +3,7 @@
 import csv
 import io
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 from mereo.output import atomic_file
 
@@ -69,14 +69,13 @@ def _exact(name: str, value: float) -> str:
     return str(int(value)) if name == "step" else repr(value)
 
 
-def _tensorboard(run_dir: Path) -> "ModuleType | None":
+def _tensorboard(run_dir: Path) -> Any:
     """A TensorBoard writer where the extra `track` is installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         return None
-    writer: ModuleType = SummaryWriter(str(run_dir / "tensorboard"))
-    return writer
+    return SummaryWriter(str(run_dir / "tensorboard"))
 
 
 def draw_curves(rows: list[Row], path: Path) -> None:

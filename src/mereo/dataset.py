@@ -53,7 +53,7 @@ class Dataset:
 
     @classmethod
     def load(cls, directory: Path, device: torch.device | str = "cpu") -> "Dataset":
-        """Read every shard; raises ``ValueError`` or ``FileNotFoundError`` when the directory is not a whole dataset."""
+        """Read every shard; ``ValueError`` or ``FileNotFoundError`` when the directory is not a whole dataset."""
         manifest = read_manifest(directory)
         shards = sorted(directory.glob("shard-*.safetensors"))
         parts = [_read_shard(path) for path in shards]
@@ -155,7 +155,7 @@ def choose_points(
     position = torch.arange(stored, device=device)
     padding = position >= count[:, None]
     # a cloud that loses nearly everything is left as it is: there would be nothing to reconstruct from
-    dropped &= ((~dropped & ~padding).sum(dim=1, keepdim=True) >= 32)
+    dropped &= (~dropped & ~padding).sum(dim=1, keepdim=True) >= 32
     unwanted = dropped | padding
     order = (position + stored * unwanted).argsort(dim=1)
     left = (~unwanted).sum(dim=1, keepdim=True)
@@ -169,7 +169,9 @@ def augment_batch(batch: Batch, augment: AugmentConfig, rng: torch.Generator) ->
     The optical axis passes through the viewpoint, so rolling about it is a rotation about z around the viewpoint.
     """
     count, device = len(batch.cloud), batch.cloud.device
-    jitter = augment.jitter_std * torch.rand(count, 1, generator=rng) * torch.randn(batch.cloud.shape[:2], generator=rng)
+    jitter = (
+        augment.jitter_std * torch.rand(count, 1, generator=rng) * torch.randn(batch.cloud.shape[:2], generator=rng)
+    )
     angle = 2 * torch.pi * torch.rand(count, generator=rng) if augment.roll else torch.zeros(count)
     cosine, sine = angle.cos().to(device), angle.sin().to(device)
     zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)

@@ -62,8 +62,8 @@ class FrequencyEncoding(nn.Module):
 class LocalAttention(nn.Module):
     """Attention of a query over its nearest set-abstraction centres of one level.
 
-    ``h_k = relu(A f_k + B (x - c_k))``, weights softmax_k(w h_k) for each of four heads, answer sum_k w_k h_k. ``A f_k``
-    is computed once per centre, so a neighbour costs the query only a gather and the small product with B.
+    ``h_k = relu(A f_k + B (x - c_k))``, weights softmax_k(w h_k) for each of four heads, answer sum_k w_k h_k.
+    ``A f_k`` is computed once per centre, so a neighbour costs the query only a gather and the small product with B.
     """
 
     HEADS = 4
@@ -130,9 +130,7 @@ class Decoder(nn.Module):
         self.head = nn.Linear(width, classes + 4)
         self.classes = classes
 
-    def prepare(
-        self, encoding: Encoding, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]
-    ) -> Code:
+    def prepare(self, encoding: Encoding, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
         """The part of the work that does not depend on the queries."""
         levels = tuple(
             Level(level.centers, attention.project(level.features))  # type: ignore[operator]

@@ -58,7 +58,7 @@ class Segment:
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
     def edge_imbalance(self) -> tuple[int, int]:
-        """``(open, misoriented)`` edge counts: both are zero exactly when the mesh is closed and coherently oriented."""
+        """``(open, misoriented)`` edge counts: both zero exactly when the mesh is closed and coherently oriented."""
         directed = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
         low, high = directed.min(axis=1), directed.max(axis=1)
         key = low * (len(self.vertices) + 1) + high
@@ -100,9 +100,7 @@ class SegmentedMesh:
 
     def with_vertices(self, vertices: Sequence[Float[np.ndarray, "v 3"]]) -> "SegmentedMesh":
         """The same segments at other positions; ``vertices[i]`` belongs to ``segments[i]``."""
-        return SegmentedMesh(
-            tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True))
-        )
+        return SegmentedMesh(tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True)))
 
     def transformed(self, transform: Float[np.ndarray, "4 4"]) -> "SegmentedMesh":
         """All vertices mapped by a homogeneous transform."""

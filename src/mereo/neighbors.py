@@ -32,9 +32,7 @@ def ball_query(
 
 
 @torch.no_grad()
-def nearest(
-    queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], count: int
-) -> Int[Tensor, "b q k"]:
+def nearest(queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], count: int) -> Int[Tensor, "b q k"]:
     """Indices of the ``count`` nearest points to each query, nearest first."""
     distance = squared_distances(queries, points)
     return distance.topk(min(count, points.shape[1]), dim=-1, largest=False).indices

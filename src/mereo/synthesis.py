@@ -114,11 +114,9 @@ def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator
     )
 
 
-def label_queries(
-    scene: Scene, view: View, solids: Solids, samples: Samples, normalizer: Normalizer
-) -> LabelledPoints:
+def label_queries(scene: Scene, view: View, solids: Solids, samples: Samples, normalizer: Normalizer) -> LabelledPoints:
     """Distances, directions and rest coordinates of sampled points, normalized."""
-    distance, direction, closest, face = signed_distance_and_direction(solids, samples.points, samples.labels)
+    distance, direction = signed_distance_and_direction(solids, samples.points, samples.labels)
     return LabelledPoints(
         positions=normalizer.apply(samples.points),
         labels=samples.labels,

@@ -112,9 +112,7 @@ class Trainer:
         while self.step < self.total:
             index = self._batch_index(self.step)[self.process.rank * per_process :][:per_process]
             rng = torch.Generator().manual_seed(_mix(self.config.seed, self.step, self.process.rank))
-            yield self.data.batch(
-                index, self.config.network.points, self.config.queries, self.config.augment, rng
-            )
+            yield self.data.batch(index, self.config.network.points, self.config.queries, self.config.augment, rng)
 
     def _batch_index(self, step: int) -> Tensor:
         """Batches run through one shuffled pass after another; a batch may straddle two passes."""
@@ -151,7 +149,11 @@ class Trainer:
         with torch.autocast(self.device.type, self.autocast) if self.autocast else nullcontext():
             outputs = self.module(batch.cloud, batch.viewpoint, batch.positions)
         return occupancy_loss(
-            Prediction(*outputs), batch.labels, batch.distances, batch.directions, self.config.loss,
+            Prediction(*outputs),
+            batch.labels,
+            batch.distances,
+            batch.directions,
+            self.config.loss,
             self.config.l1_weight,
         )
 
@@ -186,7 +188,7 @@ class Trainer:
 
     @torch.no_grad()
     def validate(self) -> tuple[float, float]:
-        """IoU and mIoU of the averaged weights on the queries of the held-out examples (not the paper's grid metric)."""
+        """IoU and mIoU of the averaged weights on the held-out examples' queries (not the paper's grid metric)."""
         classes = self.network.segments + 1
         total = torch.zeros(classes, classes, dtype=torch.long)
         self.average.eval()

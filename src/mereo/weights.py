@@ -64,7 +64,9 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path} is not a safetensors file ({error}); give the weights written by mereo train") from None
+        raise ValueError(
+            f"{path} is not a safetensors file ({error}); give the weights written by mereo train"
+        ) from None
     if "mereo" not in metadata:
         raise ValueError(f"{path} holds tensors but no mereo header; give the weights.safetensors of a mereo run")
     header = json.loads(metadata["mereo"])

@@ -4,6 +4,7 @@ Notation: b clouds, n points, m centres, k neighbours, c channels.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -35,7 +36,7 @@ class SharedMLP(nn.Module):
     def __init__(self, widths: tuple[int, ...]) -> None:
         super().__init__()
         layers: list[nn.Module] = []
-        for before, after in zip(widths[:-1], widths[1:], strict=True):
+        for before, after in pairwise(widths):
             # the bias would be removed by the batch mean
             layers += [nn.Linear(before, after, bias=False), nn.BatchNorm1d(after), nn.ReLU()]
         self.layers = nn.Sequential(*layers)
@@ -53,9 +54,7 @@ class SetAbstraction(nn.Module):
         self.radius, self.neighbors = radius, neighbors
         self.mlp = SharedMLP((channels + 3, *widths))
 
-    def forward(
-        self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n c"] | None, count: int
-    ) -> Level:
+    def forward(self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n c"] | None, count: int) -> Level:
         centers = points[:, :count]
         index = ball_query(centers, points, self.radius, self.neighbors)
         rows = gather(points, index) - centers[:, :, None]

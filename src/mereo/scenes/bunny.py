@@ -74,9 +74,7 @@ def rest_mesh() -> SegmentedMesh:
     ear_right, head = head.split(_box(EAR_RIGHT))
     tail, body = body.split(_box(TAIL))
     parts = {"body": body, "head": head, "ear_left": ear_left, "ear_right": ear_right, "tail": tail}
-    return SegmentedMesh(
-        tuple(_segment(name, part, PALETTE[i]) for i, (name, part) in enumerate(parts.items()))
-    )
+    return SegmentedMesh(tuple(_segment(name, part, PALETTE[i]) for i, (name, part) in enumerate(parts.items())))
 
 
 def _box(cut: Cut) -> manifold3d.Manifold:
@@ -193,8 +191,10 @@ def squash_and_wobble(rng: np.random.Generator) -> list[Deformation]:
     frequencies = rng.normal(size=(4, 3))
     frequencies *= 2 * np.pi / rng.uniform(25.0, 45.0, size=(4, 1)) / np.linalg.norm(frequencies, axis=1, keepdims=True)
     amplitudes = rng.normal(size=(4, 3))
-    amplitudes *= rng.uniform(0.0, 0.3 / 4) / np.linalg.norm(frequencies, axis=1).max() / np.linalg.norm(
-        amplitudes, axis=1, keepdims=True
+    amplitudes *= (
+        rng.uniform(0.0, 0.3 / 4)
+        / np.linalg.norm(frequencies, axis=1).max()
+        / np.linalg.norm(amplitudes, axis=1, keepdims=True)
     )
     return [Stretch(np.zeros(3), matrix), Waves(amplitudes, frequencies, rng.uniform(0, 2 * np.pi, size=4))]
 

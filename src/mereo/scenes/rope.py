@@ -1,7 +1,7 @@
 """Rope: a base and a rope of eight identical segments in random curves; modelled here, needs no download.
 
-Segments: `base` (a rounded block) and `segment_1` (at the base) to `segment_8` (the free end), each a piece of one round
-rope, 8 units long and 3.6 thick.
+Segments: `base` (a rounded block) and `segment_1` (at the base) to `segment_8` (the free end), each a piece of one
+round rope, 8 units long and 3.6 thick.
 
 Degrees of freedom: heading and elevation of the rope's centreline are smooth random functions of arc length (four
 harmonics each), so it bends at most 0.22 per unit (radius of curvature 4.5), turns up to full loops, rises and droops.
@@ -13,6 +13,7 @@ may be hidden where the rope crosses itself in the image. The paper's own Rope r
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import manifold3d
 import numpy as np
@@ -43,7 +44,7 @@ def _disc(x: float) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """A triangulated disc at ``x``: centre, half-radius ring and rim; faces look along +x."""
     angle = 2 * np.pi * np.arange(SIDES) / SIDES
     circle = np.stack([np.zeros(SIDES), np.cos(angle), np.sin(angle)], axis=1)
-    vertices = np.concatenate([np.zeros((1, 3)), 0.5 * RADIUS * circle, RADIUS * circle]) + [x, 0.0, 0.0]
+    vertices = np.concatenate([np.zeros((1, 3)), 0.5 * RADIUS * circle, RADIUS * circle]) + np.array([x, 0.0, 0.0])
     i, j = np.arange(SIDES), (np.arange(SIDES) + 1) % SIDES
     inner, outer = 1, 1 + SIDES
     faces = np.concatenate(
@@ -63,7 +64,9 @@ def _piece(number: int) -> Segment:
     last, _ = _disc(start + SEGMENT_LENGTH)
     angle = 2 * np.pi * np.arange(SIDES) / SIDES
     rings = [
-        np.stack([np.full(SIDES, start + SEGMENT_LENGTH * k / RINGS), RADIUS * np.cos(angle), RADIUS * np.sin(angle)], 1)
+        np.stack(
+            [np.full(SIDES, start + SEGMENT_LENGTH * k / RINGS), RADIUS * np.cos(angle), RADIUS * np.sin(angle)], 1
+        )
         for k in range(1, RINGS)
     ]
     vertices = np.concatenate([first, last, *rings])
@@ -72,7 +75,7 @@ def _piece(number: int) -> Segment:
     i, j = np.arange(SIDES), (np.arange(SIDES) + 1) % SIDES
     side = [
         np.concatenate([np.stack([a + i, b + i, b + j], axis=1), np.stack([a + i, b + j, a + j], axis=1)])
-        for a, b in zip(loops[:-1], loops[1:], strict=True)
+        for a, b in pairwise(loops)
     ]
     all_faces = np.concatenate([faces[:, ::-1], faces + disc, *(s[:, ::-1] for s in side)])
     return Segment(f"segment_{number + 1}", PALETTE[number + 1], vertices, all_faces)
@@ -116,12 +119,7 @@ class Sweep:
         values = self.curve(s)
         center, normal, binormal = values[:, :3], values[:, 3:6], values[:, 6:]
         tangent = np.cross(normal, binormal)
-        return (
-            center
-            + (points[:, 0] - s)[:, None] * tangent
-            + points[:, 1:2] * normal
-            + points[:, 2:3] * binormal
-        )
+        return center + (points[:, 0] - s)[:, None] * tangent + points[:, 1:2] * normal + points[:, 2:3] * binormal
 
 
 NODES = np.linspace(0.0, LENGTH, 97)
@@ -154,7 +152,7 @@ def is_clear(center: Float[np.ndarray, "m 3"]) -> bool:
     if (gaps[apart] < CLEARANCE).any():
         return False
     size = np.array(BASE_SIZE)
-    outside = np.maximum(np.abs(center + [size[0] / 2, 0.0, 0.0]) - size / 2, 0.0)
+    outside = np.maximum(np.abs(center + np.array([size[0] / 2, 0.0, 0.0])) - size / 2, 0.0)
     far = NODES > 2.0 * RADIUS
     return bool((np.linalg.norm(outside, axis=1)[far] > 1.1 * RADIUS).all())
 
