@@ -16,6 +16,7 @@ from toy_data import NAMES, write_toy_dataset
 
 from mereo import training
 from mereo.config import PRESETS, AugmentConfig, TrainConfig
+from mereo.run import claim_run
 from mereo.weights import load_model
 
 SMALL = replace(
@@ -159,7 +160,7 @@ def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:
 def test_batch_must_be_divisible(dataset: Path, tmp_path: Path) -> None:
     data = training.Dataset.load(dataset)
     with pytest.raises(ValueError, match="batch of 8 cannot be shared by 3 processes"):
-        training._claim_run(tmp_path / "run", dataset, SMALL, data, training.Process(0, 3))
+        claim_run(tmp_path / "run", SMALL, data, training.Process(0, 3))
 
 
 def test_paper_preset_is_the_papers_recipe() -> None:

@@ -4,15 +4,12 @@ Everything random in step t is drawn from (seed, t), so a resumed run repeats an
 ``torchrun`` each process takes its share of every batch; process 0 writes.
 """
 
-import json
 import math
-import os
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -27,20 +24,8 @@ from mereo.hardware import compiling_pays, keep_freed_memory, pick_device, pick_
 from mereo.losses import occupancy_loss
 from mereo.metrics import confusion_matrix, intersection_over_union
 from mereo.model import Model, Network
-from mereo.output import write_json
+from mereo.run import Process, claim_run, fit_config, join_processes
 from mereo.weights import save_model
-
-
-@dataclass(frozen=True)
-class Process:
-    """This process's place among those that train together."""
-
-    rank: int = 0
-    world: int = 1
-
-    @property
-    def is_main(self) -> bool:
-        return self.rank == 0
 
 
 def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_every_s: float = 120.0) -> Path:
@@ -49,11 +34,11 @@ def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_e
     ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors. If it
     holds a checkpoint of the same settings, training continues from it; other settings raise ``ValueError``.
     """
-    process = _join_processes()
+    process = join_processes()
     device = pick_device(process.rank)
     data = Dataset.load(dataset_dir, device)
-    config = _fit_config(config, data)
-    _claim_run(run_dir, dataset_dir, config, data, process)
+    config = fit_config(config, data)
+    claim_run(run_dir, config, data, process)
     keep_freed_memory()
     trainer = Trainer(config, data, run_dir, process, device)
     if trainer.resume():
@@ -258,54 +243,3 @@ def _mix(*numbers: int) -> int:
     for number in numbers:
         mixed = ((mixed ^ number) * 0xBF58476D1CE4E5B9 + 0x94D049BB133111EB) & 0x7FFFFFFFFFFFFFFF
     return mixed
-
-
-def _fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
-    """Settings that the dataset decides: how much can be held out, and whether a roll keeps a view plausible."""
-    holdout = min(config.holdout, len(data) // 10)
-    augment = replace(config.augment, roll=config.augment.roll and bool(data.manifest["any_roll"]))
-    return replace(config, holdout=holdout, augment=augment)
-
-
-def _join_processes() -> Process:
-    """Join the group that torchrun started, if any."""
-    world = int(os.environ.get("WORLD_SIZE", "1"))
-    if world == 1:
-        return Process()
-    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
-    return Process(dist.get_rank(), world)
-
-
-def _claim_run(run_dir: Path, dataset_dir: Path, config: TrainConfig, data: Dataset, process: Process) -> None:
-    """Create the run directory, or check that it belongs to the same settings and dataset."""
-    if config.batch % process.world:
-        raise ValueError(
-            f"the batch of {config.batch} cannot be shared by {process.world} processes; it must be a multiple: "
-            "change --batch or the number of processes"
-        )
-    dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
-    settings = json.loads(json.dumps({"dataset": dataset, "train": asdict(config)}))
-    path = run_dir / "config.json"
-    if path.is_file():
-        before = json.loads(path.read_text())
-        if before != settings:
-            odd = _first_difference(before, settings)
-            raise ValueError(
-                f"{run_dir} holds a run with another {odd}; continuing needs equal settings: "
-                "use them, or another --output"
-            )
-    elif run_dir.exists() and any(run_dir.iterdir()):
-        raise FileExistsError(f"{run_dir} exists and is not a training run; choose another --output")
-    elif process.is_main:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        write_json(path, settings)
-    if process.world > 1:
-        dist.barrier()
-
-
-def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:
-    for group in now:
-        for key, value in now[group].items():
-            if before.get(group, {}).get(key) != value:
-                return f"{group} setting {key} ({before.get(group, {}).get(key)!r} instead of {value!r})"
-    return "format"

@@ -1,0 +1,77 @@
+"""A training run's processes, settings and directory."""
+
+import json
+import os
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from mereo.config import TrainConfig
+from mereo.dataset import Dataset
+from mereo.output import write_json
+
+
+@dataclass(frozen=True)
+class Process:
+    """This process's place among those that train together."""
+
+    rank: int = 0
+    world: int = 1
+
+    @property
+    def is_main(self) -> bool:
+        return self.rank == 0
+
+
+def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
+    """Settings that the dataset decides: how much can be held out, and whether a roll keeps a view plausible."""
+    holdout = min(config.holdout, len(data) // 10)
+    augment = replace(config.augment, roll=config.augment.roll and bool(data.manifest["any_roll"]))
+    return replace(config, holdout=holdout, augment=augment)
+
+
+def join_processes() -> Process:
+    """Join the group that torchrun started, if any."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    if world == 1:
+        return Process()
+    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    return Process(dist.get_rank(), world)
+
+
+def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Process) -> None:
+    """Create the run directory, or check that it belongs to the same settings and dataset."""
+    if config.batch % process.world:
+        raise ValueError(
+            f"the batch of {config.batch} cannot be shared by {process.world} processes; it must be a multiple: "
+            "change --batch or the number of processes"
+        )
+    dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
+    settings = json.loads(json.dumps({"dataset": dataset, "train": asdict(config)}))
+    path = run_dir / "config.json"
+    if path.is_file():
+        before = json.loads(path.read_text())
+        if before != settings:
+            odd = _first_difference(before, settings)
+            raise ValueError(
+                f"{run_dir} holds a run with another {odd}; continuing needs equal settings: "
+                "use them, or another --output"
+            )
+    elif run_dir.exists() and any(run_dir.iterdir()):
+        raise FileExistsError(f"{run_dir} exists and is not a training run; choose another --output")
+    elif process.is_main:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        write_json(path, settings)
+    if process.world > 1:
+        dist.barrier()
+
+
+def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:
+    for group in now:
+        for key, value in now[group].items():
+            if before.get(group, {}).get(key) != value:
+                return f"{group} setting {key} ({before.get(group, {}).get(key)!r} instead of {value!r})"
+    return "format"
