@@ -68,7 +68,8 @@ def _mesh_files(path: Path) -> list[Path]:
     return files
 
 
-Part = tuple[str, Color | None, Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]
+Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
+"""Name, colour if known, vertices, faces."""
 
 
 def _parts(path: Path) -> list[Part]:

@@ -50,11 +50,18 @@ def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 
 def _is_row(line: str) -> bool:
-    cells = re.split(r"\s*[,;]\s*|\s+", line.strip())
+    """Whether a line holds at least three numbers; other cells may be words, and comments are never rows."""
+    if line.lstrip().startswith(("#", "//")):
+        return False
+    return sum(map(_is_number, re.split(r"[,;\s]+", line.strip()))) >= 3
+
+
+def _is_number(cell: str) -> bool:
     try:
-        return len([float(cell) for cell in cells if cell]) >= 3
+        float(cell)
     except ValueError:
         return False
+    return True
 
 
 def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:

@@ -1,0 +1,352 @@
+"""Every format gives back the points that were written; every damaged file gets one sentence with its cure."""
+
+import json
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from mereo.camera import Camera, PointCloud
+from mereo.files import read_camera, read_depth_image, read_mask, read_point_cloud, read_segmented_mesh
+from mereo.point_formats import _lzf_decompress
+
+POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
+CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
+
+
+def save_ply(points: np.ndarray, order: str) -> bytes:
+    """x, y, z with a colour in between, so that columns matter."""
+    head = f"ply\nformat {order} 1.0\nelement vertex {len(points)}\nproperty float x\nproperty uchar red\n"
+    head += "property float y\nproperty float z\nend_header\n"
+    if order == "ascii":
+        return (head + "".join(f"{x!r} 7 {y!r} {z!r}\n" for x, y, z in points.tolist())).encode()
+    end = "<" if "little" in order else ">"
+    return head.encode() + b"".join(struct.pack(f"{end}fBff", x, 7, y, z) for x, y, z in points.tolist())
+
+
+def save_pcd(points: np.ndarray, layout: str) -> bytes:
+    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS rgb x _ y z\nSIZE 4 4 1 4 4\nTYPE U F U F F\nCOUNT 1 1 4 1 1\n"
+    head += f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {layout}\n"
+    if layout == "ascii":
+        return (head + "".join(f"9 {x!r} 0 0 0 0 {y!r} {z!r}\n" for x, y, z in points.tolist())).encode()
+    if layout == "binary":
+        return head.encode() + b"".join(struct.pack("<If4sff", 9, x, b"pad!", y, z) for x, y, z in points.tolist())
+    x, y, z = (column.tobytes() for column in np.ascontiguousarray(points.T))
+    data = b"\x09\0\0\0" * len(points) + x + b"pad!" * len(points) + y + z
+    packed = lzf_compress(data)
+    return head.encode() + struct.pack("<II", len(packed), len(data)) + packed
+
+
+def lzf_compress(data: bytes) -> bytes:
+    """A slow, greedy encoder: the longest earlier match of at least three bytes, else literals."""
+    out, literals, at = bytearray(), bytearray(), 0
+
+    def flush() -> None:
+        for start in range(0, len(literals), 32):
+            run = literals[start : start + 32]
+            out.extend(bytes([len(run) - 1]) + run)
+        literals.clear()
+
+    while at < len(data):
+        best, offset = 0, 0
+        for back in range(1, min(at, 64) + 1):
+            length = 0
+            while at + length < len(data) and length < 264 and data[at + length] == data[at - back + length]:
+                length += 1
+            if length > best:
+                best, offset = length, back
+        if best < 3:
+            literals.append(data[at])
+            at += 1
+            continue
+        flush()
+        long, high, low = best - 2, (offset - 1) >> 8, (offset - 1) & 255
+        out.extend(bytes([(long << 5) | high, low]) if long < 7 else bytes([(7 << 5) | high, long - 7, low]))
+        at += best
+    flush()
+    return bytes(out)
+
+
+def text(points: np.ndarray, separator: str, *, extra: str = "") -> str:
+    return "".join(separator.join(repr(v) for v in row) + extra + "\n" for row in points.tolist())
+
+
+CLOUDS: dict[str, bytes] = {
+    "ascii.ply": save_ply(POINTS, "ascii"),
+    "little.ply": save_ply(POINTS, "binary_little_endian"),
+    "big.ply": save_ply(POINTS, "binary_big_endian"),
+    "ascii.pcd": save_pcd(POINTS, "ascii"),
+    "binary.pcd": save_pcd(POINTS, "binary"),
+    "compressed.pcd": save_pcd(POINTS, "binary_compressed"),
+    "plain.xyz": text(POINTS, " ").encode(),
+    "colored.XYZ": ("# made by hand\n" + text(POINTS, "\t", extra="\t255\t0\t0")).encode(),
+    "count.pts": (f"{len(POINTS)}\n" + text(POINTS, " ")).encode(),
+    "titled.csv": ("\ufeffx,y,z,name\n" + text(POINTS, ",", extra=",dot")).encode(),
+    "shuffled.csv": ('"id","z","x","y"\n' + text(np.column_stack([np.ones(57), POINTS[:, [2, 0, 1]]]), ",")).encode(),
+    "commented.txt": ("# id x y z\n" + text(np.column_stack([np.ones(57), POINTS]), " ")).encode(),
+    "german.csv": text(POINTS, "; ").encode(),
+}
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_every_format_gives_back_the_points(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(CLOUDS[name])
+    np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS.astype(np.float64))
+
+
+def test_arrays_in_numpy_files(tmp_path: Path) -> None:
+    np.save(tmp_path / "flat.npy", POINTS)
+    np.save(tmp_path / "organized.npy", POINTS[:56].reshape(7, 8, 3))
+    np.savez(tmp_path / "named.npz", points=POINTS, other=POINTS[:2])
+    np.savez(tmp_path / "only.npz", cloud=POINTS, matrix=np.eye(4))
+    for name, count in (("flat.npy", 57), ("organized.npy", 56), ("named.npz", 57), ("only.npz", 57)):
+        np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS[:count])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=80), st.binary(min_size=1, max_size=5), st.integers(0, 90))
+def test_lzf_undoes_compression(start: bytes, repeated: bytes, times: int) -> None:
+    data = start + repeated * times + start
+    assert _lzf_decompress(lzf_compress(data), len(data)) == data
+
+
+def test_missing_points_are_refused_with_the_cure_or_dropped(tmp_path: Path) -> None:
+    points = POINTS.copy()
+    points[3], points[5, 1], points[9] = np.nan, np.inf, 0
+    for name, content in (("a.ply", save_ply(points, "binary_little_endian")), ("b.pcd", save_pcd(points, "binary"))):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=r"3 of 57 points without a measurement.*--drop-invalid"):
+            read_point_cloud(tmp_path / name)
+        kept = np.delete(POINTS, [3, 5, 9], axis=0)
+        np.testing.assert_array_equal(read_point_cloud(tmp_path / name, drop_invalid=True).points, kept)
+
+
+def numpy_bytes(path: Path, array: np.ndarray) -> bytes:
+    np.save(path / "scratch.npy", array)
+    return (path / "scratch.npy").read_bytes()
+
+
+BAD_CLOUDS: dict[str, tuple[str, Callable[[Path], bytes], str]] = {
+    "empty file": ("a.ply", lambda _: b"", "is empty"),
+    "no vertices": ("a.ply", lambda _: save_ply(POINTS[:0], "ascii"), "0 vertices"),
+    "cut ascii ply": ("a.ply", lambda _: save_ply(POINTS, "ascii")[:-200], "cannot be read"),
+    "cut binary ply": ("a.ply", lambda _: save_ply(POINTS, "binary_big_endian")[:-40], "cannot be read"),
+    "cut at a line": ("a.ply", lambda _: b"\n".join(save_ply(POINTS, "ascii").split(b"\n")[:-5]), "53 of 57|54 of 57"),
+    "cut ascii pcd": ("a.pcd", lambda _: save_pcd(POINTS, "ascii")[:-300], "truncated: .* of 57"),
+    "cut binary pcd": ("a.pcd", lambda _: save_pcd(POINTS, "binary")[:-1], "truncated: 56 of 57"),
+    "cut compressed pcd": ("a.pcd", lambda _: save_pcd(POINTS, "binary_compressed")[:-9], "cannot be read"),
+    "words": ("a.xyz", lambda _: b"once upon a time\nthere was a cloud\n", "no row of three numbers"),
+    "a word among numbers": ("a.xyz", lambda _: b"1 2 3\n4 five 6\n", "cannot be read.*five"),
+    "empty cell": ("a.csv", lambda _: b"1,2,3\n4,,6\n", "cannot be read"),
+    "two columns": ("a.csv", lambda _: b"1,2\n3,4\n", "no row of three numbers"),
+    "ply called pcd": ("a.pcd", lambda _: save_ply(POINTS, "ascii"), "no PCD header"),
+    "pcd called ply": ("a.ply", lambda _: save_pcd(POINTS, "ascii"), "no PLY header"),
+    "noise called npz": ("a.npz", lambda _: bytes(range(256)), "cannot be read"),
+    "pickle": ("a.npy", lambda p: numpy_bytes(p, np.array([{}], dtype=object)), "cannot be read"),
+    "transposed": ("a.npy", lambda p: numpy_bytes(p, POINTS.T), r"shape is \(3, 57\)"),
+    "words in an array": ("a.npy", lambda p: numpy_bytes(p, np.array([["a", "b", "c"]])), "not a number"),
+    "suffix": ("a.las", lambda _: b"LASF", "suffix '.las'.*convert"),
+    "all NaN": ("a.npy", lambda p: numpy_bytes(p, np.full((4, 3), np.nan)), "all 4 points"),
+    "no rows": ("a.npy", lambda p: numpy_bytes(p, np.empty((0, 3))), "0 points"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CLOUDS)
+def test_a_bad_cloud_gets_one_sentence(tmp_path: Path, case: str) -> None:
+    name, make, expected = BAD_CLOUDS[case]
+    (tmp_path / name).write_bytes(make(tmp_path))
+    with pytest.raises(ValueError, match=expected) as caught:
+        read_point_cloud(tmp_path / name)
+    assert_sentence(caught.value, tmp_path / name)
+
+
+def assert_sentence(error: Exception, path: Path) -> None:
+    """One line that names the file and, after a colon, the cure."""
+    message = str(error)
+    assert "\n" not in message
+    assert str(path) in message
+    assert ": " in message.replace(str(path), "")
+    assert not isinstance(error, UnicodeError)
+
+
+def test_missing_files_and_directories(tmp_path: Path) -> None:
+    for reader in (read_point_cloud, read_mask, read_camera, read_segmented_mesh):
+        with pytest.raises(FileNotFoundError, match="does not exist.*check the path"):
+            reader(tmp_path / "nothing.ply")
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(ValueError, match="is a directory"):
+        read_point_cloud(tmp_path / "folder.ply")
+
+
+# --- depth images and intrinsics -------------------------------------------------------------------------------------
+
+
+def save_depth(path: Path, values: np.ndarray) -> Path:
+    Image.fromarray(values).save(path)
+    return path
+
+
+def test_depth_is_value_over_scale_and_masked(tmp_path: Path) -> None:
+    values = np.random.default_rng(1).integers(400, 60000, (6, 8)).astype(np.uint16)
+    values[2, 3] = 0
+    path = save_depth(tmp_path / "d.png", values)
+    np.testing.assert_array_equal(read_depth_image(path, CAMERA, 5000.0).depth, values / 5000.0)
+    mask = np.zeros((6, 8), np.uint8)
+    mask[1:4, 2:5] = 255
+    masked = read_depth_image(path, CAMERA, 5000.0, save_depth(tmp_path / "m.png", mask))
+    assert int(masked.valid.sum()) == 8
+    np.testing.assert_array_equal(masked.depth, np.where(mask > 0, values / 5000.0, 0))
+
+
+def test_a_bad_depth_image_gets_one_sentence(tmp_path: Path) -> None:
+    good = np.full((6, 8), 900, np.uint16)
+    path = tmp_path / "d.png"
+    for values, scale, expected in (
+        (np.zeros((6, 8), np.uint16), 1000.0, "measures 0 pixels in the image"),
+        (np.full((6, 8), 90, np.uint8), 1000.0, "mode L, not a 16-bit grey PNG"),
+        (np.full((6, 9), 900, np.uint16), 1000.0, "9 x 6 pixels but the intrinsics say 8 x 6"),
+        (good, 1.0, "median depth of .* is 900 m.*--depth-scale"),
+        (good, 1e6, "median depth of .* is 0.0009 m.*--depth-scale"),
+        (good, 0.0, "depth scale is 0.0"),
+        (good, float("nan"), "depth scale is nan"),
+    ):
+        save_depth(path, values)
+        with pytest.raises(ValueError, match=expected) as caught:
+            read_depth_image(path, CAMERA, scale)
+        assert "\n" not in str(caught.value)
+    noise = np.random.default_rng(0).integers(500, 1500, (60, 80)).astype(np.uint16)
+    path.write_bytes(save_depth(path, noise).read_bytes()[:3000])
+    with pytest.raises(ValueError, match="cannot be read as a depth image") as caught:
+        read_depth_image(path, CAMERA)
+    assert_sentence(caught.value, path)
+    save_depth(path, good)
+    with pytest.raises(ValueError, match="measures 0 pixels inside the mask"):
+        read_depth_image(path, CAMERA, 1000.0, save_depth(tmp_path / "m.png", np.zeros((6, 8), np.uint8)))
+    with pytest.raises(ValueError, match="the mask .* is 5 x 4 pixels but the depth image is 8 x 6"):
+        read_depth_image(path, CAMERA, 1000.0, save_depth(tmp_path / "m.png", np.ones((4, 5), np.uint8)))
+
+
+def test_masks_of_all_kinds_agree(tmp_path: Path) -> None:
+    truth = np.random.default_rng(2).random((5, 7)) > 0.5
+    grey = Image.fromarray(truth.astype(np.uint8) * 9)
+    for name, image in (
+        ("grey", grey),
+        ("deep", Image.fromarray(truth.astype(np.uint16) * 256)),
+        ("bits", Image.fromarray(truth)),
+        ("color", Image.merge("RGB", (Image.new("L", grey.size), grey, Image.new("L", grey.size)))),
+        ("opaque", Image.merge("RGBA", (grey, grey, grey, Image.new("L", grey.size, 255)))),
+    ):
+        image.save(tmp_path / f"{name}.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
+
+
+K = [[525.0, 0.0, 319.5], [0.0, 520.0, 239.5], [0.0, 0.0, 1.0]]
+FLAT = [v for row in K for v in row]
+SIZE = {"width": 640, "height": 480}
+ROS2 = "header:\n  frame_id: depth\nheight: 480\nwidth: 640\ndistortion_model: plumb_bob\nd:\n- 0.0\n- 0.0\nk:\n"
+ROS2 += "".join(f"- {v}\n" for v in FLAT) + "r:\n- 1.0\n- 0.0\n---\n"
+ROS1 = f"image_width: 640\nimage_height: 480\ncamera_name: depth\nK: {FLAT}\nD: [0.1, -0.2]\n"
+CALIBRATOR = f"image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: {FLAT}\n"
+CAMERAS = {
+    "plain.json": json.dumps({"fx": 525, "fy": 520, "cx": 319.5, "cy": 239.5, **SIZE}),
+    "realsense.json": json.dumps({"fx": 525, "fy": 520, "ppx": 319.5, "ppy": 239.5, **SIZE}),
+    "open3d.json": json.dumps({"intrinsic_matrix": np.array(K).T.ravel().tolist(), **SIZE}),
+    "matrix.json": json.dumps({"K": K, **SIZE}),
+    "ros.json": json.dumps({"k": FLAT, **SIZE}),
+    "centred.json": json.dumps({"fx": 525, "fy": 520, "cx": 320.0, "cy": 240.0, "pixel_center": 0.5, **SIZE}),
+    "ros2.yaml": ROS2,
+    "ros1.yaml": ROS1,
+    "calibrator.yml": CALIBRATOR,
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_all_forms_of_intrinsics_mean_the_same_camera(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(CAMERAS[name])
+    # 319.5 where pixel centres are whole numbers is the middle of 640 pixels: 320
+    assert read_camera(tmp_path / name) == Camera(640, 480, 525.0, 520.0, 320.0, 240.0)
+
+
+@pytest.mark.parametrize(
+    "content, expected",
+    [
+        ("{", "cannot be read as a camera intrinsics file"),
+        ("[1, 2]", "not an object"),
+        ('{"width": 4, "height": 3}', "neither fx, fy, cx, cy nor"),
+        ('{"fx": 5, "fy": 5, "cx": 2, "cy": 2}', "no width and height"),
+        ('{"fx": "wide", "fy": 5, "cx": 2, "cy": 2, "width": 4, "height": 3}', "could not convert"),
+        ('{"fx": -5, "fy": 5, "cx": 2, "cy": 2, "width": 4, "height": 3}', "focal length is -5"),
+        ('{"K": [5, 0, 2, 0], "width": 4, "height": 3}', "4 numbers instead of 9"),
+        (json.dumps({"K": np.array(K).T.ravel().tolist(), **SIZE}), "last row"),
+    ],
+)
+def test_bad_intrinsics_get_one_sentence(tmp_path: Path, content: str, expected: str) -> None:
+    (tmp_path / "c.json").write_text(content)
+    with pytest.raises(ValueError, match=expected) as caught:
+        read_camera(tmp_path / "c.json")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_size_may_come_from_the_image(tmp_path: Path) -> None:
+    (tmp_path / "c.json").write_text('{"fx": 5, "fy": 5, "cx": 2, "cy": 2}')
+    assert read_camera(tmp_path / "c.json", (4, 3)) == Camera(4, 3, 5.0, 5.0, 2.5, 2.5)
+
+
+def test_real_depth_frames_are_where_their_rooms_are() -> None:
+    folder = Path(os.environ.get("MEREO_ASSETS", "")) / "depth"
+    if not (folder / "tum_depth_5000.png").exists():
+        pytest.skip("MEREO_ASSETS holds no real depth frames")
+    camera = read_camera(folder / "intrinsics.json")
+    assert camera == read_camera(folder / "open3d_camera_primesense.json")
+    for name, scale in (("pcl_person_depth_mm.png", 1000.0), ("tum_depth_5000.png", 5000.0)):
+        image = read_depth_image(folder / name, camera, scale)
+        cloud: PointCloud = image.to_points()
+        assert 0.7 < np.median(cloud.points[:, 2]) < 4.0
+        row, column = np.nonzero(image.valid)
+        np.testing.assert_allclose(camera.project(cloud.points), np.column_stack([column, row]) + 0.5, atol=1e-9)
+
+
+# --- meshes ----------------------------------------------------------------------------------------------------------
+
+
+def test_parts_of_an_obj_keep_their_order_names_and_closedness(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    lines, offset = [], 1
+    for name, shift in (("zebra", 0.0), ("ant", 3.0), ("middle part", 6.0)):
+        lines += [f"v {x + shift} {y} {z}" for x, y, z in box.vertices]
+        lines += [f"g {name}"] + [f"f {a + offset}//1 {b + offset}//2 {c + offset}" for a, b, c in box.faces]
+        offset += 8
+    (tmp_path / "parts.obj").write_text("\n".join(lines))
+    mesh = read_segmented_mesh(tmp_path / "parts.obj")
+    mesh.check()
+    assert mesh.names == ("zebra", "ant", "middle part")
+    np.testing.assert_allclose([s.volume for s in mesh.segments], 1.0)
+
+
+def test_one_file_for_each_segment(tmp_path: Path) -> None:
+    for name, suffix in (("b_ball", "ply"), ("a_box", "stl"), ("c_rod", "obj"), ("d_tube", "off")):
+        trimesh.creation.icosphere(1).export(tmp_path / f"{name}.{suffix}")
+    mesh = read_segmented_mesh(tmp_path)
+    mesh.check()  # an STL file is triangles without connection until equal positions are merged
+    assert mesh.names == ("a_box", "b_ball", "c_rod", "d_tube")
+    assert len(set(mesh.colors)) == 4
+
+
+def test_bad_meshes_get_one_sentence(tmp_path: Path) -> None:
+    for name, content, expected in (
+        ("points.ply", save_ply(POINTS, "ascii"), "no faces"),
+        ("broken.obj", b"v 0 0 0\nf 1 2 3\n", "refers to vertex 2 of 1"),
+        ("broken.glb", b"glTF but not really", "cannot be read as a mesh"),
+        ("drawing.step", b"ISO-10303-21;", "suffix '.step'"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=expected) as caught:
+            read_segmented_mesh(tmp_path / name)
+        assert_sentence(caught.value, tmp_path / name)

@@ -1,0 +1,210 @@
+"""The renderer agrees with closed forms, and the pictures show what they claim to show."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from mereo.camera import Camera, DepthImage, PointCloud
+from mereo.error_pictures import OVER, UNDER, WRONG, error_grids, voxel_triangles
+from mereo.frame import rigid
+from mereo.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.pictures import (
+    ErrorCase,
+    contact_sheet,
+    depth_to_rgb,
+    error_picture,
+    render_cloud_and_segments,
+    scene_preview,
+)
+from mereo.shading import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
+from mereo.synthesis import View
+
+FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+
+
+def ball(center: tuple[float, float, float], radius: float, color: Color = PALETTE[0], name: str = "ball") -> Segment:
+    mesh = trimesh.creation.icosphere(4, radius=radius)
+    return Segment(name, color, mesh.vertices + np.array(center), np.array(mesh.faces))
+
+
+def hue_is(pixels: np.ndarray, color: Color) -> np.ndarray:
+    """Pixels whose colour is ``color`` at some brightness."""
+    wanted = np.asarray(color, dtype=float)
+    values = pixels.astype(float)
+    cosine = (values @ wanted) / np.maximum(np.linalg.norm(values, axis=-1) * np.linalg.norm(wanted), 1e-9)
+    return (cosine > 0.985) & (values.sum(axis=-1) > 30)
+
+
+def test_an_orthographic_ball_has_its_closed_form_depth_and_area() -> None:
+    view = Viewpoint.along(np.array([[-1.0, -1, 4], [1, 1, 6]]), *FRONT, margin=1.25)
+    canvas = Canvas.empty(view, (80, 60))
+    canvas.draw_triangles(Triangles.of(SegmentedMesh((ball((0, 0, 5), 1.0),))))
+    seen = np.isfinite(canvas.depth)
+    side = 2 * 1.25 / (60 * SUPERSAMPLE)
+    assert seen.sum() * side**2 == pytest.approx(np.pi, rel=0.01)
+    row, column = np.nonzero(seen)
+    x, y = (column + 0.5 - 80) * side, (row + 0.5 - 60) * side
+    inner = x**2 + y**2 < 0.9
+    # depth in the view frame, whose origin is the middle of the box
+    np.testing.assert_allclose(canvas.depth[seen][inner], -np.sqrt(1 - x**2 - y**2)[inner], atol=6e-3)
+
+
+def test_a_pinhole_picture_is_the_camera_depth_image_in_colour() -> None:
+    camera = Camera(64, 48, 90.0, 70.0, 30.0, 26.0)
+    canvas = Canvas.empty(Viewpoint.through(camera), (64, 48))
+    mesh = SegmentedMesh((ball((0.1, -0.2, 3), 0.7),))
+    canvas.draw_triangles(Triangles.of(mesh))
+    row, column = np.nonzero(np.isfinite(canvas.depth))
+    pixel = np.column_stack([column + 0.5, row + 0.5]) / SUPERSAMPLE
+    points = camera.unproject(pixel, canvas.depth[row, column])
+    np.testing.assert_allclose(np.linalg.norm(points - [0.1, -0.2, 3], axis=1), 0.7, atol=4e-3)
+
+
+def test_the_picture_moves_with_the_world() -> None:
+    mesh = SegmentedMesh((ball((0, 0, 0), 1.0), ball((1.2, 0.3, 0), 0.5, PALETTE[1], "nose")))
+    turn = trimesh.transformations.random_rotation_matrix([0.1, 0.5, 0.9])
+    move = rigid(turn[:3, :3], np.array([5.0, -3.0, 2.0]))
+    still = shade(mesh, Viewpoint(np.eye(4), 2.0), (60, 60))
+    moved = shade(mesh.transformed(move), Viewpoint(np.linalg.inv(move), 2.0), (60, 60))
+    assert np.mean(np.abs(still.astype(int) - moved.astype(int)).max(axis=-1) > 8) < 0.01
+
+
+def test_nearer_things_hide_farther_ones() -> None:
+    near, far = ball((0, 0, 0), 0.5, (255, 0, 0)), ball((0, 0, 3), 1.0, (0, 0, 255), "far")
+    view = Viewpoint.along(np.array([[-1.0, -1, -1], [1, 1, 4]]), *FRONT)
+    picture = shade(SegmentedMesh((far, near)), view, (60, 60))
+    assert hue_is(picture[30, 30], (255, 0, 0))
+    assert hue_is(picture[30, 8], (0, 0, 255))
+    behind = Viewpoint.along(np.array([[-1.0, -1, -1], [1, 1, 4]]), (0.0, 0.0, -1.0), (0.0, -1.0, 0.0))
+    assert not hue_is(shade(SegmentedMesh((far, near)), behind, (60, 60)), (255, 0, 0)).any()
+    recolored = shade(SegmentedMesh((far, near)), view, (60, 60), colors=[(0, 255, 0), (0, 255, 0)])
+    assert hue_is(recolored[30, 30], (0, 255, 0))
+
+
+def test_points_are_hidden_by_surfaces_and_by_nearer_points() -> None:
+    view = Viewpoint.along(np.array([[-1.0, -1, -1], [1, 1, 1]]), *FRONT)
+    canvas = Canvas.empty(view, (50, 50))
+    canvas.draw_triangles(Triangles.of(SegmentedMesh((ball((0, 0, 0), 0.5, (255, 255, 255)),))))
+    points = np.array([[0, 0, -0.9], [0, 0, -0.8], [0, 0, 0.9], [0.8, 0, 0.5]])
+    colors = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1]])
+    canvas.draw_points(points, colors)
+    picture = canvas.picture()
+    np.testing.assert_array_equal(picture[25, 25], [255, 0, 0])
+    assert hue_is(picture, (0, 0, 255)).any()
+    assert not hue_is(picture[15:35, 15:35], (0, 0, 255)).any()
+
+
+def test_normals_are_smooth_on_a_ball_and_sharp_on_a_box() -> None:
+    round_one = ball((0, 0, 0), 1.0)
+    normals = corner_normals(round_one.vertices, round_one.faces)
+    assert (normals * round_one.vertices[round_one.faces]).sum(axis=-1).min() > 0.9999
+    box = trimesh.creation.box()
+    sharp = corner_normals(np.array(box.vertices), np.array(box.faces))
+    np.testing.assert_allclose(sharp, np.repeat(box.face_normals[:, None], 3, axis=1), atol=1e-12)
+
+
+def test_depth_colours_show_near_bright_and_missing_grey() -> None:
+    camera = Camera(3, 1, 1.0, 1.0, 1.5, 0.5)
+    picture = depth_to_rgb(DepthImage(np.array([[0.0, 1.0, 2.0]]), camera))[0].astype(int)
+    assert picture[0].std() < 3
+    assert picture[1].sum() > picture[2].sum() + 200
+    assert depth_to_rgb(DepthImage(np.zeros((1, 3)), camera)).std() < 3
+
+
+def test_a_contact_sheet_holds_every_image_unchanged() -> None:
+    images = [np.full((20, 30, 3), 40 * i, np.uint8) for i in range(5)]
+    sheet = contact_sheet(images, ["a", "b", "c", "", "a very long caption that does not fit"], 3, "title")
+    for image in images:
+        assert (sheet == image[0, 0]).all(axis=-1).sum() >= 600
+    with pytest.raises(ValueError, match="one caption for each image"):
+        contact_sheet(images, ["a"], 3)
+
+
+# --- voxels ----------------------------------------------------------------------------------------------------------
+
+
+def test_voxel_faces_are_a_closed_outward_surface_of_the_right_volume() -> None:
+    grid = (np.random.default_rng(3).random((6, 5, 4)) > 0.6).astype(np.uint8)
+    spacing = np.array([0.5, 1.0, 2.0])
+    shown = voxel_triangles(grid, np.ones((1, 3)), np.array([3.0, 2.0, 1.0]), spacing)
+    surface = Segment("voxels", PALETTE[0], shown.vertices, shown.faces)
+    # faces run in one sense around the outward or the inward normal, so the volume may only differ in sign
+    assert abs(surface.volume) == pytest.approx(grid.sum() * spacing.prod())
+    low, high = surface.bounds
+    filled = np.argwhere(grid)
+    np.testing.assert_allclose(low, [3, 2, 1] + (filled.min(axis=0) - 0.5) * spacing)
+    np.testing.assert_allclose(high, [3, 2, 1] + (filled.max(axis=0) + 0.5) * spacing)
+
+
+def test_error_grids_count_what_the_confusion_matrix_counts() -> None:
+    rng = np.random.default_rng(4)
+    truth, found = (rng.integers(0, 4, (8, 9, 10)).astype(np.uint8) for _ in range(2))
+    grids = error_grids(truth, found)
+    over, under = ((truth == 0) & (found > 0)).sum(), ((truth > 0) & (found == 0)).sum()
+    np.testing.assert_array_equal(np.bincount(grids["reconstruction error"].ravel())[2:], [over, under])
+    wrong = ((truth > 0) & (found > 0) & (truth != found)).sum()
+    assert (grids["segmentation error"] == 2).sum() == wrong
+    assert (grids["reconstruction"] > 0).sum() == (found > 0).sum()
+    assert not (error_grids(truth, truth)["segmentation error"] == 2).any()
+
+
+def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -> None:
+    truth = np.zeros((20, 20, 20), np.uint8)
+    truth[5:15, 5:10, 5:15], truth[5:15, 10:15, 5:15] = 1, 2
+    found = truth.copy()
+    found[15:18, 5:15, 5:15], found[5:7, 5:15, 5:15], found[8:12, 5:15, 5:15] = 1, 0, 1
+    cloud = PointCloud(np.argwhere(truth)[::7].astype(float))
+    colors = [(0, 158, 115), (240, 228, 66)]
+    case = ErrorCase("box", cloud, truth, found, np.zeros(3), np.ones(3), colors)
+    error_picture(tmp_path / "e.png", [case], size=60)
+    picture = np.asarray(Image.open(tmp_path / "e.png"))
+    columns = np.array_split(picture[:, 12:], 7, axis=1)
+    shows = [[bool(hue_is(column, c).sum() > 20) for c in (OVER, UNDER, WRONG)] for column in columns]
+    assert shows[3] == [True, True, False]
+    assert shows[5] == [False, False, True]
+    for plain in (0, 1, 2, 6):
+        assert not any(shows[plain])
+    assert [f.name for f in tmp_path.iterdir()] == ["e.png"]
+
+
+def test_an_empty_prediction_can_be_drawn(tmp_path: Path) -> None:
+    truth = np.zeros((6, 6, 6), np.uint8)
+    truth[2:4, 2:4, 2:4] = 1
+    cloud = PointCloud(np.argwhere(truth).astype(float))
+    case = ErrorCase("none", cloud, truth, np.zeros_like(truth), np.zeros(3), np.ones(3), [PALETTE[0]])
+    error_picture(tmp_path / "e.png", [case], size=40)
+    assert (tmp_path / "e.png").stat().st_size > 500
+
+
+# --- sheets ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_preview_shows_cloud_and_segments_and_turns_with_the_frame(tmp_path: Path) -> None:
+    mesh = SegmentedMesh((ball((0, 0, 2), 0.3, (255, 0, 0)), ball((0.5, 0, 2), 0.2, (0, 0, 255), "nose")))
+    lost = Segment("lost", (0, 255, 0), np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    mesh = SegmentedMesh((*mesh.segments, lost))
+    cloud = PointCloud(mesh.segments[0].vertices[mesh.segments[0].vertices[:, 2] < 2])
+    render_cloud_and_segments(tmp_path / "camera.png", cloud, mesh, "title", size=90)
+    picture = np.asarray(Image.open(tmp_path / "camera.png"))
+    assert hue_is(picture, (255, 0, 0)).sum() > 300
+    assert hue_is(picture, (0, 0, 255)).sum() > 100
+    # the same things in a y-up frame with z toward the viewer give the same picture
+    flip = rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    turned = PointCloud(cloud.points @ flip[:3, :3].T)
+    render_cloud_and_segments(tmp_path / "up.png", turned, mesh.transformed(flip), "title", 90, np.eye(3))
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "up.png")), picture)
+
+
+def test_the_scene_preview_has_three_pictures_for_each_state(tmp_path: Path) -> None:
+    camera = Camera.from_fov(24, 24, 0.6)
+    mesh = SegmentedMesh((ball((0, 0, 3), 0.5, (255, 0, 0)),))
+    depth = DepthImage(np.pad(np.full((8, 8), 2.6), 8), camera)
+    views = [View(mesh, depth, rigid(np.eye(3), np.array([0.0, 0.0, -3.0 * i])), ()) for i in (1, 2)]
+    scene_preview(tmp_path / "s.png", views, "two states", size=50)
+    picture = np.asarray(Image.open(tmp_path / "s.png"))
+    thirds = np.array_split(picture[:, 12:], 9, axis=1)
+    reds = [int(hue_is(part, (255, 0, 0)).sum()) for part in thirds]
+    assert [red > 50 for red in reds[:6]] == [True, True, False] * 2

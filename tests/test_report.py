@@ -1,0 +1,133 @@
+"""The page is self-contained, small, and shows the segments in a real browser, with and without WebGL."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from mereo.camera import PointCloud
+from mereo.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.report import BUDGET_BYTES, cluster, write_report
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+def ball(name: str, shift: float, color: tuple[int, int, int], level: int = 3) -> Segment:
+    mesh = trimesh.creation.icosphere(level, radius=0.1)
+    return Segment(name, color, mesh.vertices + np.array([shift, 0, 0.5]), np.array(mesh.faces))
+
+
+def example() -> tuple[PointCloud, SegmentedMesh, dict[str, object]]:
+    lost = Segment("lost", (0, 158, 115), np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    mesh = SegmentedMesh((ball("head", -0.1, PALETTE[0]), ball("tail </script><b>", 0.1, PALETTE[1]), lost))
+    summary = {
+        "title": "A <b>bold</b> </script> title",
+        "unit": "m",
+        "input": Path("scan.ply"),
+        "segments": [
+            {"name": s.name, "centroid": np.array([0.1, 0.2, 0.3]), "volume": np.float64(s.volume), "confidence": 0.5}
+            for s in mesh.segments[:2]
+        ]
+        + [{"name": "lost", "centroid": None, "volume": 0.0, "confidence": float("nan")}],
+        "timings_s": {"encode": 0.1, "field": np.float32(1.5)},
+    }
+    return PointCloud(mesh.segments[0].vertices[::3]), mesh, summary
+
+
+def page_data(path: Path) -> dict:
+    found = re.search(r"const DATA = (.*);\n", path.read_text(encoding="utf-8"))
+    assert found
+    return json.loads(found[1])
+
+
+def positions(data: dict, text: str) -> np.ndarray:
+    low, high = np.asarray(data["low"]), np.asarray(data["high"])
+    steps = np.frombuffer(base64.b64decode(text), "<u2").reshape(-1, 3)
+    return low + steps / 65535 * (high - low)
+
+
+def test_the_page_holds_the_shapes_to_16_bits_of_the_box(tmp_path: Path) -> None:
+    cloud, mesh, summary = example()
+    write_report(tmp_path / "r.html", cloud, mesh, summary)
+    data = page_data(tmp_path / "r.html")
+    step = (np.asarray(data["high"]) - data["low"]).max() / 65535
+    np.testing.assert_allclose(positions(data, data["cloud"]["positions"]), cloud.points, atol=step)
+    for shown, segment in zip(data["segments"], mesh.segments, strict=True):
+        np.testing.assert_allclose(positions(data, shown["positions"]), segment.vertices, atol=step)
+        indices = np.frombuffer(base64.b64decode(shown["indices"]), "<u4").reshape(-1, 3)
+        np.testing.assert_array_equal(indices, segment.faces)
+        assert (shown["name"], tuple(shown["color"])) == (segment.name, segment.color)
+    assert not data["coarsened"]
+    assert data["summary"]["segments"][2]["confidence"] is None
+
+
+def test_the_page_needs_nothing_from_outside_and_cannot_be_broken_by_names(tmp_path: Path) -> None:
+    write_report(tmp_path / "r.html", *example())
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://|src=|@import|url\(|fetch\(|XMLHttpRequest", page)
+    assert page.count("</script>") == 1
+    assert "<title>A &lt;b&gt;bold&lt;/b&gt; &lt;/script&gt; title</title>" in page
+
+
+def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Path) -> None:
+    cloud, _, summary = example()
+    mesh = SegmentedMesh(tuple(ball(f"s{i}", 0.2 * i, PALETTE[i], level=7) for i in range(3)))
+    write_report(tmp_path / "r.html", PointCloud(np.tile(cloud.points, (700, 1))), mesh, summary)
+    assert 1_000_000 < (tmp_path / "r.html").stat().st_size <= BUDGET_BYTES
+    data = page_data(tmp_path / "r.html")
+    assert data["coarsened"]
+    for i, shown in enumerate(data["segments"]):
+        distance = np.linalg.norm(positions(data, shown["positions"]) - [0.2 * i, 0, 0.5], axis=1)
+        np.testing.assert_allclose(distance, 0.1, atol=0.002)
+    with pytest.raises(ValueError, match="at most 5000000: shorten the summary"):
+        write_report(tmp_path / "r2.html", cloud, mesh, {"title": "x" * BUDGET_BYTES})
+    assert not (tmp_path / "r2.html").exists()
+
+
+def test_clustering_keeps_the_shape_and_moves_no_vertex_beyond_its_cell() -> None:
+    fine = ball("ball", 0.0, PALETTE[0], level=5)
+    coarse = cluster(fine, 0.02)
+    assert len(coarse.faces) < len(fine.faces) / 5
+    assert coarse.volume == pytest.approx(fine.volume, rel=0.05)
+    gaps = np.linalg.norm(coarse.vertices[:, None] - fine.vertices[None], axis=2).min(axis=1)
+    assert gaps.max() < 0.02 * np.sqrt(3)
+    assert len(np.unique(np.sort(coarse.faces, axis=1), axis=0)) == len(coarse.faces)
+
+
+def browse(page: str, tmp_path: Path, *options: str) -> str:
+    assert BROWSER
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader"]
+    command += ["--enable-unsafe-swiftshader", "--disable-background-networking", "--disable-component-update"]
+    command += ["--disable-sync", "--no-first-run", "--hide-scrollbars", "--window-size=1000,800"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=4000", *options, page]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome in PATH")
+@pytest.mark.parametrize("mode", ["", "#2d"])
+def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
+    cloud, mesh, summary = example()
+    write_report(tmp_path / "r.html", cloud, mesh, summary)
+    address = (tmp_path / "r.html").as_uri() + mode
+    text = browse(address, tmp_path, "--dump-dom")
+    drawing = re.search(r'data-drawing="(\w+)"', text)
+    assert drawing
+    assert drawing[1] == "canvas" or not mode
+    table = re.search(r'<table id="table">(.*?)</table>', text, re.DOTALL)
+    assert table
+    assert "tail &lt;/script&gt;&lt;b&gt;" in table[1]
+    assert "0.1,  0.2,  0.3" in table[1]
+    browse(address, tmp_path, f"--screenshot={tmp_path / 's.png'}")
+    stage = np.asarray(Image.open(tmp_path / "s.png").convert("RGB"))[150:500, 40:680].astype(float)
+    for segment in mesh.segments[:2]:
+        wanted = np.asarray(segment.color, dtype=float)
+        cosine = stage @ wanted / (np.linalg.norm(stage, axis=-1) * np.linalg.norm(wanted))
+        assert (cosine > 0.99).sum() > 1000, f"{segment.name} is not to be seen"
