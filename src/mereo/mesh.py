@@ -98,7 +98,7 @@ class SegmentedMesh:
         boxes = np.stack([segment.bounds for segment in self.segments])
         return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
-    def with_vertices(self, vertices: Sequence[Float[np.ndarray, "v 3"]]) -> "SegmentedMesh":
+    def with_vertices(self, vertices: Sequence[Float[np.ndarray, "_ 3"]]) -> "SegmentedMesh":
         """The same segments at other positions; ``vertices[i]`` belongs to ``segments[i]``."""
         return SegmentedMesh(tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True)))
 

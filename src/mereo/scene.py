@@ -113,7 +113,7 @@ class Scene:
         groups: dict[int, list[int]] = {}
         for index, deformation in enumerate(deformations):
             groups.setdefault(id(deformation), []).append(index)
-        moved: list[Float[np.ndarray, "v 3"]] = [np.empty((0, 3))] * len(deformations)
+        moved: list[Float[np.ndarray, "_ 3"]] = [np.empty((0, 3))] * len(deformations)
         for members in groups.values():
             parts = [self.rest.segments[i].vertices for i in members]
             joint = deformations[members[0]](np.concatenate(parts))
