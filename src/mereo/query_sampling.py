@@ -9,7 +9,7 @@ result does not depend on the size of a batch: it is, bit for bit, that of drawi
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -26,6 +26,7 @@ _FIRST_BATCH = 8
 _LARGEST_BATCH = 1 << 17
 
 
+@runtime_checkable
 class Shape(Protocol):
     """What a sampler asks of an object; ``solid.Solids`` and the polygons of ``examples/sampling_2d.py`` satisfy it.
 
