@@ -8,7 +8,11 @@ from mereo.solid import ray_scene
 
 
 def render_depth(mesh: SegmentedMesh, camera: Camera) -> DepthImage:
-    """Noise-free depth (z, not ray length) of a mesh given in the camera frame; 0 where no surface is hit."""
+    """Noise-free depth (z, not ray length) of a mesh given in the camera frame; 0 where no surface is hit.
+
+    One ray goes through each pixel's centre. Depth is in the mesh's units, with the relative precision of single
+    precision (about 1e-7). Both sides of a face are seen, so a camera inside a segment sees its inner wall.
+    """
     vertices, faces, _ = mesh.merged()
     directions = camera.directions().reshape(-1, 3).astype(np.float32)
     hits = ray_scene(vertices, faces).run(np.zeros_like(directions), directions, output=True)
@@ -18,7 +22,13 @@ def render_depth(mesh: SegmentedMesh, camera: Camera) -> DepthImage:
 
 
 def add_depth_noise(image: DepthImage, std: float, rng: np.random.Generator) -> DepthImage:
-    """Gaussian noise of standard deviation ``std`` (the depth's unit) on every measured pixel."""
-    noise = rng.normal(0.0, std, size=image.depth.shape) if std > 0 else np.zeros_like(image.depth)
-    noisy = np.where(image.valid, np.maximum(image.depth + noise, 1e-6), 0.0)
-    return DepthImage(noisy, image.camera)
+    """Gaussian noise of standard deviation ``std`` (the depth's unit) on every measured pixel; misses stay misses.
+
+    ``rng`` advances by one number per pixel, measured or not. Raises ``ValueError`` when ``std`` is not finite and at
+    least 0.
+    """
+    if not 0 <= std < np.inf:
+        raise ValueError(f"the depth noise is {std}; it is a standard deviation, finite and at least 0: correct it")
+    noisy = image.depth + rng.normal(0.0, std, size=image.depth.shape)
+    # noise cannot turn a hit into a miss, which is what a depth of 0 would mean
+    return DepthImage(np.where(image.valid, np.maximum(noisy, np.finfo(np.float32).tiny), 0.0), image.camera)

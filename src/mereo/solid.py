@@ -2,10 +2,12 @@
 
 Inside tests cast one ray and ask whether the first face hit is seen from behind. Two rays in unrelated directions are
 compared; where they disagree (a ray through an edge, an imperfect mesh) the generalized winding number decides
-(Jacobson et al., SIGGRAPH 2013; Barill et al., SIGGRAPH 2018).
+(Jacobson et al., SIGGRAPH 2013; Barill et al., SIGGRAPH 2018). Each segment has a ray scene of its own: in a joint one
+the coincident faces of two neighbours would make the first face hit ambiguous.
 """
 
 from functools import cached_property
+from typing import NamedTuple
 
 import igl
 import numpy as np
@@ -23,7 +25,7 @@ _DEVICE = rtcore.EmbreeDevice()
 
 
 def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> EmbreeScene:
-    """An Embree scene of one triangle mesh."""
+    """An Embree scene of one triangle mesh; it works in single precision, so keep coordinates near the origin."""
     scene = EmbreeScene(_DEVICE)
     TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
     return scene
@@ -36,10 +38,12 @@ class _Solid:
         self.vertices = np.ascontiguousarray(segment.vertices, dtype=np.float64)
         self.faces = np.ascontiguousarray(segment.faces, dtype=np.int64)
         self.low, self.high = segment.bounds
+        self.center = (self.low + self.high) / 2
 
     @cached_property
     def rays(self) -> EmbreeScene:
-        return ray_scene(self.vertices, self.faces)
+        # about its own centre: a camera frame is hundreds of units away, where single precision is coarse
+        return ray_scene(self.vertices - self.center, self.faces)
 
     @cached_property
     def tree(self) -> igl.AABB:
@@ -47,30 +51,51 @@ class _Solid:
         tree.init(self.vertices, self.faces)
         return tree
 
-    def inside(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        result = np.zeros(len(points), dtype=bool)
-        candidates = np.flatnonzero(((points > self.low) & (points < self.high)).all(axis=1))
-        if len(candidates) == 0:
-            return result
-        near = np.ascontiguousarray(points[candidates])
-        first, second = (self._behind_first_hit(near, direction) for direction in _DIRECTIONS)
-        doubtful = first != second
-        if doubtful.any():
-            winding = igl.fast_winding_number(self.vertices, self.faces, near[doubtful])
-            first[doubtful] = winding > 0.5
-        result[candidates] = first
+    def in_box(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether points lie strictly in the segment's box, outside of which nothing is inside."""
+        result = np.ones(len(points), dtype=bool)
+        for axis in range(3):
+            result &= (points[:, axis] > self.low[axis]) & (points[:, axis] < self.high[axis])
         return result
 
-    def _behind_first_hit(
-        self, points: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]
-    ) -> Bool[np.ndarray, " n"]:
-        origins = points.astype(np.float32)
-        hits = self.rays.run(origins, np.broadcast_to(direction, origins.shape).copy(), output=True)
-        return (hits["primID"] >= 0) & (hits["Ng"] @ direction > 0)
+    def holds(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether points, already known to lie in the box, are inside."""
+        if len(points) == 0:
+            return np.zeros(0, dtype=bool)
+        first, second = self._behind_first_hit(points)
+        doubtful = first != second
+        if doubtful.any():
+            first[doubtful] = igl.fast_winding_number(self.vertices, self.faces, points[doubtful]) > 0.5
+        return first
+
+    def _behind_first_hit(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "2 n"]:
+        """For each of two rays whether the first face it hits is seen from behind."""
+        origins = np.tile((points - self.center).astype(np.float32), (2, 1))
+        directions = np.repeat(_DIRECTIONS, len(points), axis=0)
+        hits = self.rays.run(origins, directions, output=True)
+        normals = hits["Ng"].reshape(2, -1, 3)
+        behind = np.stack([normal @ direction for normal, direction in zip(normals, _DIRECTIONS, strict=True)]) > 0
+        return behind & (hits["primID"].reshape(2, -1) >= 0)
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         squared, _, _ = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
         return np.sqrt(squared)
+
+
+class Nearest(NamedTuple):
+    """The closest surface point of each query point.
+
+    Attributes:
+        distance: unsigned.
+        point: where it is.
+        face: which face of ``mesh.merged()`` it lies on.
+        owner: that face's segment.
+    """
+
+    distance: Float[np.ndarray, " n"]
+    point: Float[np.ndarray, "n 3"]
+    face: Int[np.ndarray, " n"]
+    owner: Int[np.ndarray, " n"]
 
 
 class Solids:
@@ -98,31 +123,32 @@ class Solids:
 
     def inside(self, index: int, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether each point lies in segment ``index``."""
-        return self._solids[index].inside(points)
+        solid = self._solids[index]
+        result = solid.in_box(points)
+        result[result] = solid.holds(points[result])
+        return result
 
     def label(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
         """0 in empty space, else index + 1; where segments overlap the first one owns the point."""
         labels = np.zeros(len(points), dtype=np.uint8)
         for index, solid in enumerate(self._solids):
-            free = np.flatnonzero(labels == 0)
-            labels[free[solid.inside(points[free])]] = index + 1
+            candidates = np.flatnonzero((labels == 0) & solid.in_box(points))
+            labels[candidates[solid.holds(points[candidates])]] = index + 1
         return labels
 
     def segment_distance(self, index: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Unsigned distance to segment ``index``'s surface."""
         return self._solids[index].distance(points)
 
-    def nearest(
-        self, points: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-        """Over all surfaces: unsigned distance, closest point, its face in ``mesh.merged()``, that face's segment."""
+    def nearest(self, points: Float[np.ndarray, "n 3"]) -> Nearest:
+        """The closest point over the surfaces of all segments."""
         tree, vertices, faces, owner = self._surface
         squared, face, closest = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
-        return np.sqrt(squared), closest, face, owner[face]
+        return Nearest(np.sqrt(squared), closest, face, owner[face])
 
     def nearest_segment(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
         """The segment whose surface is nearest."""
-        return self.nearest(points)[3]
+        return self.nearest(points).owner
 
     def face_normals(self, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Unit normals of faces of ``mesh.merged()``."""
@@ -133,17 +159,22 @@ class Solids:
 
 
 def signed_distance_and_direction(
-    solids: Solids, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]
+    solids: Solids,
+    points: Float[np.ndarray, "n 3"],
+    labels: UInt8[np.ndarray, " n"],
+    nearest: Nearest | None = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     """Distance (negative where ``labels`` is not 0) and unit direction to the closest surface point.
 
-    A point on the surface has no direction of its own and takes the face's normal.
+    ``nearest`` is ``solids.nearest(points)`` where the caller has it already. A point on the surface has no direction
+    of its own and takes the face's normal.
     """
-    distance, closest, face, _ = solids.nearest(points)
-    offset = closest - points
-    on_surface = distance < 1e-9 * np.abs(solids.mesh.bounds).max()
-    direction = np.where(on_surface[:, None], solids.face_normals(face), offset / np.maximum(distance, 1e-30)[:, None])
-    return np.where(labels > 0, -distance, distance), direction
+    nearest = solids.nearest(points) if nearest is None else nearest
+    offset = nearest.point - points
+    direction = offset / np.maximum(nearest.distance, 1e-30)[:, None]
+    on_surface = np.flatnonzero(nearest.distance < 1e-9 * np.abs(solids.mesh.bounds).max())
+    direction[on_surface] = solids.face_normals(nearest.face[on_surface])
+    return np.where(labels > 0, -nearest.distance, nearest.distance), direction
 
 
 def label_grid(
@@ -152,7 +183,9 @@ def label_grid(
     """Exact labels on the product grid of three ascending coordinate arrays; the first segment wins an overlap.
 
     Instead of a test per node, every triangle is projected onto the (x, y) columns it covers; along each column the
-    signed crossings below a node add up to the winding number there. Parallel to z it is exact for closed meshes.
+    signed crossings below a node add up to the winding number there. A column through an edge or a vertex counts as
+    one beside it, the same one for all triangles, so a closed segment has no cracks; a node exactly on a surface
+    belongs to the side of larger coordinates.
     """
     labels = np.zeros((len(x), len(y), len(z)), dtype=np.uint8)
     for index, segment in enumerate(mesh.segments):
@@ -173,30 +206,40 @@ def _winding_grid(
 ) -> Bool[np.ndarray, "nx ny nz"]:
     corners = segment.vertices[segment.faces]
     triangle, i, j = _covered_columns(corners[..., :2], x, y)
-    ids, corner = segment.faces[triangle], corners[triangle]
-    px, py = x[i], y[j]
-    hit = np.ones(len(triangle), dtype=bool)
-    weights = np.empty((len(triangle), 3))
-    area = _cross2(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    for k in range(3):
-        a, b = (k + 1) % 3, (k + 2) % 3
-        # both triangles of an edge evaluate it from its lower vertex, so that a column is on exactly one side
-        swap = ids[:, a] > ids[:, b]
-        start = np.where(swap[:, None], corner[:, b], corner[:, a])
-        end = np.where(swap[:, None], corner[:, a], corner[:, b])
-        value = (end[:, 0] - start[:, 0]) * (py - start[:, 1]) - (end[:, 1] - start[:, 1]) * (px - start[:, 0])
-        hit &= ((value >= 0) ^ swap) == (area > 0)
-        weights[:, k] = np.where(swap, -value, value)
-    hit &= area != 0
-    height = (weights[hit] * corner[hit][..., 2]).sum(axis=1) / area[hit]
+    weights, left = _edge_sides(corners[triangle][..., :2], segment.faces[triangle], x[i], y[j])
+    from_above = left.all(axis=1)  # counter-clockwise in the projection: the way up leaves the solid here
+    hit = np.flatnonzero(from_above | ~left.any(axis=1))
+    heights, weights = corners[triangle[hit]][..., 2], weights[hit]
+    height = (weights * heights).sum(axis=1) / weights.sum(axis=1)
+    height = np.clip(height, heights.min(axis=1), heights.max(axis=1))  # so that level faces stay level
     crossings = np.zeros((len(x), len(y), len(z) + 1), dtype=np.int32)
-    # a face that looks up (positive projected area) is left on the way up
-    np.add.at(crossings, (i[hit], j[hit], np.searchsorted(z, height)), np.where(area[hit] > 0, -1, 1))
+    np.add.at(crossings, (i[hit], j[hit], np.searchsorted(z, height)), np.where(from_above[hit], -1, 1))
     return crossings.cumsum(axis=2)[..., :-1] > 0
 
 
-def _cross2(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+def _edge_sides(
+    corners: Float[np.ndarray, "p 3 2"],
+    ids: Int[np.ndarray, "p 3"],
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, "p 3"]]:
+    """Barycentric weights (not normalized) of columns in triangles, and whether each is left of the opposite edge.
+
+    All triangles of an edge evaluate it from its lower vertex and so agree bit for bit. A column exactly on the edge
+    is moved by (e, e^2), e infinitely small (Edelsbrunner and Muecke's simulation of simplicity): then vertices too
+    are on one side of everything.
+    """
+    weights, left = np.empty((len(x), 3)), np.empty((len(x), 3), dtype=bool)
+    for k in range(3):
+        a, b = (k + 1) % 3, (k + 2) % 3
+        swap = ids[:, a] > ids[:, b]
+        start = np.where(swap[:, None], corners[:, b], corners[:, a])
+        edge = np.where(swap[:, None], corners[:, a], corners[:, b]) - start
+        value = edge[:, 0] * (y - start[:, 1]) - edge[:, 1] * (x - start[:, 0])
+        moved = (edge[:, 1] < 0) | ((edge[:, 1] == 0) & (edge[:, 0] > 0))
+        left[:, k] = np.where(value == 0, moved, value > 0) ^ swap
+        weights[:, k] = np.where(swap, -value, value)
+    return weights, left
 
 
 def _covered_columns(
@@ -216,7 +259,8 @@ def _covered_columns(
 def check_overlap(mesh: SegmentedMesh, tolerance: float = 1e-3, cells: int = 64) -> None:
     """Raise ``ValueError`` naming two segments whose common volume exceeds ``tolerance`` of the smaller one.
 
-    The common volume is measured on a grid of ``cells`` per axis over the smaller segment's box.
+    Segments that touch share no volume. The common volume is measured on a grid of ``cells`` per axis over the smaller
+    segment's box.
     """
     order = sorted(mesh.segments, key=lambda segment: abs(segment.volume))
     for number, small in enumerate(order):
@@ -226,10 +270,11 @@ def check_overlap(mesh: SegmentedMesh, tolerance: float = 1e-3, cells: int = 64)
         for large in order[number + 1 :]:
             if (large.bounds[1] <= low).any() or (large.bounds[0] >= high).any():
                 continue
-            shared = (alone & (label_grid(SegmentedMesh((large,)), *axes) > 0)).sum() / max(int(alone.sum()), 1)
-            if shared > tolerance:
+            both = int((alone & (label_grid(SegmentedMesh((large,)), *axes) > 0)).sum())
+            share, volume = both / max(int(alone.sum()), 1), both * float(np.prod((high - low) / cells))
+            if share > tolerance:
                 raise ValueError(
-                    f"segments {small.name!r} and {large.name!r} overlap in {100 * shared:.2g} % of {small.name!r}; "
-                    f"at most {100 * tolerance:.2g} % is allowed: subtract one from the other "
-                    "(for example trimesh.boolean.difference)"
+                    f"segments {small.name!r} and {large.name!r} overlap in a volume of {volume:.3g}, "
+                    f"{100 * share:.2g} % of {small.name!r}; at most {100 * tolerance:.2g} % is allowed: "
+                    "subtract one from the other (for example trimesh.boolean.difference)"
                 )
