@@ -1,0 +1,429 @@
+"""The paper's claims about its samplers (section 3.2), as statistics with bounds, closed forms and slow references."""
+
+import importlib.util
+import sys
+from dataclasses import replace
+from functools import cache, cached_property
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mereo import query_sampling
+from mereo.config import SamplingConfig
+from mereo.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.query_sampling import (
+    Samples,
+    extended_boxes,
+    joint_box,
+    label_uniform,
+    nested_sort_sample,
+    owner_labels,
+    sample_queries,
+    sort_sample,
+    volume_uniform,
+)
+from mereo.solid import Solids
+
+
+@cache
+def example() -> ModuleType:
+    path = Path(__file__).parents[1] / "examples" / "sampling_2d.py"
+    spec = importlib.util.spec_from_file_location("sampling_2d", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+class Balls:
+    """Balls in any dimension; every answer in closed form."""
+
+    def __init__(self, *balls: tuple[tuple[float, ...], float]) -> None:
+        self.centers, self.radii = np.array([c for c, _ in balls]), np.array([r for _, r in balls])
+        self.count = len(balls)
+
+    def boxes(self) -> np.ndarray:
+        return np.stack([self.centers - self.radii[:, None], self.centers + self.radii[:, None]], axis=1)
+
+    def radius(self, index: int, points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points - self.centers[index], axis=1)
+
+    def inside(self, index: int, points: np.ndarray) -> np.ndarray:
+        return self.radius(index, points) < self.radii[index]
+
+    def label(self, points: np.ndarray) -> np.ndarray:
+        labels = np.zeros(len(points), dtype=np.uint8)
+        for index in reversed(range(self.count)):
+            labels[self.inside(index, points)] = index + 1
+        return labels
+
+    def segment_distance(self, index: int, points: np.ndarray) -> np.ndarray:
+        return np.abs(self.radius(index, points) - self.radii[index])
+
+
+def square(low: float, high: float, shift: float = 0.0) -> np.ndarray:
+    return np.array([[low + shift, low], [high + shift, low], [high + shift, high], [low + shift, high]])
+
+
+def cube(name: str, shift: float) -> Segment:
+    corners = np.array([[x + shift, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    return Segment(name, PALETTE[0], corners, faces)
+
+
+def shapes() -> dict[str, query_sampling.Shape]:
+    """Two dimensions and three, one segment and several, touching and apart, convex and not."""
+    outlines, _ = example().read_outlines()
+    return {
+        "thin": example().Polygons2D(outlines["thin"]),
+        "squares": example().Polygons2D(square(0, 1), square(0, 1, shift=1.0), square(2, 2.3)),
+        "balls": Balls(((0, 0, 0), 1.0), ((2.05, 0, 0), 1.0), ((0, 1.4, 0), 0.35)),
+        "cubes": Solids(SegmentedMesh((cube("left", 0.0), cube("right", 1.0)))),
+    }
+
+
+NAMES = ("thin", "squares", "balls", "cubes")
+
+
+def halves(samples: Samples, keep: int) -> list[tuple[Samples, Samples]]:
+    """Per segment, the points inside and those outside."""
+    points, labels = (np.split(a, len(a) // keep) for a in samples)
+    sides = [Samples(p, q) for p, q in zip(points, labels, strict=True)]
+    return list(zip(sides[::2], sides[1::2], strict=True))
+
+
+# --- the algorithm ---------------------------------------------------------------------------------------------------
+
+
+def one_at_a_time(shape: query_sampling.Shape, keep: int, draw: int, seed: int, nested: bool) -> Samples:
+    """The paper's loop, one draw after the other."""
+    seeds = np.random.default_rng(seed).integers(0, 2**32, size=(shape.count, 4), dtype=np.uint32)
+    points, labels = [], []
+    for index, (low, high) in enumerate(extended_boxes(shape)):
+        stream = np.random.default_rng(seeds[index])
+        inside: list[tuple[np.ndarray, int]] = []
+        outside: list[tuple[np.ndarray, int]] = []
+        while len(inside) < draw or len(outside) < draw:
+            point = low + stream.random(len(low)) * (high - low)
+            label = int((owner_labels(shape, point[None]) if nested else shape.label(point[None]))[0])
+            if label == index + 1:
+                inside.append((point, label))
+            elif label == 0 or nested:
+                outside.append((point, label))
+        for side in (inside, outside):
+            distance = shape.segment_distance(index, np.array([p for p, _ in side]))
+            nearest = sorted(np.argsort(distance)[:keep])
+            points += [side[i][0] for i in nearest]
+            labels += [side[i][1] for i in nearest]
+    return Samples(np.array(points), np.array(labels, dtype=np.uint8))
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_equals_drawing_one_point_at_a_time(name: str, nested: bool) -> None:
+    sampler = nested_sort_sample if nested else sort_sample
+    for keep, draw in ((12, 12), (9, 30)):
+        fast = sampler(shapes()[name], keep, draw, np.random.default_rng(5))
+        slow = one_at_a_time(shapes()[name], keep, draw, 5, nested)
+        np.testing.assert_array_equal(fast.points, slow.points)
+        np.testing.assert_array_equal(fast.labels, slow.labels)
+
+
+def test_batch_size_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    shape = shapes()["balls"]
+    usual = sort_sample(shape, 40, 80, np.random.default_rng(1))
+    for first, largest in ((1, 1 << 17), (300, 1 << 17), (8, 7)):
+        monkeypatch.setattr(query_sampling, "_FIRST_BATCH", first)
+        monkeypatch.setattr(query_sampling, "_LARGEST_BATCH", largest)
+        other = sort_sample(shape, 40, 80, np.random.default_rng(1))
+        np.testing.assert_array_equal(usual.points, other.points)
+
+
+def test_generator_advances_by_the_same_amount_whatever_is_drawn() -> None:
+    """So the uniform points after it are comparable between samplers' settings."""
+    rngs = [np.random.default_rng(3) for _ in range(2)]
+    for rng, draw in zip(rngs, (20, 200), strict=True):
+        sort_sample(shapes()["balls"], 20, draw, rng)
+    assert rngs[0].random() == rngs[1].random()
+
+
+def test_few_distances_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bound that makes it fast: far fewer distances than draws outside."""
+    ball = Balls(((0, 0, 0), 1.0))
+    measured: list[int] = []
+    real = ball.segment_distance
+    monkeypatch.setattr(ball, "segment_distance", lambda i, p: (measured.append(len(p)), real(i, p))[1])
+    points = np.random.default_rng(0).uniform(-6, 6, size=(20_000, 3))
+    rows = query_sampling._nearest_rows(ball, 0, points, 100)
+    assert set(rows) == set(np.argsort(real(0, points))[:100])
+    assert sum(measured) < 5_000
+
+
+# --- counts, labels, what is dropped and what is kept ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_equal_counts_and_right_labels(name: str) -> None:
+    shape, rng = shapes()[name], np.random.default_rng(0)
+    for samples in (label_uniform(shape, 50, rng), sort_sample(shape, 50, 50, rng), sort_sample(shape, 50, 100, rng)):
+        assert len(samples.points) == 100 * shape.count
+        np.testing.assert_array_equal(samples.labels, shape.label(samples.points))
+        for index, (inside, outside) in enumerate(halves(samples, 50)):
+            assert (inside.labels == index + 1).all()
+            assert (outside.labels != index + 1).all()
+    uniform = volume_uniform(shape, 100, rng)
+    np.testing.assert_array_equal(uniform.labels, shape.label(uniform.points))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_samples_fill_the_extended_boxes_and_stay_in_them(name: str) -> None:
+    shape = shapes()[name]
+    boxes = extended_boxes(shape)
+    np.testing.assert_allclose(boxes[:, 1] - boxes[:, 0], 1.5 * (shape.boxes()[:, 1] - shape.boxes()[:, 0]))
+    np.testing.assert_allclose(boxes.mean(axis=1), shape.boxes().mean(axis=1), atol=1e-12)
+    for points, (low, high) in zip(
+        np.split(volume_uniform(shape, 4000, np.random.default_rng(0)).points, shape.count), boxes, strict=True
+    ):
+        unit = (points - low) / (high - low)
+        assert unit.min() > 0
+        assert unit.max() < 1
+        # mean of 4000 uniform numbers: standard deviation 0.0046
+        assert np.abs(unit.mean(axis=0) - 0.5).max() < 4 * np.sqrt(1 / 12 / 4000)
+
+
+def test_sort_sample_drops_points_in_other_segments_and_nested_keeps_them() -> None:
+    squares = shapes()["squares"]
+    dropped = halves(sort_sample(squares, 200, 200, np.random.default_rng(0)), 200)
+    assert all((outside.labels == 0).all() for _, outside in dropped)
+    nested = nested_sort_sample(squares, 200, 200, np.random.default_rng(0))
+    np.testing.assert_array_equal(nested.labels, squares.label(nested.points))
+    left, right, alone = halves(nested, 200)
+    # a quarter of a square's outline is shared with its neighbour
+    assert 0.15 < (left[1].labels == 2).mean() < 0.35
+    assert 0.15 < (right[1].labels == 1).mean() < 0.35
+    assert (alone[1].labels == 0).all()
+
+
+def test_the_nearest_surface_owns_nested_and_overlapping_solids() -> None:
+    nested = Balls(((0, 0, 0), 3.0), ((0, 0, 0), 2.0), ((0, 0, 0), 1.0))
+    points = np.random.default_rng(0).uniform(-3.2, 3.2, size=(5000, 3))
+    radius = np.linalg.norm(points, axis=1)
+    # the innermost ball that holds it, also just outside ball 3, whose surface is then the nearest of all
+    np.testing.assert_array_equal(owner_labels(nested, points), (radius < 3).astype(int) + (radius < 2) + (radius < 1))
+    overlapping = Balls(((-0.6, 0, 0), 1.0), ((0.6, 0, 0), 1.0))
+    points = points / 3.2
+    lens = points[overlapping.inside(0, points) & overlapping.inside(1, points)]
+    assert len(lens) > 100
+    # equal radii: the first ball's surface is nearer where its centre is farther
+    np.testing.assert_array_equal(owner_labels(overlapping, lens), np.where(lens[:, 0] > 0, 1, 2))
+
+
+def test_nested_sampler_reaches_what_sort_sample_cannot() -> None:
+    organ = Balls(((0, 0, 0), 1.0), ((0, 0, 0), 3.0))
+    samples = nested_sort_sample(organ, 100, 100, np.random.default_rng(0))
+    (_, around), (outer, beyond) = halves(samples, 100)
+    assert (around.labels == 2).all()
+    assert (outer.labels == 2).all()
+    assert set(beyond.labels) <= {0, 1}
+
+
+# --- the paper's claims about densities and distances ----------------------------------------------------------------
+
+REPEATS = 30
+KEEP = 256
+
+
+class Panel:
+    """A toy shape in its draw box, with the areas near its outline measured by Monte Carlo."""
+
+    def __init__(self, name: str, figure_box: bool) -> None:
+        outlines, box = example().read_outlines()
+        self.shape = example().Polygons2D(outlines[name])
+        self.boxes = box[None] if figure_box else extended_boxes(self.shape)
+        rng = np.random.default_rng(7)
+        low, high = self.boxes[0]
+        points = low + rng.random((150_000, 2)) * (high - low)
+        distance = np.concatenate([self.shape.segment_distance(0, part) for part in np.split(points, 30)])
+        inside = self.shape.inside(0, points)
+        self.inside, self.outside = np.sort(distance[inside]), np.sort(distance[~inside])
+
+    def distances(self, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
+        distance = self.shape.segment_distance(0, samples.points)
+        return distance[samples.labels > 0], distance[samples.labels == 0]
+
+    @cached_property
+    def sorted(self) -> dict[int, list[tuple[np.ndarray, np.ndarray]]]:
+        """Distances of the points kept inside and outside, for SortSample with n = k and n = 2k, in every run."""
+        return {
+            factor: [
+                self.distances(sort_sample(self.shape, KEEP, factor * KEEP, np.random.default_rng(seed), self.boxes))
+                for seed in range(REPEATS)
+            ]
+            for factor in (1, 2)
+        }
+
+    @cached_property
+    def uniform(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The same for Label Uniform."""
+        return [
+            self.distances(label_uniform(self.shape, KEEP, np.random.default_rng(seed), self.boxes))
+            for seed in range(REPEATS)
+        ]
+
+    def bias(self, runs: list[tuple[np.ndarray, np.ndarray]]) -> float:
+        """Log ratio of densities just inside and just outside, in standard deviations.
+
+        The two bands along the outline have equal areas, 0.3 of the shape's; counts in them are compared. Four counts
+        enter, two of them Monte Carlo areas, each with a relative variance of one over itself.
+        """
+        area = int(0.3 * len(self.inside))
+        within = [
+            sum(int((side < edge).sum()) for side in sides)
+            for sides, edge in zip(zip(*runs, strict=True), (self.inside[area], self.outside[area]), strict=True)
+        ]
+        return float(np.log(within[0] / within[1]) / np.sqrt(1 / within[0] + 1 / within[1] + 2 / area))
+
+
+panel = cache(Panel)
+each_panel = pytest.mark.parametrize(
+    "name, figure_box", [(name, box) for name in ("simple", "small", "thin") for box in (False, True)]
+)
+
+
+@each_panel
+@pytest.mark.parametrize("factor", [1, 2])
+def test_sort_sample_has_no_density_step_at_the_surface(name: str, figure_box: bool, factor: int) -> None:
+    here = panel(name, figure_box)
+    assert abs(here.bias(here.sorted[factor])) < 4
+
+
+@each_panel
+def test_label_uniform_has_a_density_step_at_the_surface(name: str, figure_box: bool) -> None:
+    """The same statistic, so that the test above is known to be able to fail: it must fail clearly here."""
+    here = panel(name, figure_box)
+    assert here.bias(here.uniform) > 12
+
+
+@each_panel
+def test_outside_points_stay_within_the_distance_that_geometry_gives(name: str, figure_box: bool) -> None:
+    """With n = k the outside points fill a band of the shape's own area, with n = 2k both sides one of half of it."""
+    here = panel(name, figure_box)
+    for factor in (1, 2):
+        runs = here.sorted[factor]
+        area = len(here.inside) // factor
+        reach_in, reach_out = (np.mean([run[side].max() for run in runs]) for side in (0, 1))
+        assert reach_out == pytest.approx(here.outside[area], rel=0.06)
+        assert reach_in == pytest.approx(here.inside[area - 1], rel=0.06)
+
+
+@each_panel
+def test_drawing_more_brings_points_closer(name: str, figure_box: bool) -> None:
+    here = panel(name, figure_box)
+    label, once, twice = (np.concatenate([out for _, out in runs]) for runs in (here.uniform, *here.sorted.values()))
+    assert np.median(twice) < 0.8 * np.median(once) < 0.8 * np.median(label)
+    diagonal = float(np.linalg.norm(here.boxes[0, 1] - here.boxes[0, 0]))
+    assert twice.max() < once.max() < diagonal / 6
+    if figure_box:
+        assert label.max() > diagonal / 4
+
+
+def test_reach_around_balls_in_closed_form() -> None:
+    """Equal volumes on both sides: r * 2^(1/3) for n = k; half volumes r * 0.5^(1/3) and r * 1.5^(1/3) for n = 2k."""
+    balls = Balls(((0, 0, 0), 1.0), ((9, 0, 0), 2.0))
+    for factor, inner, outer in ((1, None, 2.0), (2, 0.5, 1.5)):
+        runs = [halves(sort_sample(balls, 256, 256 * factor, np.random.default_rng(s)), 256) for s in range(20)]
+        for index, r in enumerate(balls.radii):
+            outermost = np.mean([balls.radius(index, run[index][1].points).max() for run in runs])
+            assert outermost == pytest.approx(r * outer ** (1 / 3), rel=0.025)
+            if inner is not None:
+                innermost = np.mean([balls.radius(index, run[index][0].points).min() for run in runs])
+                assert innermost == pytest.approx(r * inner ** (1 / 3), rel=0.025)
+
+
+# --- all queries of an example ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sampler", ["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"])
+def test_queries_of_an_example(sampler: str) -> None:
+    shape = shapes()["balls"]
+    settings = replace(SamplingConfig(), sampler=sampler, per_segment=64, uniform_fraction=0.5)
+    samples = sample_queries(shape, settings, np.random.default_rng(2))
+    again = sample_queries(shape, settings, np.random.default_rng(2))
+    np.testing.assert_array_equal(samples.points, again.points)
+    assert len(samples.points) == len(samples.labels) == settings.total(3) == 64 * 3 + 96
+    assert samples.labels.dtype == np.uint8
+    np.testing.assert_array_equal(samples.labels, shape.label(samples.points))
+    low, high = joint_box(shape)
+    np.testing.assert_array_equal([low, high], [[-1, -1, -1], [3.05, 1.75, 1]])
+    unit = (samples.points[64 * 3 :] - low) / (high - low)
+    assert unit.min() > 0
+    assert unit.max() < 1
+    assert np.abs(unit.mean(axis=0) - 0.5).max() < 4 * np.sqrt(1 / 12 / 96)
+
+
+def test_settings_reach_the_sampler() -> None:
+    shape, config = shapes()["balls"], SamplingConfig(per_segment=80, oversample=3, box_margin=0.8, uniform_fraction=0)
+    queries = sample_queries(shape, config, np.random.default_rng(4))
+    direct = sort_sample(shape, 40, 120, np.random.default_rng(4), extended_boxes(shape, 0.8))
+    np.testing.assert_array_equal(queries.points, direct.points)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"per_segment": 7}, "per_segment is 7; half the points go inside and half outside: pass an even number"),
+        ({"per_segment": 0}, "per_segment is 0; .* even number"),
+        ({"oversample": 0}, "oversample is 0; it is n / k and at least 1: pass 1 or 2"),
+        ({"box_margin": 0.0}, "box_margin is 0.0; boxes must reach beyond .*: pass a fraction"),
+        ({"box_margin": float("nan")}, "box_margin is nan"),
+        ({"uniform_fraction": -0.1}, "uniform_fraction is -0.1; it cannot be negative"),
+    ],
+)
+def test_bad_settings(change: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        sample_queries(shapes()["balls"], replace(SamplingConfig(), **change), np.random.default_rng(0))
+
+
+def test_fewer_drawn_than_kept() -> None:
+    with pytest.raises(ValueError, match="keep is 9 and draw is 8; .* pass keep <= draw"):
+        sort_sample(shapes()["balls"], 9, 8, np.random.default_rng(0))
+
+
+def test_a_segment_that_is_never_hit(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert query_sampling.MAX_DRAWS == 2_000_000
+    monkeypatch.setattr(query_sampling, "MAX_DRAWS", 30_000)
+    covered = Balls(((0, 0, 0), 3.0), ((0, 0, 0), 1.0))
+    with pytest.raises(ValueError) as caught:
+        sort_sample(covered, 128, 128, np.random.default_rng(0))
+    assert str(caught.value) == (
+        "segment 1 has 0 of 30,000 draws inside it; 128 are needed: check that it is closed and no earlier segment "
+        "covers it, or split it into shorter parts"
+    )
+
+
+def test_a_segment_without_empty_space_around_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(query_sampling, "MAX_DRAWS", 30_000)
+    enclosed = Balls(((0, 0, 0), 1.0), ((0, 0, 0), 3.0))
+    with pytest.raises(ValueError) as caught:
+        sort_sample(enclosed, 128, 128, np.random.default_rng(0))
+    assert str(caught.value) == (
+        "segment 0 has 0 of 30,000 draws in the empty space around it; 128 are needed: widen box_margin, "
+        "or use nested-sort-sample for a segment enclosed by others"
+    )
+
+
+def test_the_example_draws_its_figure(tmp_path: Path) -> None:
+    example().main(["--output", str(tmp_path / "figure.png")])
+    with Image.open(tmp_path / "figure.png") as image:
+        assert image.size == (1320, 1920)
+        # red inside, blue outside, white paper
+        pixels = np.asarray(image.convert("RGB"), dtype=int)
+    red, blue = pixels[..., 0] - pixels[..., 2], pixels[..., 2] - pixels[..., 0]
+    assert (red > 80).mean() > 0.01
+    assert (blue > 80).mean() > 0.01
