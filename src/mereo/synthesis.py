@@ -3,14 +3,15 @@
     SegmentedMesh -deform-> -render-> DepthImage -unproject-> PointCloud
                       '---- sample and label query points ---> LabelledPoints
 
-Query boxes are axis-aligned in the camera frame, where the points live, as are the boxes of the evaluation.
+Query points are drawn in the camera frame, in boxes whose sides are parallel to the camera's axes. The paper draws them
+around the object and then "transforms them into camera space"; drawn there directly, they fill the boxes that
+evaluation and reconstruction look into, which know the camera's axes only.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from scipy.spatial import cKDTree
+from jaxtyping import Float, Int, UInt8
 
 from mereo.camera import Camera, DepthImage
 from mereo.config import GenerateConfig
@@ -21,10 +22,13 @@ from mereo.ordering import farthest_point_order
 from mereo.query_sampling import Samples, sample_queries
 from mereo.rendering import add_depth_noise, render_depth
 from mereo.scene import Scene
-from mereo.solid import Solids, signed_distance_and_direction
+from mereo.solid import Nearest, Solids, signed_distance_and_direction
 
 MIN_POINTS = 32
+"""A view of fewer points says too little about the object; it is drawn again."""
+
 ATTEMPTS = 100
+"""Views drawn before giving up on a scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +36,8 @@ class View:
     """A random state seen by a random camera.
 
     Attributes:
-        mesh: the deformed segments in the CAMERA frame.
-        depth: the noisy depth image.
+        mesh: the deformed segments in the CAMERA frame, in scene units.
+        depth: the noisy depth image, with the camera it was taken with.
         T_world_camera: the camera's pose in the scene's frame.
         deformations: for each segment the map from rest to the scene's frame.
     """
@@ -53,7 +57,7 @@ class LabelledPoints:
         distances: signed, to the nearest segment surface, negative inside any segment.
         directions: unit vector to that surface.
         rest: rest-pose coordinates of inside points, ``(rest - box centre) / half of the box's longest side`` of the
-            joint rest box; NaN outside.
+            joint rest box; NaN outside, and where the deformation could not be inverted.
     """
 
     positions: Float[np.ndarray, "q 3"]
@@ -79,12 +83,16 @@ class Example:
 
 
 def example_rng(seed: int, index: int) -> np.random.Generator:
-    """The generator of example ``index``: any example can be remade alone."""
+    """The generator of example ``index``: any example can be remade alone, in any order, by any process."""
     return np.random.default_rng(np.random.SeedSequence([seed, index]))
 
 
 def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> Example:
-    """One training example."""
+    """One training example: a random state, seen and noisy, and query points with their answers.
+
+    Raises:
+        ValueError: no random view sees the object, or a segment cannot be sampled (``query_sampling``).
+    """
     view = sample_view(scene, settings, rng)
     points = view.depth.to_points().points
     normalizer = Normalizer.fit(points)
@@ -99,7 +107,10 @@ def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator)
 
 
 def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> View:
-    """A random state seen by a random camera; views that see next to nothing are drawn again."""
+    """A random state seen by a random camera; both are drawn again while fewer than ``MIN_POINTS`` points are seen.
+
+    Raises ``ValueError`` naming the scene after ``ATTEMPTS`` such views.
+    """
     camera = Camera.from_fov(settings.image_size, settings.image_size, scene.workspace.fov_rad)
     for _ in range(ATTEMPTS):
         state = scene.sample_state(rng)
@@ -116,28 +127,67 @@ def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator
 
 def label_queries(scene: Scene, view: View, solids: Solids, samples: Samples, normalizer: Normalizer) -> LabelledPoints:
     """Distances, directions and rest coordinates of sampled points, normalized."""
-    distance, direction = signed_distance_and_direction(solids, samples.points, samples.labels)
+    nearest = solids.nearest(samples.points)
+    distance, direction = signed_distance_and_direction(solids, samples.points, samples.labels, nearest)
     return LabelledPoints(
         positions=normalizer.apply(samples.points),
         labels=samples.labels,
         distances=distance * normalizer.scale,
         directions=direction,
-        rest=rest_coordinates(scene, view, samples),
+        rest=rest_coordinates(scene, view, samples, nearest),
     )
 
 
-def rest_coordinates(scene: Scene, view: View, samples: Samples) -> Float[np.ndarray, "q 3"]:
-    """Where inside points were before the deformation; the guess is the rest position of the nearest vertex."""
+def rest_coordinates(scene: Scene, view: View, samples: Samples, nearest: Nearest) -> Float[np.ndarray, "q 3"]:
+    """Where inside points were before the deformation, normalized by the joint rest box; NaN for the others."""
     low, high = scene.rest.bounds
+    inside = np.flatnonzero(samples.labels)
+    world = transform_points(view.T_world_camera, samples.points[inside])
+    guess = _rest_guess(scene.rest, view.mesh, samples.points[inside], nearest.point[inside], nearest.face[inside])
     rest = np.full((len(samples.points), 3), np.nan)
-    world = transform_points(view.T_world_camera, samples.points)
-    for index, deformation in enumerate(view.deformations):
-        members = np.flatnonzero(samples.labels == index + 1)
-        if len(members) == 0:
-            continue
-        moved = transform_points(view.T_world_camera, view.mesh.segments[index].vertices)
-        nearest = cKDTree(moved).query(world[members])[1]
-        guess = scene.rest.segments[index].vertices[nearest] + world[members] - moved[nearest]
-        found, converged = invert(deformation, world[members], guess)
-        rest[members[converged]] = found[converged]
+    # segments that move together share one deformation and are inverted in one call
+    maps = np.array([id(deformation) for deformation in view.deformations])[samples.labels[inside] - 1]
+    for deformation in {id(d): d for d in view.deformations}.values():
+        members = np.flatnonzero(maps == id(deformation))
+        if len(members):
+            found, converged = invert(deformation, world[members], guess[members])
+            rest[inside[members[converged]]] = found[converged]
     return (rest - (low + high) / 2) / ((high - low).max() / 2)
+
+
+def _rest_guess(
+    rest: SegmentedMesh,
+    deformed: SegmentedMesh,
+    points: Float[np.ndarray, "n 3"],
+    closest: Float[np.ndarray, "n 3"],
+    face: Int[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"]:
+    """First guess of rest positions: the closest surface point's, and the offset from it turned as its triangle was.
+
+    ``closest`` lies on ``face`` of ``deformed.merged()``. The interface of two neighbours is the same in both, so it
+    does not matter whose face it is.
+    """
+    before, faces, _ = rest.merged()
+    after, _, _ = deformed.merged()
+    old, new = before[faces[face]], after[faces[face]]
+    weights = _barycentric(new, closest)
+    local = np.einsum("nji,nj->ni", _triangle_frames(new), points - closest)
+    return np.einsum("nk,nkj->nj", weights, old) + np.einsum("nij,nj->ni", _triangle_frames(old), local)
+
+
+def _barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Barycentric coordinates of points in the planes of their triangles."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    normal = np.cross(b - a, c - a)
+    size = np.maximum(np.einsum("ni,ni->n", normal, normal), 1e-30)
+    v = np.einsum("ni,ni->n", np.cross(points - a, c - a), normal) / size
+    w = np.einsum("ni,ni->n", np.cross(b - a, points - a), normal) / size
+    return np.stack([1 - v - w, v, w], axis=1)
+
+
+def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """Rotations whose columns are each triangle's first edge, its normal, and the direction across."""
+    along = triangles[:, 1] - triangles[:, 0]
+    normal = np.cross(along, triangles[:, 2] - triangles[:, 0])
+    along, normal = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (along, normal))
+    return np.stack([along, normal, np.cross(along, normal)], axis=2)
