@@ -162,12 +162,12 @@ def _exposed_faces(
 def _quad_corners(
     cells: Int[np.ndarray, "n 3"], axes: Int[np.ndarray, " n"], signs: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 4 3"]:
-    """Corners of each face in grid coordinates, voxel centres at whole numbers, in order around the face."""
+    """Corners of each face in grid coordinates, voxel centres at whole numbers, counter-clockwise from outside."""
     row = np.arange(len(cells))
     corners = np.repeat(cells[:, None].astype(float), 4, axis=1)
     corners[row, :, axes] += 0.5 * signs[:, None]
-    for step, pattern in ((1, (-0.5, 0.5, 0.5, -0.5)), (2, (-0.5, -0.5, 0.5, 0.5))):
-        corners[row, :, (axes + step) % 3] += np.asarray(pattern)
+    corners[row, :, (axes + 1) % 3] += np.array([-0.5, 0.5, 0.5, -0.5]) * signs[:, None]
+    corners[row, :, (axes + 2) % 3] += np.array([-0.5, -0.5, 0.5, 0.5])
     return corners
 
 

@@ -126,11 +126,12 @@ def _base64(array: np.ndarray) -> str:
 
 
 def _fit(surfaces: SegmentedMesh, extent: float, room_bytes: int) -> list[Segment]:
-    """The segments, coarsened together in steps of 1.3 until they take at most ``room_bytes``."""
+    """The segments, coarsened together until they take at most ``room_bytes``."""
     shown, cells = list(surfaces.segments), 400.0
-    while sum(6 * len(s.vertices) + 12 * len(s.faces) for s in shown) > room_bytes and cells > 4:
+    while (size := sum(6 * len(s.vertices) + 12 * len(s.faces) for s in shown)) > room_bytes and cells > 4:
         shown = [cluster(segment, extent / cells) for segment in surfaces.segments]
-        cells /= 1.3
+        # a surface meets about cells^2 cells of the grid; the factor keeps the last steps from crawling
+        cells *= min(0.95, max(0.5, (max(room_bytes, 0) / size) ** 0.5))
     return shown
 
 
@@ -140,11 +141,18 @@ def cluster(segment: Segment, cell: float) -> Segment:
     J. Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993. Fast and
     dependency-free; the result is for looking at and need not be closed.
     """
-    key = np.floor((segment.vertices - segment.vertices.min(axis=0)) / cell).astype(np.int64)
-    _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    inverse = inverse.reshape(-1)
+    inverse = _same(np.floor((segment.vertices - segment.vertices.min(axis=0)) / cell).astype(np.int64))[1]
+    count = np.bincount(inverse)
     sums = [np.bincount(inverse, weights=segment.vertices[:, axis], minlength=len(count)) for axis in range(3)]
     faces: Int[np.ndarray, "f 3"] = inverse[segment.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    first = _same(np.sort(faces, axis=1))[0]
     return Segment(segment.name, segment.color, np.stack(sums, axis=1) / count[:, None], faces[np.sort(first)])
+
+
+def _same(rows: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " n"]]:
+    """First place of each different row, and for each row which one it is; packed, because sorting rows is slow."""
+    base = int(rows.max(initial=0)) + 1
+    packed = (rows[:, 0] * base + rows[:, 1]) * base + rows[:, 2]
+    _, first, inverse = np.unique(packed, return_index=True, return_inverse=True)
+    return first, inverse

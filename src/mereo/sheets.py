@@ -1,6 +1,7 @@
 """Contact sheets, captions, legends, and depth as colour: what all pictures are put together from."""
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import matplotlib
@@ -13,7 +14,8 @@ from mereo.mesh import Color
 from mereo.output import atomic_file
 from mereo.shading import Canvas, Viewpoint
 
-Picture = UInt8[np.ndarray, "h w 3"]
+Picture = UInt8[np.ndarray, "_ _ 3"]
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 INK: Color = (28, 32, 38)
 MISSING: Color = (236, 237, 240)
@@ -54,10 +56,16 @@ def contact_sheet(
     return np.asarray(sheet)
 
 
-def fit_font(size: int, text: str, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+def fit_font(size: int, text: str, width: int) -> Font:
     """Pillow's own font, small enough for ``text`` to fit into ``width`` pixels."""
-    while size > 8 and ImageFont.load_default(size).getlength(text) > width:
+    while size > 8 and font(size).getlength(text) > width:
         size -= 1
+    return font(size)
+
+
+@cache
+def font(size: int) -> Font:
+    """Pillow's own font; unpacking it takes longer than drawing with it."""
     return ImageFont.load_default(size)
 
 
@@ -97,10 +105,9 @@ def cloud_picture(points: Float[np.ndarray, "n 3"], view: Viewpoint, size: tuple
 
 def legend(names: Sequence[str], colors: Sequence[Color], width: int) -> Picture:
     """A swatch and a name for each segment, in as many rows as are needed."""
-    font = ImageFont.load_default(15)
     places, x, y = [], 12, 6
     for name in names:
-        length = 22 + int(font.getlength(name)) + 20
+        length = 22 + int(font(15).getlength(name)) + 20
         if x > 12 and x + length > width:
             x, y = 12, y + 26
         places.append((x, y))
@@ -109,7 +116,7 @@ def legend(names: Sequence[str], colors: Sequence[Color], width: int) -> Picture
     pen = ImageDraw.Draw(strip)
     for name, color, (left, top) in zip(names, colors, places, strict=True):
         pen.rounded_rectangle((left, top + 2, left + 15, top + 17), 4, fill=color)
-        pen.text((left + 22, top + 10), name, fill=INK, font=font, anchor="lm")
+        pen.text((left + 22, top + 10), name, fill=INK, font=font(15), anchor="lm")
     return np.asarray(strip)
 
 
