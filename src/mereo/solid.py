@@ -144,6 +144,7 @@ class Solids:
         """The closest point over the surfaces of all segments."""
         tree, vertices, faces, owner = self._surface
         squared, face, closest = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
+        face = face.astype(np.int64)  # libigl's is C's long long, which numpy tells apart
         return Nearest(np.sqrt(squared), closest, face, owner[face])
 
     def nearest_segment(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
@@ -185,7 +186,7 @@ def label_grid(
     Instead of a test per node, every triangle is projected onto the (x, y) columns it covers; along each column the
     signed crossings below a node add up to the winding number there. A column through an edge or a vertex counts as
     one beside it, the same one for all triangles, so a closed segment has no cracks; a node exactly on a surface
-    belongs to the side of larger coordinates.
+    has the label of the node just above it.
     """
     labels = np.zeros((len(x), len(y), len(z)), dtype=np.uint8)
     for index, segment in enumerate(mesh.segments):
@@ -207,13 +208,14 @@ def _winding_grid(
     corners = segment.vertices[segment.faces]
     triangle, i, j = _covered_columns(corners[..., :2], x, y)
     weights, left = _edge_sides(corners[triangle][..., :2], segment.faces[triangle], x[i], y[j])
-    from_above = left.all(axis=1)  # counter-clockwise in the projection: the way up leaves the solid here
-    hit = np.flatnonzero(from_above | ~left.any(axis=1))
+    hit = np.flatnonzero(left.all(axis=1) | ~left.any(axis=1))
+    # counter-clockwise in the projection: on the way up the column leaves the solid here
+    step = np.where(left[hit, 0], -1, 1)
     heights, weights = corners[triangle[hit]][..., 2], weights[hit]
     height = (weights * heights).sum(axis=1) / weights.sum(axis=1)
     height = np.clip(height, heights.min(axis=1), heights.max(axis=1))  # so that level faces stay level
     crossings = np.zeros((len(x), len(y), len(z) + 1), dtype=np.int32)
-    np.add.at(crossings, (i[hit], j[hit], np.searchsorted(z, height)), np.where(from_above[hit], -1, 1))
+    np.add.at(crossings, (i[hit], j[hit], np.searchsorted(z, height)), step)
     return crossings.cumsum(axis=2)[..., :-1] > 0
 
 
