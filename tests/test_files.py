@@ -110,6 +110,18 @@ def test_arrays_in_numpy_files(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS[:count])
 
 
+def test_a_ply_with_faces_before_or_behind_its_vertices(tmp_path: Path) -> None:
+    faces = "element face 1\nproperty list uchar int vertex_indices\n"
+    vertices = f"element vertex {len(POINTS)}\nproperty float x\nproperty float y\nproperty float z\n"
+    rows, triangle = text(POINTS, " "), "3 0 1 2\n"
+    for name, head, body in (
+        ("behind", vertices + faces, rows + triangle),
+        ("before", faces + vertices, triangle + rows),
+    ):
+        (tmp_path / f"{name}.ply").write_text(f"ply\nformat ascii 1.0\n{head}end_header\n{body}")
+        np.testing.assert_array_equal(read_point_cloud(tmp_path / f"{name}.ply").points, POINTS)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=80), st.binary(min_size=1, max_size=5), st.integers(0, 90))
 def test_lzf_undoes_compression(start: bytes, repeated: bytes, times: int) -> None:

@@ -13,25 +13,70 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+PLY_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+
 
 def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    declared = re.search(rb"^\s*element\s+vertex\s+(\d+)", _ply_header(path), re.MULTILINE)
-    count = int(declared[1]) if declared else 0
+    """The vertices only: faces and scanner grids, which may be larger, are not read."""
+    content = path.read_bytes()
+    order, elements, start = _ply_header(content)
+    count = next((count for name, count, _ in elements if name == "vertex"), 0)
     if count == 0:
         raise ValueError("it has 0 vertices")
+    first, _, properties = elements[0]
+    if first != "vertex" or any(kind == "list" for kind, *_ in properties):
+        return _ply_by_trimesh(path, count)
+    names = [name for _, name in properties]
+    if order == "ascii":
+        rows = [row for row in content[start:].decode("ascii").splitlines() if row.strip()]
+        _expect(len(rows), count)
+        return np.loadtxt(rows[:count], usecols=[names.index(axis) for axis in "xyz"], ndmin=2)
+    end = "<>"[order == "binary_big_endian"]
+    record = np.dtype([(name, end + PLY_TYPES[kind]) for kind, name in properties])
+    _expect((len(content) - start) // record.itemsize, count)
+    vertices = np.frombuffer(content, record, count, start)
+    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+
+
+def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str]]]], int]:
+    """The format, each element's name, count and properties (type and name), and where the data starts."""
+    match = re.search(rb"^end_header[ \t]*\r?\n?", content[:65536], re.MULTILINE)
+    if not content.startswith(b"ply") or match is None:
+        raise ValueError("it has no PLY header")
+    order, elements = "", []
+    for key, *values in filter(None, map(str.split, content[: match.end()].decode("latin-1").splitlines())):
+        if key == "format":
+            order = values[0]
+        elif key == "element":
+            elements.append((values[0], int(values[1]), list[list[str]]()))
+        elif key == "property":
+            elements[-1][2].append(values)
+    return order, elements, match.end()
+
+
+def _ply_by_trimesh(path: Path, count: int) -> Float[np.ndarray, "n 3"]:
+    """Unusual files, where something stands before the vertices."""
     loaded: Any = trimesh.load(path, file_type="ply", process=False)
     # trimesh returns the rows it finds; a file cut short is only noticed by counting them
-    if len(loaded.vertices) != count:
-        raise ValueError(f"it is truncated: {len(loaded.vertices)} of {count} vertices")
+    _expect(len(loaded.vertices), count)
     return np.asarray(loaded.vertices, dtype=np.float64)
-
-
-def _ply_header(path: Path) -> bytes:
-    with path.open("rb") as file:
-        head = file.read(65536)
-    if not head.startswith(b"ply") or b"end_header" not in head:
-        raise ValueError("it has no PLY header")
-    return head[: head.index(b"end_header")]
 
 
 def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:

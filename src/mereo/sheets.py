@@ -24,7 +24,7 @@ MISSING: Color = (236, 237, 240)
 def save_png(path: str | Path, picture: Picture) -> None:
     """Write a picture whole or not at all."""
     with atomic_file(Path(path)) as partial:
-        Image.fromarray(picture).save(partial, format="PNG", optimize=True)
+        Image.fromarray(picture).save(partial, format="PNG")
 
 
 def contact_sheet(
