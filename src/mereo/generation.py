@@ -1,26 +1,84 @@
-"""Many examples on disk: shards of 64, written whole or not at all, the same bits for any number of workers."""
+"""Many examples on disk: shards of 64, each written whole or not at all, the same bits for any number of workers.
+
+Example i comes from (seed, i) alone. A dataset is a directory with ``manifest.json``, everything needed to make it
+again, and ``shard-00000.safetensors`` and so on, whose tensors are (e examples, p stored points, q queries):
+
+    cloud f32 [e, p, 3], cloud_count i32 [e], center f64 [e, 3], scale f64 [e],
+    positions f32 [e, q, 3], labels u8 [e, q], distances f32 [e, q], directions f16 [e, q, 3], rest f16 [e, q, 3]
+
+Workers only compute; this process alone writes. So one place meets a full disk, and whatever kills a worker leaves
+nothing half-written.
+"""
 
 import hashlib
 import json
-import multiprocessing
-import os
+import platform
+import sys
 import time
-from dataclasses import asdict
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from safetensors.numpy import save_file
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from mereo.config import TEST_SEED_START, GenerateConfig
-from mereo.output import write_json
+from mereo.output import atomic_file, write_json
+from mereo.parallel import in_processes
+from mereo.query_sampling import check_settings
 from mereo.scene import Scene, load_scene
 from mereo.synthesis import Example, example_rng, synthesize
 
-SHARD = 64
+SHARD_SIZE = 64
+MANIFEST = "manifest.json"
+LIBRARIES = ("numpy", "scipy", "embreex", "libigl", "manifold3d", "trimesh")
+"""Their versions are in the manifest: others may move last bits, but make no other dataset."""
+
+NOT_COMPARED = ("libraries", "bytes")
+"""Manifest entries that may differ when a dataset is resumed."""
+
+SECONDS_BETWEEN_LINES = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What all shards of a dataset have in common; a built-in scene is sent to workers by its name."""
+
+    scene: str | Scene
+    settings: GenerateConfig
+    seed: int
+
+
+@dataclass(frozen=True)
+class _Shard:
+    """One file: examples ``first`` up to ``end``, without the end."""
+
+    path: Path
+    first: int
+    end: int
+
+    def is_complete(self) -> bool:
+        """Whether the file is there with all its examples; a file cut off by a crashed machine is reported."""
+        try:
+            with safe_open(self.path, framework="numpy") as file:
+                if file.get_slice("labels").get_shape()[0] == self.end - self.first:
+                    return True
+        except FileNotFoundError:
+            return False
+        except (SafetensorError, OSError):
+            pass
+        print(f"{self.path.name} is damaged and is made again", flush=True)
+        return False
 
 
 def generate(
-    scene_name: str,
+    scene: str | Scene,
     output: Path,
     settings: GenerateConfig,
     *,
@@ -31,79 +89,199 @@ def generate(
     resume: bool = False,
     test: bool = False,
 ) -> None:
-    if seed >= TEST_SEED_START and not test:
-        raise ValueError(f"seed {seed} is for testing; training data needs a seed below {TEST_SEED_START}: choose one")
-    scene = load_scene(scene_name)
-    manifest = make_manifest(scene, settings, examples, seed)
-    output.mkdir(parents=True, exist_ok=True)
-    path = output / "manifest.json"
-    if path.is_file() and not resume:
-        raise FileExistsError(f"{output} exists; continue it with --resume, or choose another --output")
-    write_json(path, manifest)
-    jobs = [
-        (scene_name, output, settings, seed, number, min(examples, (number + 1) * SHARD))
-        for number in range(shard[0], -(-examples // SHARD), shard[1])
-        if not (output / f"shard-{number:05d}.safetensors").is_file()
+    """Make ``examples`` labelled examples of a scene in the directory ``output``.
+
+    Args:
+        scene: a built-in scene's name, or a scene of your own (which workers must be able to unpickle).
+        output: created; with ``resume`` its complete shards are kept and the missing ones made.
+        settings: how one example is made.
+        seed: seeds from ``TEST_SEED_START`` up are for testing and need ``test``, which refuses smaller ones.
+        workers: processes; the files do not depend on their number. More than one needs a main module that can be
+            imported (``if __name__ == "__main__":``).
+        shard: ``(i, n)`` makes every n-th file from the i-th on, to share the work between machines; they may all
+            write to one directory.
+
+    Raises:
+        ValueError: a number or setting out of its range, a seed of the wrong kind, ``resume`` with other settings.
+        FileExistsError: ``output`` holds something and ``resume`` is not set.
+        OSError: the disk is full; complete shards are kept. ``ChildProcessError`` where a worker was killed.
+    """
+    _check_request(examples, seed, workers, shard, test)
+    check_settings(settings.sampling)
+    manifest = make_manifest(load_scene(scene) if isinstance(scene, str) else scene, settings, examples, seed)
+    shards = [
+        _Shard(output / f"shard-{n:05d}.safetensors", n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
+        for n in range(shard[0], -(-examples // SHARD_SIZE), shard[1])
     ]
-    start, done = time.monotonic(), 0
-    with multiprocessing.get_context("fork").Pool(workers, _quiet) as pool:
-        for count in pool.imap_unordered(_write_shard, jobs):
-            done += count
-            rate = done / (time.monotonic() - start)
-            left = sum(j[5] - j[4] * SHARD for j in jobs) - done
-            print(f"{done} examples  {rate:.1f}/s  {left / rate / 60:.1f} min left", flush=True)
+    _claim_directory(output, manifest, shards, resume, alone=shard[1] == 1)
+    missing = [item for item in shards if not item.is_complete()]
+    total = sum(item.end - item.first for item in missing)
+    work = partial(_make_shard, _Work(scene, settings, seed))
+    with closing(in_processes(work, missing, workers)) as made, _progress(total) as advance:
+        for item, data in made:
+            with atomic_file(item.path) as temporary:
+                temporary.write_bytes(data)
+            advance(item.end - item.first)
 
 
-def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: int) -> dict[str, object]:
+def _check_request(examples: int, seed: int, workers: int, shard: tuple[int, int], test: bool) -> None:
+    if examples < 1:
+        raise ValueError(f"--examples is {examples}; it must be at least 1: ask for some")
+    if workers < 1:
+        raise ValueError(f"the number of workers is {workers}; it must be at least 1: pass 1, or one per core")
+    if not 0 <= shard[0] < shard[1]:
+        raise ValueError(f"the shard is {shard[0]}/{shard[1]}; i/n needs i from 0 to n - 1: pass for example 0/4")
+    if seed < 0:
+        raise ValueError(f"--seed is {seed}; it must not be negative: choose from 0 to {TEST_SEED_START - 1}")
+    if seed >= TEST_SEED_START and not test:
+        raise ValueError(
+            f"--seed is {seed}; seeds from {TEST_SEED_START} up are for testing and never for training: "
+            "choose a smaller one, or pass --test to make a test set"
+        )
+    if test and seed < TEST_SEED_START:
+        raise ValueError(
+            f"--seed is {seed}; a test set needs one from {TEST_SEED_START} up, which training never uses: choose one"
+        )
+
+
+# --- the directory ----------------------------------------------------------------------------------------------------
+
+
+def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: int) -> dict[str, Any]:
+    """Everything that decides the dataset, and what training needs to know of the scene, as JSON values."""
     digest = hashlib.sha256()
     for segment in scene.rest.segments:
-        digest.update(np.ascontiguousarray(segment.vertices, dtype=np.float64).tobytes())
-        digest.update(np.ascontiguousarray(segment.faces, dtype=np.int64).tobytes())
-    manifest: dict[str, object] = {
+        digest.update(np.ascontiguousarray(segment.vertices, dtype="<f8").tobytes())
+        digest.update(np.ascontiguousarray(segment.faces, dtype="<i8").tobytes())
+    manifest = {
         "scene": scene.name,
-        "segments": [{"name": s.name, "color": list(s.color)} for s in scene.rest.segments],
+        "source": scene.source,
+        "segments": [{"name": s.name, "color": s.color} for s in scene.rest.segments],
         "any_roll": scene.workspace.any_roll,
+        "workspace": asdict(scene.workspace),
         "settings": asdict(settings),
         "seed": seed,
         "examples": examples,
-        "version": "0.1.0",
+        "shard_size": SHARD_SIZE,
         "rest_sha256": digest.hexdigest(),
+        "version": version("mereo"),
+        "libraries": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "bytes": examples * example_bytes(settings, len(scene.rest.segments)),
     }
-    return json.loads(json.dumps(manifest))
+    plain: dict[str, Any] = json.loads(json.dumps(manifest))
+    return plain
 
 
-def _quiet() -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
+def example_bytes(settings: GenerateConfig, segments: int) -> int:
+    """Size of one example, on disk and in memory."""
+    per_point, per_query, once = 12, 12 + 1 + 4 + 6 + 6, 4 + 24 + 8
+    return per_point * settings.points + per_query * settings.sampling.total(segments) + once
 
 
-def _write_shard(job: tuple[str, Path, GenerateConfig, int, int, int]) -> int:
-    scene_name, output, settings, seed, number, end = job
-    scene = load_scene(scene_name)
-    rows = [
-        pack(synthesize(scene, settings, example_rng(seed, i)), settings.points) for i in range(number * SHARD, end)
-    ]
-    tensors = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
-    path = output / f"shard-{number:05d}.safetensors"
-    temporary = path.with_suffix(".tmp")
+def _claim_directory(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> None:
+    """Create the directory with its manifest, or check that it is this very dataset; other machines' shards may come.
+
+    What a killed run was writing is removed, of this part's shards only.
+    """
+    path = output / MANIFEST
+    if output.exists() and not output.is_dir():
+        raise FileExistsError(f"{output} is a file; a dataset is a directory: choose another --output")
+    if path.is_file():
+        if not resume and (alone or any(item.path.exists() for item in shards)):
+            raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
+        _check_same(path, manifest)
+    elif output.is_dir() and any(not file.name.startswith(".") for file in output.iterdir()):
+        raise FileExistsError(f"{output} is not empty and holds no {MANIFEST}; choose another --output")
+    else:
+        write_json(path, manifest)
+    for item in shards:
+        for leftover in output.glob(f".{item.path.stem}.*.partial*"):
+            leftover.unlink(missing_ok=True)
+
+
+def _check_same(path: Path, manifest: dict[str, Any]) -> None:
     try:
-        save_file(tensors, temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return len(rows)
+        before = _flat(json.loads(path.read_text("utf-8")))
+    except (ValueError, AttributeError):
+        raise ValueError(f"{path} is not a manifest; it cannot be resumed: choose another --output") from None
+    for key, now in _flat(manifest).items():
+        # a manifest of an older version may not state everything
+        if before.get(key, now) != now:
+            raise ValueError(
+                f"{path.parent} was made with {key} = {before[key]!r}, not {now!r}; resuming needs equal settings: "
+                "use them, or choose another --output"
+            )
+
+
+def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as ``settings.sampling.sampler`` and so on."""
+    flat: dict[str, Any] = {}
+    for key, item in value.items():
+        if key not in NOT_COMPARED:
+            flat |= _flat(item, f"{prefix}{key}.") if isinstance(item, dict) else {prefix + key: item}
+    return flat
+
+
+# --- the work ---------------------------------------------------------------------------------------------------------
+
+
+def _make_shard(work: _Work, shard: _Shard, cancelled: Callable[[], bool]) -> bytes:
+    """The shard's file content; nothing when cancelled, which is asked before every example."""
+    scene = load_scene(work.scene) if isinstance(work.scene, str) else work.scene
+    rows = []
+    for index in range(shard.first, shard.end):
+        if cancelled():
+            return b""
+        rows.append(pack(synthesize(scene, work.settings, example_rng(work.seed, index)), work.settings.points))
+    return save({key: np.stack([row[key] for row in rows]) for key in rows[0]})
 
 
 def pack(example: Example, points: int) -> dict[str, np.ndarray]:
-    count = len(example.cloud)
-    queries = example.queries
+    """One row of each tensor of a shard; clouds with fewer points repeat theirs from the front."""
+    count, queries = len(example.cloud), example.queries
     return {
         "cloud": example.cloud[np.arange(points) % count].astype(np.float32),
         "cloud_count": np.array(count, dtype=np.int32),
         "center": example.normalizer.center.astype(np.float64),
         "scale": np.array(example.normalizer.scale, dtype=np.float64),
         "positions": queries.positions.astype(np.float32),
-        "labels": queries.labels,
+        "labels": queries.labels.astype(np.uint8),
         "distances": queries.distances.astype(np.float32),
         "directions": queries.directions.astype(np.float16),
         "rest": queries.rest.astype(np.float16),
     }
+
+
+# --- progress ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[int], None]]:
+    """Yields a function that takes the number of new examples; a bar on a terminal, a line now and then elsewhere."""
+    bar = Progress(BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), transient=True)
+    task = bar.add_task("", total=total)
+    terminal = sys.stdout.isatty()
+    start = shown = time.monotonic()
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done, shown
+        done, now = done + count, time.monotonic()
+        rate = done / max(now - start, 1e-9)
+        text = f"{rate:.1f} examples/s, {_duration((total - done) / rate)} left"
+        if terminal:
+            bar.update(task, completed=done, description=text)
+        elif now - shown >= SECONDS_BETWEEN_LINES:
+            print(f"{done} of {total}, {text}", flush=True)
+            shown = now
+
+    with bar if terminal else nullcontext():
+        yield advance
+    print(f"{done} examples made in {_duration(time.monotonic() - start)}", flush=True)
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"
