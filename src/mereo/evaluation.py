@@ -1,0 +1,275 @@
+"""Scores on test sets (paper, appendix B): synthetic views of a scene, and the four real scans of the bunny.
+
+The joint box of all true segments is divided into 100^3 cells; their centres are labelled by the truth and by the
+model, and those outside every segment's enlarged box are dropped. One confusion matrix is summed over the whole set;
+IoU and mIoU come from it, and the mean over single examples is reported beside it.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from rich.console import Console
+from rich.progress import track
+
+from mereo.camera import PointCloud
+from mereo.config import TEST_SEED_START, GenerateConfig
+from mereo.error_pictures import ErrorCase, error_picture
+from mereo.frames import TruthGrid, truth_grid
+from mereo.mesh import Color, SegmentedMesh
+from mereo.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.model import Model
+from mereo.output import new_directory, write_json
+from mereo.reconstruction import segment_names
+from mereo.refinement import sample_coarse_to_fine
+from mereo.scans import SCANS, scan_in_camera
+from mereo.scene import Scene, load_scene
+from mereo.synthesis import example_rng, sample_view
+from mereo.weights import load_model
+
+CELLS = 100
+"""The paper's grid along each axis."""
+
+PICTURES = 4
+"""The first few examples are drawn with their errors."""
+
+
+@dataclass(frozen=True, eq=False)
+class TestCase:
+    """One cloud with its truth, both in the same camera frame."""
+
+    __test__ = False  # not a test, whatever pytest thinks of the name
+
+    name: str
+    cloud: PointCloud
+    truth: TruthGrid
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Scores of a test set.
+
+    Attributes:
+        names: of the segments.
+        confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
+        examples: scores of each test case by its name.
+        cases: the first few with their labels, for pictures.
+    """
+
+    names: tuple[str, ...]
+    confusion: Int[np.ndarray, "c c"]
+    examples: dict[str, Scores]
+    cases: tuple[ErrorCase, ...] = field(default=())
+
+    @property
+    def scores(self) -> Scores:
+        """Over the whole set."""
+        return intersection_over_union(self.confusion)
+
+    @property
+    def example_mean(self) -> tuple[float, float]:
+        """IoU and mIoU averaged over the examples."""
+        each = self.examples.values()
+        return float(np.mean([s.iou for s in each])), float(np.nanmean([s.miou for s in each]))
+
+
+# --- one cloud -------------------------------------------------------------------------------------------------------
+
+
+def predict_grid(model: Model, cloud: PointCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
+    """The model's labels on the grid of ``truth``, evaluated coarse to fine."""
+    logits = partial(model.logits, model.encode(cloud))
+    grid = truth.grid
+    x, y, z = grid.labels.shape
+    return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
+
+
+def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segments: int) -> Int[np.ndarray, "c c"]:
+    """True against predicted labels of the points that count; all ``segments`` are one where the model knows one."""
+    labels = np.minimum(truth.grid.labels[truth.kept], segments)
+    return confusion_matrix(labels, predicted[truth.kept], segments + 1)
+
+
+def grid_scores(model: Model, cloud: PointCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
+    """The paper's evaluation of one cloud; ``truth`` is in the cloud's frame and units."""
+    check_names(model, truth.names)
+    grid = truth_grid(truth, cells)
+    segments = len(segment_names(model)[0])
+    return intersection_over_union(grid_confusion(grid, predict_grid(model, cloud, grid), segments))
+
+
+def check_names(model: Model, names: Sequence[str]) -> None:
+    """Raise ``ValueError`` unless the model's labels mean the same as the truth's."""
+    if tuple(names) != model.names:
+        raise ValueError(
+            f"the weights know the segments {', '.join(model.names)} but the truth has {', '.join(names)}; they must "
+            "be the same in the same order: use the weights that belong to this object"
+        )
+
+
+# --- test sets -------------------------------------------------------------------------------------------------------
+
+
+def evaluate(
+    model: Model,
+    scene: Scene | str | None = None,
+    *,
+    examples: int = 128,
+    seed: int = TEST_SEED_START,
+    cells: int = CELLS,
+    progress: bool = False,
+) -> Evaluation:
+    """Scores on synthetic views of a scene, seen as in training: through a noisy depth image.
+
+    Args:
+        model: the trained model.
+        scene: a scene or its name; by default the one that the model was trained on.
+        examples: how many; example i is made from (seed, i) alone.
+        seed: at least ``config.TEST_SEED_START``: smaller ones are for training.
+        cells: of the grid along each axis.
+        progress: show a bar with the time left.
+
+    Raises ``ValueError`` for a training seed, no examples, or another object than the model's.
+    """
+    if seed < TEST_SEED_START:
+        raise ValueError(f"the seed is {seed}; training may have seen it: take a test seed, {TEST_SEED_START} or more")
+    if examples < 1:
+        raise ValueError(f"{examples} examples are asked for; at least 1 is needed: the paper takes 128")
+    if scene is None or isinstance(scene, str):
+        scene = load_scene(scene or trained_scene(model))
+    check_names(model, scene.rest.names)
+    return score_cases(model, partial(_scene_case, scene, seed, cells), examples, progress)
+
+
+def trained_scene(model: Model) -> str:
+    """The scene in the weights' provenance; raises ``ValueError`` where there is none."""
+    scene = model.provenance.get("scene")
+    if not isinstance(scene, str):
+        raise ValueError("the weights do not say which scene they were trained on; name it with --scene")
+    return scene
+
+
+def _scene_case(scene: Scene, seed: int, cells: int, index: int) -> TestCase:
+    view = sample_view(scene, GenerateConfig(), example_rng(seed, index))
+    return TestCase(f"{scene.name} {index}", view.depth.to_points(), truth_grid(view.mesh, cells))
+
+
+def evaluate_scans(model: Model, output: str | Path | None = None, *, cells: int = CELLS) -> Evaluation:
+    """Scores on the four real scans of the bunny; writes what ``evaluate_weights`` does when ``output`` is given.
+
+    Raises ``ValueError`` for another object's model and ``assets.AssetUnavailable`` where a scan cannot be had.
+    """
+
+    def case(index: int) -> TestCase:
+        cloud, truth, _ = scan_in_camera(SCANS[index])
+        check_names(model, truth.names)
+        return TestCase(SCANS[index], cloud, truth_grid(truth, cells))
+
+    evaluation = score_cases(model, case, len(SCANS), progress=False)
+    if output is not None:
+        with new_directory(output) as directory:
+            _write(directory, evaluation, {"scans": list(SCANS), "trained": model.provenance})
+    return evaluation
+
+
+def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progress: bool) -> Evaluation:
+    """One confusion matrix over ``case(0) ... case(count - 1)``, which are made one at a time."""
+    names, colors = segment_names(model)
+    total = np.zeros((len(names) + 1,) * 2, dtype=np.int64)
+    examples: dict[str, Scores] = {}
+    pictures: list[ErrorCase] = []
+    for one, predicted in _predictions(model, case, count, progress):
+        confusion = grid_confusion(one.truth, predicted, len(names))
+        total += confusion
+        examples[one.name] = intersection_over_union(confusion)
+        if len(pictures) < PICTURES:
+            pictures.append(_picture_case(one, predicted, colors))
+    return Evaluation(names, total, examples, tuple(pictures))
+
+
+def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> ErrorCase:
+    """Only points that count are shown."""
+    grid = one.truth.grid
+    reference = np.minimum(grid.labels, np.uint8(len(colors)))
+    shown = np.where(one.truth.kept, predicted, np.uint8(0))
+    return ErrorCase(one.name, one.cloud, reference, shown, grid.origin, grid.spacing, colors)
+
+
+def _predictions(
+    model: Model, case: Callable[[int], TestCase], count: int, progress: bool
+) -> Iterator[tuple[TestCase, UInt8[np.ndarray, "x y z"]]]:
+    for index in track(range(count), "evaluating", console=Console(stderr=True), disable=not progress):
+        one = case(index)
+        yield one, predict_grid(model, one.cloud, one.truth)
+
+
+# --- results ---------------------------------------------------------------------------------------------------------
+
+
+def evaluate_weights(
+    weights: str | Path,
+    output: str | Path,
+    *,
+    examples: int = 128,
+    seed: int = TEST_SEED_START,
+    scene: str | None = None,
+) -> Evaluation:
+    """``mereo evaluate``: write metrics.json, table.md and errors.png into a new directory, and print the table."""
+    with new_directory(output) as directory:
+        model = load_model(weights)
+        evaluation = evaluate(model, scene, examples=examples, seed=seed, progress=True)
+        facts = {
+            "weights": str(weights),
+            "scene": scene or trained_scene(model),
+            "seed": seed,
+            "trained": model.provenance,
+        }
+        _write(directory, evaluation, facts)
+    print(markdown_table(evaluation))
+    print(f"wrote {output}")
+    return evaluation
+
+
+def _write(directory: Path, evaluation: Evaluation, facts: dict[str, Any]) -> None:
+    write_json(directory / "metrics.json", metrics(evaluation, facts))
+    (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
+    error_picture(directory / "errors.png", evaluation.cases)
+
+
+def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
+    """What ``metrics.json`` holds."""
+    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
+    return {
+        **facts,
+        "examples": len(evaluation.examples),
+        "definition": f"{CELLS}^3 cell centres of the joint box, kept inside any segment's box enlarged by 50 %; one "
+        "confusion matrix over the set; miou is the mean over the segments without empty space",
+        "iou": scores.iou,
+        "miou": scores.miou,
+        "per_segment": dict(zip(evaluation.names, _floats(scores.per_segment), strict=True)),
+        "example_mean": {"iou": iou, "miou": miou},
+        "per_example": {name: {"iou": each.iou, "miou": each.miou} for name, each in evaluation.examples.items()},
+        "confusion": evaluation.confusion,
+    }
+
+
+def _floats(values: Float[np.ndarray, " n"]) -> list[float]:
+    return [float(value) for value in values]
+
+
+def markdown_table(evaluation: Evaluation) -> str:
+    """The whole set and the mean over its examples."""
+    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
+    names = " | ".join(evaluation.names)
+    values = " | ".join(f"{value:.3f}" for value in scores.per_segment)
+    blank = " | ".join("" for _ in evaluation.names)
+    return (
+        f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
+        f"|---|---|---|{'---|' * len(evaluation.names)}\n"
+        f"| whole set | {scores.iou:.3f} | {scores.miou:.3f} | {values} |\n"
+        f"| mean over examples | {iou:.3f} | {miou:.3f} | {blank} |\n"
+    )

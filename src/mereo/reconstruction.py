@@ -1,0 +1,256 @@
+"""The inverse path: from what a camera saw of an object to all its segments, hidden side included.
+
+    PointCloud -normalize-> -encode-> code -query-> field -extract-> SegmentedMesh
+
+Everything that comes out is in the input's frame and units.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+from rich.console import Console
+from rich.table import Table
+
+from mereo.camera import PointCloud
+from mereo.extraction import LabelGrid, extract_whole, locate
+from mereo.files import read_camera, read_depth_image, read_point_cloud
+from mereo.frame import inverse_rigid, rigid, transform_points
+from mereo.measurement import FoundSegment, measure
+from mereo.mesh import PALETTE, Color, SegmentedMesh
+from mereo.mesh_files import readable
+from mereo.model import Model
+from mereo.output import GLTF_CAMERA_ROTATION, new_directory, write_json, write_labels_npz, write_segments_glb
+from mereo.pictures import render_cloud_and_segments
+from mereo.refinement import Field
+from mereo.report import write_report
+from mereo.scans import SCANNER_TO_CAMERA, scanner_to_camera
+from mereo.weights import load_model
+
+Frame = Literal["camera", "scanner"]
+
+SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
+"""Where segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one lies behind it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """An object with all its segments, in the input's frame and units.
+
+    Attributes:
+        surfaces: every segment of the model as a closed mesh; without faces where it was not found.
+        labels: the label grid.
+        segments: each segment in numbers, in the same order.
+        timings_s: seconds of each stage.
+        evaluated: points at which the network was asked for surfaces.
+        clipped: whether a segment still reached the largest box and was closed there.
+    """
+
+    surfaces: SegmentedMesh
+    labels: LabelGrid
+    segments: tuple[FoundSegment, ...]
+    timings_s: dict[str, float]
+    evaluated: int
+    clipped: bool
+
+
+def reconstruct(
+    cloud: PointCloud | Float[np.ndarray, "n 3"], model: Model, resolution: int = 128, frame: Frame = "camera"
+) -> Reconstruction:
+    """All segments of the object that ``cloud`` shows.
+
+    Args:
+        cloud: points on the object, any unit and density.
+        model: trained on this object, see ``mereo.load_model``.
+        resolution: cells along the longest side of the object's box.
+        frame: the cloud's axes: "camera" is x right, y down, z forward from the camera at the origin; "scanner" is y
+            up, z toward the scanner.
+
+    Raises ``ValueError`` for unusable clouds, and where the model finds no segment at all.
+    """
+    points = np.asarray(cloud.points if isinstance(cloud, PointCloud) else cloud, dtype=np.float64)
+    timings: dict[str, float] = {}
+    T_camera_input = scanner_to_camera(points) if frame == "scanner" else np.eye(4)
+    with _timed(timings, "encode"):
+        code = model.encode(PointCloud(transform_points(T_camera_input, points)))
+    field: Field = partial(model.logits, code)
+    names, colors = segment_names(model)
+    with _timed(timings, "locate"):
+        box = locate(field, code.normalizer.invert(SEARCH_BOX))
+    with _timed(timings, "extract"):
+        found = extract_whole(field, box, resolution, names, colors)
+    with _timed(timings, "measure"):
+        segments = measure(found, model, code)
+    clipped = bool(found.grid.touched_sides().any())
+    result = Reconstruction(found.surfaces, found.grid, segments, timings, found.evaluated, clipped)
+    return result if frame == "camera" else _turned_back(result, inverse_rigid(T_camera_input))
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    timings[stage] = time.perf_counter() - start
+
+
+def segment_names(model: Model) -> tuple[tuple[str, ...], tuple[Color, ...]]:
+    """Names and colours of the classes that the model tells apart; one trained on distances knows only the whole."""
+    return (model.names, model.colors) if "ce" in model.loss else (("object",), PALETTE[:1])
+
+
+def _turned_back(result: Reconstruction, T_scanner_camera: Float[np.ndarray, "4 4"]) -> Reconstruction:
+    """From the camera frame to the scanner's: half a turn about x reverses the grid along y and z."""
+    grid = result.labels
+    last = np.asarray(grid.labels.shape) - 1
+    corner = grid.origin + grid.spacing * last * np.array([0, 1, 1])
+    labels = LabelGrid(
+        np.ascontiguousarray(grid.labels[:, ::-1, ::-1]),
+        transform_points(T_scanner_camera, corner),
+        grid.spacing,
+        grid.names,
+    )
+    segments = tuple(
+        replace(
+            segment,
+            centroid=transform_points(T_scanner_camera, segment.centroid),
+            box=np.sort(transform_points(T_scanner_camera, segment.box), axis=0),
+        )
+        for segment in result.segments
+    )
+    return replace(result, surfaces=result.surfaces.transformed(T_scanner_camera), labels=labels, segments=segments)
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:
+    """What ``summary.json`` holds: ``facts``, then each segment and the stages' seconds."""
+    segments = [
+        {
+            "name": found.name,
+            "label": found.label,
+            "color": list(color),
+            "volume": found.volume,
+            "centroid": found.centroid.tolist(),
+            "box": found.box.tolist(),
+            "confidence": found.confidence,
+            "voxels": found.voxels,
+            "components": found.components,
+        }
+        for found, color in zip(result.segments, result.surfaces.colors, strict=True)
+    ]
+    return {
+        **facts,
+        "spacing": float(result.labels.spacing[0]),
+        "evaluated_points": result.evaluated,
+        "clipped": result.clipped,
+        "segments": segments,
+        "timings_s": result.timings_s,
+    }
+
+
+def write_reconstruction(
+    result: Reconstruction,
+    cloud: PointCloud,
+    output_dir: str | Path,
+    *,
+    frame: Frame = "camera",
+    force: bool = False,
+    **facts: object,
+) -> None:
+    """Write segments.glb, labels.npz, summary.json, preview.png and report.html into a new directory, all or nothing.
+
+    ``facts`` (``title``, ``unit``, ...) are added to the summary and shown in the report. Raises ``FileExistsError``
+    for a directory with content unless ``force``.
+    """
+    with new_directory(output_dir, force) as directory:
+        _write_files(directory, result, cloud, frame, facts)
+
+
+def _write_files(
+    directory: Path, result: Reconstruction, cloud: PointCloud, frame: Frame, facts: dict[str, object]
+) -> None:
+    started = time.perf_counter()
+    grid = result.labels
+    to_viewer = GLTF_CAMERA_ROTATION if frame == "camera" else np.eye(3)
+    write_segments_glb(directory / "segments.glb", result.surfaces, to_viewer)
+    write_labels_npz(directory / "labels.npz", grid.labels, grid.origin, grid.spacing, grid.names)
+    to_camera = rigid(np.eye(3) if frame == "camera" else SCANNER_TO_CAMERA, np.zeros(3))
+    seen = PointCloud(transform_points(to_camera, cloud.points))
+    title = str(facts.get("title", "mereo reconstruction"))
+    render_cloud_and_segments(directory / "preview.png", seen, result.surfaces.transformed(to_camera), title)
+    timings_s = {**result.timings_s, "write": time.perf_counter() - started}
+    summary = summarize(replace(result, timings_s=timings_s), frame=frame, **facts)
+    write_report(directory / "report.html", cloud, result.surfaces, summary, to_viewer)
+    write_json(directory / "summary.json", summary)
+
+
+def reconstruct_file(
+    input: str | Path,
+    weights: str | Path,
+    output: str | Path,
+    *,
+    resolution: int = 128,
+    intrinsics: str | Path | None = None,
+    depth_scale: float = 1000.0,
+    mask: str | Path | None = None,
+    frame: Frame = "camera",
+    drop_invalid: bool = False,
+    force: bool = False,
+) -> Reconstruction:
+    """``mereo reconstruct``: read a point cloud or a depth image, reconstruct, write a new directory, print a table."""
+    with new_directory(output, force) as directory:
+        cloud = read_input(Path(input), intrinsics, depth_scale, mask, frame, drop_invalid)
+        model = load_model(weights)
+        result = reconstruct(cloud, model, resolution, frame)
+        facts = {"title": Path(input).name, "weights": str(weights), "resolution": resolution, "points": len(cloud)}
+        _write_files(directory, result, cloud, frame, facts)
+    print_segments(result, f"{Path(input).name}, {len(cloud)} points")
+    print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
+    return result
+
+
+def read_input(
+    path: Path,
+    intrinsics: str | Path | None = None,
+    depth_scale: float = 1000.0,
+    mask: str | Path | None = None,
+    frame: Frame = "camera",
+    drop_invalid: bool = False,
+) -> PointCloud:
+    """The points of a depth image (PNG, metres) or of a point cloud file (its own unit)."""
+    if path.suffix.lower() != ".png":
+        if intrinsics is not None or mask is not None:
+            raise ValueError(f"{path} is read as a point cloud; leave out the intrinsics and the mask")
+        return read_point_cloud(path, drop_invalid)
+    if intrinsics is None:
+        raise ValueError(f"{path} is a depth image without intrinsics; they are needed: give --intrinsics FILE")
+    if frame != "camera":
+        raise ValueError(f"the frame is {frame!r} but {path} is a depth image; those are always in the camera frame")
+    with readable(path, "depth image"), Image.open(path) as image:
+        size = image.size
+    return read_depth_image(path, read_camera(intrinsics, size), depth_scale, mask).to_points()
+
+
+def print_segments(result: Reconstruction, title: str) -> None:
+    """A table of the segments, and a line of the stages' seconds."""
+    table = Table(title=title, title_justify="left")
+    table.add_column("segment")
+    for column in ("volume", "confidence", "components", "centroid"):
+        table.add_column(column, justify="right")
+    for found in result.segments:
+        place = " ".join(f"{value:.4g}" for value in found.centroid)
+        row = (f"{found.volume:.4g}", f"{found.confidence:.2f}", str(found.components), place)
+        table.add_row(found.name, *(row if found.voxels else ("0", "not found", "0", "")))
+    console = Console()
+    console.print(table)
+    console.print("seconds: " + ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in result.timings_s.items()))
+    if result.clipped:
+        console.print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")

@@ -1,0 +1,193 @@
+"""A field of class logits on a grid, evaluated coarse to fine: the dense labels at a fraction of the cost.
+
+Every ``COARSE``-th node is evaluated; cells that may hold a change of label are halved until one step wide; all
+other nodes take the label of the cell they lie in. Which cells may hold one?
+
+- Those whose corners differ, and (at the first level) those where the lead of the winning class falls so steeply that
+  it may vanish inside, with all cells around them (``_changing_cells``, ``_sloping_cells``).
+- Then no evaluated node may contradict the label assumed beside it; where one does, that neighbour is evaluated too,
+  and so on (``_follow``). So a surface that is met anywhere is followed to its end.
+
+What can be missed is a part that lies between the nodes of the coarse lattice, touches no evaluated node, and casts no
+slope on its surroundings. The tests compare with the dense grid on closed forms and on trained networks.
+
+Notation: nodes are points of the grid, cells are the boxes between eight nodes; c classes; class 0 is empty space.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+Field = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n c"]]
+"""Class logits at points."""
+
+COARSE = 4
+"""Every fourth node is always evaluated: 1.6 % of the grid."""
+
+REACH = 1.0
+"""How far slopes are trusted to go on; larger values refine more cells that hold no change of label."""
+
+_NEIGHBORS = np.array([step for step in product((-1, 0, 1), repeat=3) if any(step)])
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """A field on a grid.
+
+    Attributes:
+        labels: the class of the largest logit; the lowest one of equals.
+        rows: the row of ``logits`` that belongs to a node, or -1 where the label follows from the cell.
+        logits: of the evaluated nodes.
+    """
+
+    labels: UInt8[np.ndarray, "x y z"]
+    rows: Int[np.ndarray, "x y z"]
+    logits: Float[np.ndarray, "m c"]
+
+
+class _Evaluator:
+    """The field at nodes of the finest grid; keeps every answer."""
+
+    def __init__(self, field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"]) -> None:
+        self.field, self.origin, self.spacing = field, origin, spacing
+        self.chunks: list[Float[np.ndarray, "m c"]] = []
+        self.count = 0
+
+    def __call__(self, index: Int[np.ndarray, "m 3"]) -> tuple[UInt8[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+        """Labels and rows of nodes."""
+        logits = self.field(self.origin + index * self.spacing)
+        rows = np.arange(self.count, self.count + len(index), dtype=np.int32)
+        self.chunks.append(logits)
+        self.count += len(index)
+        return logits.argmax(axis=1).astype(np.uint8), rows
+
+    def logits(self) -> Float[np.ndarray, "m c"]:
+        return np.concatenate(self.chunks)
+
+
+def sample_dense(
+    field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"], shape: tuple[int, int, int]
+) -> Sampled:
+    """The field at every node ``origin + [i, j, k] * spacing``."""
+    evaluate = _Evaluator(field, origin, spacing)
+    labels, rows = evaluate(_all_nodes(shape))
+    return Sampled(labels.reshape(shape), rows.reshape(shape), evaluate.logits())
+
+
+def sample_coarse_to_fine(
+    field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"], shape: tuple[int, int, int]
+) -> Sampled:
+    """The labels of ``sample_dense`` from few evaluations; every cell with a change of label is known exactly."""
+    evaluate = _Evaluator(field, origin, spacing)
+    # whole coarse cells: up to three nodes beyond the grid are evaluated too and cut off at the end
+    cells = [-(-(nodes - 1) // COARSE) for nodes in shape]
+    lattice = (cells[0] + 1, cells[1] + 1, cells[2] + 1)
+    labels, rows = evaluate(COARSE * _all_nodes(lattice))
+    labels, rows = labels.reshape(lattice), rows.reshape(lattice)
+    active = _dilate(_changing_cells(labels) | _sloping_cells(rows, evaluate.logits()))
+    step = COARSE
+    while step > 1:
+        step //= 2
+        labels, rows = _halve(labels, rows, active, step, evaluate)
+        active = _changing_cells(labels)
+    inside = tuple(slice(0, nodes) for nodes in shape)
+    return Sampled(labels[inside], rows[inside], evaluate.logits())
+
+
+def _all_nodes(shape: tuple[int, int, int]) -> Int[np.ndarray, "n 3"]:
+    return np.indices(shape).reshape(3, -1).T
+
+
+def _changing_cells(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "i j k"]:
+    """Cells whose eight corners do not all have one label."""
+    return _over_corners(labels, np.maximum) != _over_corners(labels, np.minimum)
+
+
+def _sloping_cells(rows: Int[np.ndarray, "x y z"], logits: Float[np.ndarray, "m c"]) -> Bool[np.ndarray, "i j k"]:
+    """Cells in which the lead of the winning class, going on as between its neighbours, could vanish half way.
+
+    For a field of signed distances this finds every cell that a surface passes, also of a ball between the nodes.
+    """
+    best = np.partition(logits, -2, axis=1)
+    lead = (best[:, -1] - best[:, -2])[rows]
+    change = np.zeros_like(lead)
+    for axis in range(3):
+        steps = np.abs(np.diff(lead, axis=axis))
+        before = [(0, 0)] * 3
+        after = [(0, 0)] * 3
+        before[axis], after[axis] = (1, 0), (0, 1)
+        change += np.maximum(np.pad(steps, before), np.pad(steps, after))
+    return _over_corners(lead <= REACH * 0.5 * change, np.logical_or)
+
+
+def _over_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
+    """``combine`` over the eight corners of each cell."""
+    for axis in range(3):
+        count = values.shape[axis]
+        values = combine(
+            np.take(values, np.arange(count - 1), axis=axis), np.take(values, np.arange(1, count), axis=axis)
+        )
+    return values
+
+
+def _dilate(cells: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
+    """The cells and all that touch them."""
+    for axis in range(3):
+        grown = cells.copy()
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        grown[tuple(low)] |= cells[tuple(high)]
+        grown[tuple(high)] |= cells[tuple(low)]
+        cells = grown
+    return cells
+
+
+def _halve(
+    labels: UInt8[np.ndarray, "x y z"],
+    rows: Int[np.ndarray, "x y z"],
+    active: Bool[np.ndarray, "i j k"],
+    step: int,
+    evaluate: _Evaluator,
+) -> tuple[UInt8[np.ndarray, "u v w"], Int[np.ndarray, "u v w"]]:
+    """The next lattice, ``step`` fine nodes apart: active cells evaluated, others filled with their corners' label."""
+    shape = tuple(2 * n - 1 for n in labels.shape)
+    # a node between coarse nodes takes the one below: all corners of a cell that is not active agree
+    fine_labels = labels[np.ix_(*(np.arange(n) // 2 for n in shape))]
+    fine_rows = np.full(shape, -1, dtype=np.int32)
+    fine_rows[::2, ::2, ::2] = rows
+    wanted = active
+    for axis in range(3):
+        doubled = np.repeat(wanted, 2, axis=axis)
+        ends = [(0, 0)] * 3
+        ends[axis] = (0, 1)
+        wanted = np.pad(doubled, ends)
+        ends[axis] = (1, 0)
+        wanted |= np.pad(doubled, ends)
+    _follow(fine_labels, fine_rows, np.argwhere(wanted & (fine_rows < 0)), step, evaluate)
+    return fine_labels, fine_rows
+
+
+def _follow(
+    labels: UInt8[np.ndarray, "x y z"],
+    rows: Int[np.ndarray, "x y z"],
+    wanted: Int[np.ndarray, "m 3"],
+    step: int,
+    evaluate: _Evaluator,
+) -> None:
+    """Evaluate nodes, then every skipped node beside one of another label, until none is left. Changes the arrays.
+
+    So no evaluated node contradicts the label assumed beside it, and a surface once met is followed to its end.
+    """
+    while len(wanted):
+        place = tuple(wanted.T)
+        labels[place], rows[place] = evaluate(step * wanted)
+        beside = (wanted[:, None] + _NEIGHBORS).reshape(-1, 3)
+        label = np.repeat(labels[place], len(_NEIGHBORS))
+        within = ((beside >= 0) & (beside < labels.shape)).all(axis=1)
+        beside, label = beside[within], label[within]
+        flat = np.ravel_multi_index(tuple(beside.T), labels.shape)
+        doubtful = (rows.ravel()[flat] < 0) & (labels.ravel()[flat] != label)
+        wanted = np.stack(np.unravel_index(np.unique(flat[doubtful]), labels.shape), axis=1)

@@ -1,0 +1,68 @@
+"""Range scans: from a scanner's frame to a camera's, and the four real scans of the Stanford bunny with their truth.
+
+Scanner frame: x right, y up, z toward the scanner, the origin somewhere near the object. The scans' poses are known, so
+the rest-pose segments of the scene "bunny", brought into a scan's frame, are its exact answer.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo import assets
+from mereo.camera import PointCloud
+from mereo.files import read_point_cloud
+from mereo.frame import Normalizer, rigid, transform_points
+from mereo.mesh import SegmentedMesh
+
+SCANS = tuple(assets.BUNNY_SCAN_POSES)
+"""Names of the bunny's scans."""
+
+SCANNER_TO_CAMERA = np.diag([1.0, -1.0, -1.0])
+"""Half a turn about x; its own inverse."""
+
+VIEW_DISTANCE = 8.5
+"""Assumed distance of a scanner, in half longest sides of the visible part: the middle of the training views."""
+
+
+def scanner_to_camera(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
+    """``T_camera_scanner`` that turns a scan into a camera frame and puts it on the optical axis.
+
+    The network looks along lines of sight from the camera, but a scan does not say where the scanner stood; it is
+    assumed ``VIEW_DISTANCE`` away, in front of the middle of the cloud. Raises ``ValueError`` for a cloud without
+    extent.
+    """
+    normalizer = Normalizer.fit(points)
+    target = np.array([0.0, 0.0, VIEW_DISTANCE / normalizer.scale])
+    return rigid(SCANNER_TO_CAMERA, target - SCANNER_TO_CAMERA @ normalizer.center)
+
+
+def bunny_scan(name: str) -> tuple[PointCloud, Float[np.ndarray, "4 4"]]:
+    """A real scan in its scanner frame, metres, and ``T_model_scan`` into the frame of bunny.off.
+
+    Raises ``ValueError`` for an unknown name and ``assets.AssetUnavailable`` where the scan cannot be had.
+    """
+    if name not in SCANS:
+        raise ValueError(f"there is no scan {name!r}; it must be one of {', '.join(SCANS)}: check the spelling")
+    return read_point_cloud(assets.get(f"bunny/{name}.ply")), assets.BUNNY_SCAN_POSES[name]
+
+
+def bunny_truth(name: str) -> SegmentedMesh:
+    """The scanned bunny's segments in the scanner frame, metres.
+
+    Accuracy: the scan lies within 0.1 mm (median) of this surface.
+    """
+    from mereo.scenes.bunny import model_to_scene, rest_mesh
+
+    center, scale = model_to_scene()
+    T_model_scene = np.eye(4)
+    T_model_scene[:3, :3] /= scale
+    T_model_scene[:3, 3] = center
+    # the published rotations are orthonormal to 1e-6 only, so a general inverse
+    return rest_mesh().transformed(np.linalg.inv(assets.BUNNY_SCAN_POSES[name]) @ T_model_scene)
+
+
+def scan_in_camera(name: str) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
+    """A real scan and its truth in a camera frame, metres, and ``T_camera_scan``."""
+    scan, _ = bunny_scan(name)
+    T_camera_scan = scanner_to_camera(scan.points)
+    cloud = PointCloud(transform_points(T_camera_scan, scan.points))
+    return cloud, bunny_truth(name).transformed(T_camera_scan), T_camera_scan
