@@ -1,21 +1,30 @@
 """Generation: the same bits however the work is shared or interrupted, and never a test seed by accident."""
 
+import errno
 import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
+from toy_scene import toy_scene
 
 from mereo import generation
-from mereo.config import PRESETS, TEST_SEED_START, GenerateConfig, SamplingConfig
+from mereo.config import TEST_SEED_START, GenerateConfig, SamplingConfig
 from mereo.dataset import Dataset
-from mereo.generation import generate
-from mereo.scene import load_scene
-from mereo.synthesis import example_rng, synthesize
+from mereo.generation import example_bytes, generate
+from mereo.scene import Scene, load_scene
+from mereo.synthesis import Example, example_rng, synthesize
 
 SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
+TOY = toy_scene()
 
 
 @pytest.fixture(autouse=True)
@@ -27,114 +36,254 @@ def contents(directory: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
 
 
-def test_killed_and_resumed_equals_uninterrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    generate("rope", tmp_path / "whole", SMALL, examples=10, seed=3)
-    original = generation._make_shard
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten examples, made in one go: shards of 4, 4 and 2."""
+    output = tmp_path_factory.mktemp("whole") / "data"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generation, "SHARD_SIZE", 4)
+        generate(TOY, output, SMALL, examples=10, seed=3)
+    return output
 
-    def dies_in_the_second(job: generation._Job) -> int:
-        if job.first == 4:
+
+# --- the same bits ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("calls", [0, 5, 9])
+def test_killed_and_resumed_equals_uninterrupted(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    made = 0
+
+    def stops(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> Example:
+        nonlocal made
+        if made == calls:
             raise KeyboardInterrupt
-        return original(job)
+        made += 1
+        return synthesize(scene, settings, rng)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(generation, "_make_shard", dies_in_the_second)
-        generate("rope", tmp_path / "parts", SMALL, examples=10, seed=3)
-    assert sorted(contents(tmp_path / "parts")) == ["manifest.json", "shard-00000.safetensors"]
-    generate("rope", tmp_path / "parts", SMALL, examples=10, seed=3, resume=True)
-    assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
+        patch.setattr(generation, "synthesize", stops)
+        generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3)
+    complete = contents(tmp_path / "data")
+    assert len(complete) == 1 + calls // 4
+    assert complete.items() <= contents(whole).items()
+    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, resume=True)
+    assert contents(tmp_path / "data") == contents(whole)
 
 
-def test_machines_that_share_the_work_make_the_same_dataset(tmp_path: Path) -> None:
-    generate("rope", tmp_path / "whole", SMALL, examples=10, seed=3)
-    for part in range(2):
-        generate("rope", tmp_path / "parts", SMALL, examples=10, seed=3, shard=(part, 2), resume=part > 0)
-    assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
+def test_machines_that_share_the_work_and_the_directory_make_the_same_dataset(whole: Path, tmp_path: Path) -> None:
+    for part in (1, 0):
+        generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(part, 2))
+    assert contents(whole) == contents(tmp_path / "data")
+    with pytest.raises(FileExistsError, match="holds a dataset; continue it with --resume"):
+        generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(0, 2))
+
+
+def test_a_damaged_shard_is_reported_and_made_again(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3)
+    shard = tmp_path / "data" / "shard-00001.safetensors"
+    shard.write_bytes(shard.read_bytes()[:-1])
+    capsys.readouterr()
+    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, resume=True)
+    assert "shard-00001.safetensors is damaged and is made again" in capsys.readouterr().out
+    assert contents(whole) == contents(tmp_path / "data")
+
+
+def test_any_example_can_be_remade_alone(whole: Path) -> None:
+    example = synthesize(TOY, SMALL, example_rng(3, 5))
+    shard = load_file(whole / "shard-00001.safetensors")
+    assert np.array_equal(shard["positions"][1], example.queries.positions.astype(np.float32))
+    assert np.array_equal(shard["labels"][1], example.queries.labels)
+    count = int(shard["cloud_count"][1])
+    assert count == len(example.cloud) < SMALL.points or count == SMALL.points
+    repeated = example.cloud[np.arange(SMALL.points) % count].astype(np.float32)
+    assert np.array_equal(shard["cloud"][1], repeated)
 
 
 @pytest.mark.slow
-def test_two_workers_equal_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()  # spawned workers do not see a patched shard size
-    generate("rope", tmp_path / "one", SMALL, examples=130, seed=3, workers=1)
-    generate("rope", tmp_path / "two", SMALL, examples=130, seed=3, workers=2)
-    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+def test_two_workers_equal_one(whole: Path, tmp_path: Path) -> None:
+    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, workers=2)
+    assert contents(whole) == contents(tmp_path / "data")
 
 
-def test_any_example_can_be_remade_alone(tmp_path: Path) -> None:
-    generate("rope", tmp_path / "data", SMALL, examples=6, seed=8)
-    example = synthesize(load_scene("rope"), SMALL, example_rng(8, 5))
-    shard = load_file(tmp_path / "data" / "shard-00001.safetensors")
-    assert np.array_equal(shard["positions"][1], example.queries.positions.astype(np.float32))
-    assert np.array_equal(shard["labels"][1], example.queries.labels)
+@pytest.mark.slow
+def test_ctrl_c_leaves_complete_shards_only(tmp_path: Path) -> None:
+    """A real interrupt to a real command, as a terminal sends it: to every process of the group."""
+    output = tmp_path / "data"
+    options = "--examples 20000 --workers 2 --image-size 32 --points 32 --per-segment 4 --output"
+    command = [sys.executable, "-m", "mereo", "generate", "rope", *options.split(), str(output)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
+    deadline = time.monotonic() + 300
+    while not list(output.glob("shard-*")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (130, "mereo: interrupted\n")
+    shards = sorted(path.name for path in output.iterdir())
+    assert shards[0] == "manifest.json" and len(shards) > 1
+    assert all(len(load_file(output / name)["labels"]) == 64 for name in shards[1:])
 
 
-def test_training_reads_what_generation_writes(tmp_path: Path) -> None:
-    generate("rope", tmp_path / "data", SMALL, examples=6, seed=8)
-    data = Dataset.load(tmp_path / "data")
-    assert len(data) == 6 and data.cloud.shape == (6, 128, 3)
-    assert data.positions.shape == (6, SMALL.sampling.total(9), 3)
+# --- what is stored ---------------------------------------------------------------------------------------------------
+
+
+def test_training_reads_what_generation_writes(whole: Path) -> None:
+    data = Dataset.load(whole)
+    assert len(data) == 10 and data.cloud.shape == (10, 128, 3)
+    assert data.positions.shape == (10, SMALL.sampling.total(4), 3)
     assert (data.viewpoint[:, 2] < data.cloud[..., 2].amin(dim=1)).all()
 
 
-def test_a_paper_size_dataset_fits_in_2_5_gigabytes(tmp_path: Path) -> None:
-    """28,800 examples of a five-segment scene, on disk and in memory, from the bytes of one example."""
-    queries, points = SamplingConfig().total(5), GenerateConfig().points
-    generate("rope", tmp_path / "data", replace(SMALL, points=points), examples=2, seed=1)
-    shard = load_file(tmp_path / "data" / "shard-00000.safetensors")
-    per_query = sum(a.nbytes / a.shape[1] for k, a in shard.items() if a.shape[1:2] == (SMALL.sampling.total(9),)) / 2
-    rest = sum(a.nbytes for k, a in shard.items() if a.shape[1:2] != (SMALL.sampling.total(9),)) / 2
-    assert 28_800 * (per_query * queries + rest) < 2.5e9
+def test_tensors_are_as_documented(whole: Path) -> None:
+    shard = load_file(whole / "shard-00000.safetensors")
+    queries = SMALL.sampling.total(4)
+    assert {key: (value.dtype.name, value.shape) for key, value in shard.items()} == {
+        "cloud": ("float32", (4, 128, 3)),
+        "cloud_count": ("int32", (4,)),
+        "center": ("float64", (4, 3)),
+        "scale": ("float64", (4,)),
+        "positions": ("float32", (4, queries, 3)),
+        "labels": ("uint8", (4, queries)),
+        "distances": ("float32", (4, queries)),
+        "directions": ("float16", (4, queries, 3)),
+        "rest": ("float16", (4, queries, 3)),
+    }
+    assert np.array_equal(np.isnan(shard["rest"]).any(axis=-1), shard["labels"] == 0)
+
+
+def test_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
+    """28,800 examples of a five-segment scene, on disk and in memory."""
+    stored = sum(value.nbytes for value in load_file(whole / "shard-00000.safetensors").values())
+    assert stored == 4 * example_bytes(SMALL, segments=4)
+    file = (whole / "shard-00000.safetensors").stat().st_size
+    assert file - stored < 2000  # the header, once per 64 examples
+    assert 28_800 * example_bytes(GenerateConfig(), segments=5) + 450 * 2000 < 1.6e9 < 2.5e9
+
+
+def test_manifest_tells_how_to_make_it_again(whole: Path) -> None:
+    manifest = json.loads((whole / "manifest.json").read_text())
+    assert (manifest["scene"], manifest["seed"], manifest["examples"]) == ("toy", 3, 10)
+    assert manifest["settings"]["sampling"]["per_segment"] == 16
+    assert [part["name"] for part in manifest["segments"]] == list(TOY.rest.names)
+    assert [tuple(part["color"]) for part in manifest["segments"]] == list(TOY.rest.colors)
+    assert len(manifest["rest_sha256"]) == 64 and manifest["any_roll"] is False
+    assert manifest["bytes"] == 10 * example_bytes(SMALL, 4)
+    assert manifest["libraries"]["numpy"] == np.__version__
+
+
+def test_files_have_the_users_permissions(whole: Path) -> None:
+    mask = os.umask(0)
+    os.umask(mask)
+    assert all(path.stat().st_mode & 0o777 == 0o666 & ~mask for path in whole.iterdir())
+
+
+def test_a_built_in_scene_goes_by_its_name(tmp_path: Path) -> None:
+    generate("rope", tmp_path / "data", SMALL, examples=1, seed=1)
+    manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
+    assert [part["name"] for part in manifest["segments"]] == list(load_scene("rope").rest.names)
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
 
 
 def test_test_seeds_and_training_seeds_never_meet(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="seeds from 1000000 up are for testing and never for training"):
-        generate("rope", tmp_path / "data", SMALL, examples=4, seed=TEST_SEED_START)
+        generate(TOY, tmp_path / "data", SMALL, examples=4, seed=TEST_SEED_START)
     with pytest.raises(ValueError, match="a test set needs one from 1000000 up"):
-        generate("rope", tmp_path / "data", SMALL, examples=4, seed=5, test=True)
+        generate(TOY, tmp_path / "data", SMALL, examples=4, seed=TEST_SEED_START - 1, test=True)
     assert not (tmp_path / "data").exists()
-    generate("rope", tmp_path / "data", SMALL, examples=1, seed=TEST_SEED_START, test=True)
+    generate(TOY, tmp_path / "data", SMALL, examples=1, seed=TEST_SEED_START, test=True)
 
 
-def test_resuming_with_other_settings_is_refused(tmp_path: Path) -> None:
-    generate("rope", tmp_path / "data", SMALL, examples=4, seed=1)
-    with pytest.raises(ValueError, match=r"was made with seed = 1, not 2; resuming needs equal settings"):
-        generate("rope", tmp_path / "data", SMALL, examples=4, seed=2, resume=True)
-    with pytest.raises(ValueError, match=r"was made with settings = .*resuming needs equal settings"):
-        generate("rope", tmp_path / "data", replace(SMALL, noise_std=0.5), examples=4, seed=1, resume=True)
+def test_resuming_names_the_setting_that_differs(whole: Path, tmp_path: Path) -> None:
+    before = contents(whole)
+    sampling = replace(SMALL.sampling, oversample=2)
+    cases = [
+        (SMALL, 4, 10, "seed = 3, not 4"),
+        (SMALL, 3, 11, "examples = 10, not 11"),
+        (replace(SMALL, noise_std=0.5), 3, 10, "settings.noise_std = 0.1, not 0.5"),
+        (replace(SMALL, sampling=sampling), 3, 10, "settings.sampling.oversample = 1, not 2"),
+    ]
+    for settings, seed, examples, difference in cases:
+        message = rf"was made with {re.escape(difference)}; resuming needs equal settings: use them, or choose another"
+        with pytest.raises(ValueError, match=message):
+            generate(TOY, whole, settings, examples=examples, seed=seed, resume=True)
+    with pytest.raises(ValueError, match="was made with scene = 'toy', not 'rope'"):
+        generate("rope", whole, SMALL, examples=10, seed=3, resume=True)
+    assert contents(whole) == before
 
 
-def test_an_existing_directory_is_left_alone(tmp_path: Path) -> None:
+def test_a_broken_manifest_cannot_be_resumed(tmp_path: Path) -> None:
+    for text in ("{", "[]"):
+        (tmp_path / "manifest.json").write_text(text)
+        with pytest.raises(ValueError, match="is not a manifest; it cannot be resumed: choose another --output"):
+            generate(TOY, tmp_path, SMALL, examples=4, seed=1, resume=True)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_an_existing_directory_is_left_alone(tmp_path: Path, resume: bool) -> None:
     (tmp_path / "notes.txt").write_text("precious")
-    for resume, message in ((False, "continue it with --resume"), (True, "is no dataset to resume")):
-        with pytest.raises(FileExistsError, match=message):
-            generate("rope", tmp_path, SMALL, examples=4, seed=1, resume=resume)
+    with pytest.raises(FileExistsError, match=r"is not empty and holds no manifest\.json; choose another --output"):
+        generate(TOY, tmp_path, SMALL, examples=4, seed=1, resume=resume)
+    with pytest.raises(FileExistsError, match="is a file; a dataset is a directory: choose another --output"):
+        generate(TOY, tmp_path / "notes.txt", SMALL, examples=4, seed=1, resume=resume)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_full_disk_is_one_sentence_and_leaves_no_half_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(tensors: object, path: Path) -> None:
-        Path(path).write_bytes(b"half")
-        raise OSError(28, "No space left on device")
+def test_a_dataset_is_not_overwritten_without_being_asked(whole: Path) -> None:
+    with pytest.raises(FileExistsError, match="holds a dataset; continue it with --resume, or choose another --output"):
+        generate(TOY, whole, SMALL, examples=10, seed=3)
 
-    monkeypatch.setattr(generation, "save_file", full)
-    with pytest.raises(OSError, match="the disk is full while writing"):
-        generate("rope", tmp_path / "data", SMALL, examples=4, seed=1)
+
+def test_a_full_disk_is_one_sentence_and_leaves_no_half_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = Path.write_bytes
+
+    def full(path: Path, data: bytes) -> int:
+        written(path, data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match=r"the disk is full while writing .*shard-00000\.safetensors; free space or"):
+        generate(TOY, tmp_path / "data", SMALL, examples=4, seed=1)
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["manifest.json"]
 
 
-@pytest.mark.parametrize(("examples", "seed", "workers"), [(0, 1, 1), (4, -1, 1), (4, 1, 0)])
-def test_wrong_numbers_are_named(tmp_path: Path, examples: int, seed: int, workers: int) -> None:
-    with pytest.raises(ValueError, match="it must"):
-        generate("rope", tmp_path / "data", SMALL, examples=examples, seed=seed, workers=workers)
+def test_what_a_killed_run_was_writing_is_removed_on_resume(whole: Path, tmp_path: Path) -> None:
+    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(0, 2))
+    mine, others = (
+        tmp_path / "data" / f".shard-0000{number}.1a2b3c4d.partial.safetensors" for number in (1, 0)
+    )  # the second is perhaps being written by another machine at this moment
+    mine.write_bytes(b"half")
+    others.write_bytes(b"half")
+    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(1, 2))
+    assert contents(tmp_path / "data") == {**contents(whole), others.name: b"half"}
 
 
-def test_manifest_tells_how_to_make_it_again(tmp_path: Path) -> None:
-    generate("rope", tmp_path / "data", SMALL, examples=2, seed=1)
-    manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
-    assert manifest["scene"] == "rope" and manifest["seed"] == 1 and manifest["examples"] == 2
-    assert manifest["settings"]["sampling"]["per_segment"] == 16
-    assert [s["name"] for s in manifest["segments"]] == list(load_scene("rope").rest.names)
-    assert len(manifest["rest_sha256"]) == 64 and manifest["any_roll"] is False
+@pytest.mark.parametrize(
+    "examples, seed, workers, shard, message",
+    [
+        (0, 1, 1, (0, 1), "--examples is 0; it must be at least 1"),
+        (4, -1, 1, (0, 1), "--seed is -1; it must not be negative"),
+        (4, 1, 0, (0, 1), "the number of workers is 0; it must be at least 1"),
+        (4, 1, 1, (2, 2), "the shard is 2/2; i/n needs i from 0 to n - 1"),
+    ],
+)
+def test_wrong_numbers_are_named(
+    tmp_path: Path, examples: int, seed: int, workers: int, shard: tuple[int, int], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        generate(TOY, tmp_path / "data", SMALL, examples=examples, seed=seed, workers=workers, shard=shard)
+    assert not (tmp_path / "data").exists()
 
 
-def test_presets_name_only_known_networks() -> None:
-    assert set(PRESETS) == {"paper", "base", "large", "tiny"}
+def test_progress_tells_rate_and_time_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(generation, "SECONDS_BETWEEN_LINES", 0.0)
+    generate(TOY, tmp_path / "data", SMALL, examples=6, seed=3)
+    lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"4 of 6, \d+\.\d examples/s, \d+ s left", lines[0])
+    assert lines[1].startswith("6 of 6, ") and re.fullmatch(r"6 examples made in \d+ (s|min)", lines[2])

@@ -201,9 +201,12 @@ def _claim_directory(output: Path, manifest: dict[str, Any], shards: list[_Shard
 
 def _check_same(path: Path, manifest: dict[str, Any]) -> None:
     try:
-        before = _flat(json.loads(path.read_text("utf-8")))
-    except (ValueError, AttributeError):
-        raise ValueError(f"{path} is not a manifest; it cannot be resumed: choose another --output") from None
+        before = json.loads(path.read_text("utf-8"))
+    except ValueError:
+        before = None
+    if not isinstance(before, dict):
+        raise ValueError(f"{path} is not a manifest; it cannot be resumed: choose another --output")
+    before = _flat(before)
     for key, now in _flat(manifest).items():
         # a manifest of an older version may not state everything
         if before.get(key, now) != now:
