@@ -17,9 +17,10 @@ import trimesh
 from jaxtyping import Float
 
 from mereo import assets
-from mereo.deformation import Compose, Deformation
+from mereo.deformation import Compose, Deformation, smooth_step, turn
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.scene import WHOLE_SPHERE_RAD, Scene, Workspace
+from mereo.warps import SmoothField, Squash
 
 SHORTEST_SIDE = 20.0
 LONGEST_EDGE = 1.2
@@ -108,15 +109,10 @@ class SoftJoint:
     rotation_vector: Float[np.ndarray, "3"]
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        local = points - self.center
-        t = np.clip(local @ self.direction / self.length, 0.0, 1.0)
-        weight = t * t * t * (t * (6.0 * t - 15.0) + 10.0)
-        angle = float(np.linalg.norm(self.rotation_vector))
-        axis = self.rotation_vector / max(angle, 1e-12)
-        cosine, sine = np.cos(weight * angle)[:, None], np.sin(weight * angle)[:, None]
-        along = (local @ axis)[:, None] * axis
-        # Rodrigues' formula with an angle per point
-        return self.center + along + cosine * (local - along) + sine * np.cross(axis, local)
+        height = (points - self.center) @ self.direction
+        angle_rad = float(np.linalg.norm(self.rotation_vector))
+        axis = self.rotation_vector / max(angle_rad, 1e-12)
+        return turn(points, self.center, axis, angle_rad * smooth_step(height / self.length))
 
 
 @dataclass(frozen=True)
@@ -158,36 +154,9 @@ TAIL_JOINT = JointBounds(TAIL.origin, TAIL.direction, length=4.0, twist_rad=0.15
 SPINE_JOINT = JointBounds((-10.0, -4.0, 2.0), (1.0, 0.0, 0.0), length=24.0, twist_rad=0.35, bend_rad=0.35)
 
 
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """Linear map ``center + matrix (x - center)``, its determinant 1: what a squeeze does to soft matter."""
-
-    center: Float[np.ndarray, "3"]
-    matrix: Float[np.ndarray, "3 3"]
-
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        return self.center + (points - self.center) @ self.matrix.T
-
-
-@dataclass(frozen=True, eq=False)
-class Waves:
-    """``x + sum_k a_k sin(b_k . x + c_k)``; invertible while ``sum_k |a_k| |b_k| < 1``, here at most 0.3."""
-
-    amplitudes: Float[np.ndarray, "k 3"]
-    frequencies: Float[np.ndarray, "k 3"]
-    phases: Float[np.ndarray, " k"]
-
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        return points + np.sin(points @ self.frequencies.T + self.phases) @ self.amplitudes
-
-
 def squash_and_wobble(rng: np.random.Generator) -> list[Deformation]:
     """Squeeze along a random axis by up to 18 percent at constant volume, then smooth random waves."""
-    axis = rng.normal(size=3)
-    axis /= np.linalg.norm(axis)
-    factor = np.exp(rng.uniform(-0.18, 0.18))
-    across = factor**-0.5
-    matrix = across * np.eye(3) + (factor - across) * np.outer(axis, axis)
+    squash = Squash(np.zeros(3), rng.normal(size=3), float(np.exp(rng.uniform(-0.18, 0.18))))
     frequencies = rng.normal(size=(4, 3))
     frequencies *= 2 * np.pi / rng.uniform(25.0, 45.0, size=(4, 1)) / np.linalg.norm(frequencies, axis=1, keepdims=True)
     amplitudes = rng.normal(size=(4, 3))
@@ -196,7 +165,7 @@ def squash_and_wobble(rng: np.random.Generator) -> list[Deformation]:
         / np.linalg.norm(frequencies, axis=1).max()
         / np.linalg.norm(amplitudes, axis=1, keepdims=True)
     )
-    return [Stretch(np.zeros(3), matrix), Waves(amplitudes, frequencies, rng.uniform(0, 2 * np.pi, size=4))]
+    return [squash, SmoothField(amplitudes, frequencies, rng.uniform(0, 2 * np.pi, size=4))]
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
