@@ -217,11 +217,12 @@ def evaluate_weights(
     examples: int = 128,
     seed: int = TEST_SEED_START,
     scene: str | None = None,
+    cells: int = CELLS,
 ) -> Evaluation:
     """``mereo evaluate``: write metrics.json, table.md and errors.png into a new directory, and print the table."""
     with new_directory(output) as directory:
         model = load_model(weights)
-        evaluation = evaluate(model, scene, examples=examples, seed=seed, progress=True)
+        evaluation = evaluate(model, scene, examples=examples, seed=seed, cells=cells, progress=True)
         facts = {
             "weights": str(weights),
             "scene": scene or trained_scene(model),

@@ -46,7 +46,7 @@ class LabelGrid:
         x, y, z = (self.origin[i] + np.arange(self.labels.shape[i]) * self.spacing[i] for i in range(3))
         return x, y, z
 
-    def positions(self, index: Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def positions(self, index: Int[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Centres of voxels given by their index."""
         return self.origin + index * self.spacing
 
@@ -151,12 +151,8 @@ def locate(field: Field, box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 
         if not touched.any():
             break
         box = _grown(box, touched, 0.25)
+    _check_found(grid)
     occupied = np.argwhere(grid.labels > 0)
-    if len(occupied) == 0:
-        raise ValueError(
-            "the model finds no segment near the cloud, only empty space; the cloud must show the object it "
-            "was trained on: check the weights, the mask, and the cloud's frame (x right, y down, z forward)"
-        )
     low, high = grid.positions(occupied.min(axis=0) - 2), grid.positions(occupied.max(axis=0) + 2)
     return np.stack([np.maximum(low, box[0]), np.minimum(high, box[1])])
 
@@ -164,7 +160,10 @@ def locate(field: Field, box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 
 def extract_whole(
     field: Field, box: Float[np.ndarray, "2 3"], resolution: int, names: Sequence[str], colors: Sequence[Color]
 ) -> Extraction:
-    """``extract`` in a box that grows, at most ``GROWTHS`` times, where a segment touches it."""
+    """``extract`` in a box that grows, at most ``GROWTHS`` times, where a segment touches it.
+
+    Raises ``ValueError`` where the field knows only empty space.
+    """
     found = extract(field, box, resolution, names, colors)
     for _ in range(GROWTHS):
         touched = found.grid.touched_sides()
@@ -172,7 +171,16 @@ def extract_whole(
             break
         box = _grown(box, touched, 0.1)
         found = extract(field, box, resolution, names, colors)
+    _check_found(found.grid)
     return found
+
+
+def _check_found(grid: LabelGrid) -> None:
+    if not grid.labels.any():
+        raise ValueError(
+            "the model finds no segment near the cloud, only empty space; the cloud must show the object it was "
+            "trained on: check the weights, the mask, and the cloud's frame (x right, y down, z forward)"
+        )
 
 
 def _grown(box: Float[np.ndarray, "2 3"], sides: Bool[np.ndarray, "2 3"], fraction: float) -> Float[np.ndarray, "2 3"]:

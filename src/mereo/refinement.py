@@ -3,8 +3,9 @@
 Every ``COARSE``-th node is evaluated; cells that may hold a change of label are halved until one step wide; all
 other nodes take the label of the cell they lie in. Which cells may hold one?
 
-- Those whose corners differ, and (at the first level) those where the lead of the winning class falls so steeply that
-  it may vanish inside, with all cells around them (``_changing_cells``, ``_sloping_cells``).
+- Those whose corners differ (``_changing_cells``), and at the first level all cells around them.
+- Those where the lead of the winning class falls so steeply that it may vanish inside (``_sloping_cells``), except
+  beside a surface that is already known.
 - Then no evaluated node may contradict the label assumed beside it; where one does, that neighbour is evaluated too,
   and so on (``_follow``). So a surface that is met anywhere is followed to its end.
 
@@ -87,12 +88,13 @@ def sample_coarse_to_fine(
     lattice = (cells[0] + 1, cells[1] + 1, cells[2] + 1)
     labels, rows = evaluate(COARSE * _all_nodes(lattice))
     labels, rows = labels.reshape(lattice), rows.reshape(lattice)
-    active = _dilate(_changing_cells(labels) | _sloping_cells(rows, evaluate.logits()))
     step = COARSE
     while step > 1:
+        changing, sloping = _changing_cells(labels), _sloping_cells(rows, evaluate.logits())
+        # beside a surface that is already known the lead is small because of it, and `_follow` watches there
+        active = _dilate(changing | sloping) if step == COARSE else changing | (sloping & ~_dilate(changing))
         step //= 2
         labels, rows = _halve(labels, rows, active, step, evaluate)
-        active = _changing_cells(labels)
     inside = tuple(slice(0, nodes) for nodes in shape)
     return Sampled(labels[inside], rows[inside], evaluate.logits())
 
@@ -107,19 +109,21 @@ def _changing_cells(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "i j
 
 
 def _sloping_cells(rows: Int[np.ndarray, "x y z"], logits: Float[np.ndarray, "m c"]) -> Bool[np.ndarray, "i j k"]:
-    """Cells in which the lead of the winning class, going on as between its neighbours, could vanish half way.
+    """Cells in which the lead of the winning class, falling on as between evaluated nodes, could vanish half way.
 
     For a field of signed distances this finds every cell that a surface passes, also of a ball between the nodes.
     """
-    best = np.partition(logits, -2, axis=1)
-    lead = (best[:, -1] - best[:, -2])[rows]
+    lead = np.full(rows.shape, np.nan, dtype=logits.dtype)
+    known = rows >= 0
+    best = np.partition(logits[rows[known]], -2, axis=1)
+    lead[known] = best[:, -1] - best[:, -2]
     change = np.zeros_like(lead)
     for axis in range(3):
-        steps = np.abs(np.diff(lead, axis=axis))
-        before = [(0, 0)] * 3
-        after = [(0, 0)] * 3
+        steps = np.nan_to_num(np.abs(np.diff(lead, axis=axis)))
+        before, after = [(0, 0)] * 3, [(0, 0)] * 3
         before[axis], after[axis] = (1, 0), (0, 1)
         change += np.maximum(np.pad(steps, before), np.pad(steps, after))
+    # NaN compares as False: a cell all of whose corners were skipped stays as it is
     return _over_corners(lead <= REACH * 0.5 * change, np.logical_or)
 
 

@@ -1,0 +1,49 @@
+"""Coarse-to-fine extraction against the dense grid: points evaluated, seconds, and labels that differ.
+
+    python benchmarks/extraction.py [WEIGHTS] [RESOLUTION] [VIEWS]
+
+Views are test examples of the weights' scene. Where labels differ the two largest logits agree to rounding: a batch of
+another size adds in another order.
+"""
+
+import sys
+import time
+from functools import partial
+
+import numpy as np
+
+from mereo.config import TEST_SEED_START, GenerateConfig
+from mereo.evaluation import trained_scene
+from mereo.extraction import Extraction, extract, extract_dense
+from mereo.scene import load_scene
+from mereo.synthesis import example_rng, sample_view
+from mereo.weights import load_model
+
+
+def main(weights: str = "rope", resolution: int = 64, views: int = 2) -> None:
+    model = load_model(weights)
+    scene = load_scene(trained_scene(model))
+    print("view   points asked      share   seconds (coarse to fine, dense)   labels that differ   largest lead there")
+    for index in range(views):
+        view = sample_view(scene, GenerateConfig(), example_rng(TEST_SEED_START, index))
+        field = partial(model.logits, model.encode(view.depth.to_points()))
+        low, high = view.mesh.bounds
+        box = np.stack([low, high]) + 0.1 * (high - low).max() * np.array([[-1.0], [1.0]])
+        results: list[Extraction] = []
+        seconds = []
+        for run in (extract, extract_dense):
+            start = time.perf_counter()
+            results.append(run(field, box, resolution, model.names, model.colors))
+            seconds.append(time.perf_counter() - start)
+        fine, dense = results
+        odd = np.argwhere(fine.grid.labels != dense.grid.labels)
+        leads = np.sort(field(dense.grid.positions(odd)), axis=1) if len(odd) else np.zeros((1, 2))
+        print(
+            f"{index:4d} {fine.evaluated:14d} {fine.evaluated / dense.evaluated:10.1%} "
+            f"{seconds[0]:16.2f} {seconds[1]:12.2f} {len(odd):20d} {float((leads[:, -1] - leads[:, -2]).max()):20.2g}"
+        )
+
+
+if __name__ == "__main__":
+    arguments = sys.argv[1:]
+    main(arguments[0] if arguments else "rope", *(int(value) for value in arguments[1:3]))

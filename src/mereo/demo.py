@@ -1,0 +1,123 @@
+"""``mereo demo``: a real range scan and two rendered depth frames, back to segments, compared with the truth."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from mereo.assets import AssetUnavailable
+from mereo.camera import PointCloud
+from mereo.evaluation import grid_confusion, predict_grid
+from mereo.frames import TruthGrid, load_frame, shipped_frames, truth_grid
+from mereo.metrics import Scores, intersection_over_union
+from mereo.model import Model
+from mereo.reconstruction import Frame, Reconstruction, reconstruct, segment_names, write_reconstruction
+from mereo.scans import bunny_scan, scan_in_camera
+from mereo.weights import load_model, shipped_names
+
+REAL_SCAN = "bun000"
+RESOLUTION = 100
+
+OWN_OBJECT = """[bold]On your own data[/bold]
+  mereo reconstruct cloud.ply --weights bunny --output result
+  mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --weights bunny --output result
+
+[bold]On your own object[/bold]: describe it as in src/mereo/scenes/rope.py, then
+  mereo scene check NAME
+  mereo scene preview NAME --output states.png
+  mereo generate NAME --examples 9600 --seed 1 --output data/NAME
+  mereo train data/NAME --output runs/NAME --preset base
+  mereo evaluate runs/NAME/weights.safetensors --output runs/NAME/test
+  mereo reconstruct frame.ply --weights runs/NAME/weights.safetensors --output result"""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One input of the demo.
+
+    Attributes:
+        name: of the output folder.
+        title: one line about it.
+        weights: a shipped name.
+        cloud, frame: the input as its sensor gives it.
+        camera_cloud, truth: the same cloud in a camera frame, and the right answer there.
+    """
+
+    name: str
+    title: str
+    weights: str
+    cloud: PointCloud
+    frame: Frame
+    camera_cloud: PointCloud
+    truth: TruthGrid
+
+
+def main(output: str | Path = Path("out/demo")) -> None:
+    """Reconstruct every input that can be had, print tables, and write a folder each below ``output``."""
+    console, started = Console(), time.perf_counter()
+    model = cache(load_model)
+    for make in _inputs():
+        try:
+            case = make()
+        except AssetUnavailable as error:
+            console.print(f"The real scan {REAL_SCAN} is left out: {error}\n", highlight=False)
+            continue
+        _show(case, model(case.weights), Path(output) / case.name, console)
+    console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
+    console.print(OWN_OBJECT, highlight=False, soft_wrap=True)
+
+
+def _inputs() -> Iterator[Callable[[], Case]]:
+    """The real scan first; frames and weights that are not shipped are no inputs."""
+    if "bunny" in shipped_names():
+        yield _scan_case
+    for name in shipped_frames():
+        if name in shipped_names():
+            yield partial(_frame_case, name)
+
+
+def _scan_case() -> Case:
+    scan, _ = bunny_scan(REAL_SCAN)
+    camera_cloud, truth, _ = scan_in_camera(REAL_SCAN)
+    title = f"{REAL_SCAN}: a real Cyberware range scan of the Stanford bunny, metres"
+    return Case(REAL_SCAN, title, "bunny", scan, "scanner", camera_cloud, truth_grid(truth))
+
+
+def _frame_case(name: str) -> Case:
+    frame = load_frame(name)
+    camera = frame.depth.camera
+    cloud = frame.depth.to_points()
+    title = f"{name}: a rendered {camera.width} x {camera.height} depth image with noise, scene units"
+    return Case(name, title, name, cloud, "camera", cloud, frame.truth)
+
+
+def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
+    result = reconstruct(case.cloud, model, RESOLUTION, case.frame)
+    started = time.perf_counter()
+    write_reconstruction(
+        result, case.cloud, folder, frame=case.frame, force=True, title=case.title, weights=case.weights
+    )
+    written_s = time.perf_counter() - started
+    predicted = predict_grid(model, case.camera_cloud, case.truth)
+    scores = intersection_over_union(grid_confusion(case.truth, predicted, len(segment_names(model)[0])))
+    console.print(_table(case, result, scores))
+    stages = {**result.timings_s, "write": written_s}
+    seconds = ", ".join(f"{stage} {value:.1f} s" for stage, value in stages.items())
+    console.print(f"{len(case.cloud)} points; {seconds}; look at {folder / 'report.html'}\n", highlight=False)
+
+
+def _table(case: Case, result: Reconstruction, scores: Scores) -> Table:
+    table = Table(title=case.title, title_justify="left")
+    table.add_column("segment")
+    for column in ("IoU with the truth", "confidence", "volume"):
+        table.add_column(column, justify="right")
+    for found, iou in zip(result.segments, scores.per_segment, strict=True):
+        table.add_row(found.name, f"{iou:.3f}", f"{found.confidence:.2f}", f"{found.volume:.4g}")
+    table.add_section()
+    table.add_row("all as one (IoU)", f"{scores.iou:.3f}", "", "")
+    table.add_row("mean of segments (mIoU)", f"{scores.miou:.3f}", "", "")
+    return table

@@ -1,0 +1,198 @@
+"""Surfaces: closed forms, and coarse to fine against the dense grid."""
+
+import numpy as np
+import pytest
+from analytic import Distance, ball, half, logits_of, plate, union
+
+from mereo.evaluation import trained_scene
+from mereo.extraction import Extraction, _grid, extract, extract_dense, extract_whole, locate
+from mereo.mesh import PALETTE, Segment
+from mereo.refinement import Field, sample_coarse_to_fine, sample_dense
+from mereo.scene import load_scene
+from mereo.synthesis import GenerateConfig, example_rng, sample_view
+from mereo.weights import load_model, shipped_names
+
+BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+
+
+def run(
+    field: Field, segments: int = 1, resolution: int = 40, box: np.ndarray = BOX, dense: bool = False
+) -> Extraction:
+    names = tuple(f"part {i}" for i in range(segments))
+    return (extract_dense if dense else extract)(field, box, resolution, names, PALETTE[:segments])
+
+
+def euler_number(segment: Segment) -> int:
+    edges = np.unique(np.sort(segment.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    return len(np.unique(segment.faces)) - len(edges) + len(segment.faces)
+
+
+def small_balls(seed: int) -> Distance:
+    """Twelve balls of radius 0.6 to 3 voxels; a coarse cell has 4."""
+    rng = np.random.default_rng(seed)
+    voxel = 2 / 40
+    return union(*(ball(tuple(rng.uniform(-0.8, 0.8, 3)), rng.uniform(0.6, 3.0) * voxel) for _ in range(12)))
+
+
+FIELDS = {
+    "one ball": (logits_of(ball((0.03, -0.02, 0.05), 0.7)), 1),
+    "touching balls": (logits_of(ball((-0.41, 0.0, 0.0), 0.4), ball((0.39, 0.0, 0.0), 0.4)), 2),
+    "halves": (logits_of(half(ball((0.0, 0.0, 0.0), 0.7), -1.0), half(ball((0.0, 0.0, 0.0), 0.7), 1.0)), 2),
+    "thin plate": (logits_of(plate((1.0, 0.3, 0.2), 0.11, 0.06)), 1),
+    "thin tilted plate": (logits_of(plate((1.0, 1.0, 1.0), 0.11, 0.06)), 1),
+    "two thin plates": (logits_of(plate((0.2, 1.0, 0.1), 0.0, 0.06), plate((0.2, 1.0, 0.1), 0.06, 0.06)), 2),
+    "ball smaller than a cell": (logits_of(ball((0.11, 0.12, 0.08), 0.06)), 1),
+    **{f"small balls {seed}": (logits_of(small_balls(seed)), 1) for seed in range(12)},
+    "small balls of two labels": (logits_of(small_balls(20), small_balls(21)), 2),
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_coarse_to_fine_is_the_dense_grid(name: str) -> None:
+    field, segments = FIELDS[name]
+    fine, dense = run(field, segments), run(field, segments, dense=True)
+    assert (fine.grid.labels == dense.grid.labels).all()
+    assert dense.grid.labels.any() and dense.evaluated == dense.grid.labels.size
+    for a, b in zip(fine.surfaces.segments, dense.surfaces.segments, strict=True):
+        np.testing.assert_array_equal(a.vertices, b.vertices)
+        np.testing.assert_array_equal(a.faces, b.faces)
+
+
+@pytest.mark.parametrize("shape", [(41, 41, 41), (30, 44, 51), (5, 6, 7), (2, 9, 4)])
+def test_any_grid_shape(shape: tuple[int, int, int]) -> None:
+    field = logits_of(ball((0.0, 0.1, 0.2), 0.6), ball((0.5, 0.5, 0.5), 0.3))
+    spacing = 2 / (np.array(shape) - 1)
+    fine, dense = (sample(field, BOX[0], spacing, shape) for sample in (sample_coarse_to_fine, sample_dense))
+    assert fine.labels.shape == shape
+    np.testing.assert_array_equal(fine.labels, dense.labels)
+    known = fine.rows >= 0
+    np.testing.assert_array_equal(fine.logits[fine.rows[known]], dense.logits[dense.rows[known]])
+
+
+def test_few_points_are_asked() -> None:
+    field = logits_of(ball((0.0, 0.0, 0.0), 0.6))
+    assert run(field, resolution=128).evaluated < 0.08 * 129**3
+
+
+def test_a_surface_once_met_is_followed_to_its_end() -> None:
+    """A wire of one voxel's radius leaves a ball; saturated logits give the coarse lattice no slope to notice it by."""
+    turn = np.linspace(0.0, 5.0, 400)
+    wire = union(*(ball((0.62 * np.cos(t), 0.62 * np.sin(t), -0.3 + 0.2 * t), 0.06) for t in turn[::4]))
+    plain = logits_of(union(ball((0.62, 0.0, -0.3), 0.2), wire))
+    field: Field = lambda points: 8.0 * np.sign(plain(points))  # noqa: E731
+    fine, dense = run(field), run(field, dense=True)
+    np.testing.assert_array_equal(fine.grid.labels, dense.grid.labels)
+    assert fine.grid.labels[:, :, -7:].any(), "the wire reaches up"
+
+
+def test_a_ball_is_a_closed_surface_of_euler_number_2() -> None:
+    found = run(logits_of(ball((0.03, -0.02, 0.05), 0.7)), resolution=64)
+    segment = found.surfaces.segments[0]
+    assert segment.edge_imbalance() == (0, 0)
+    assert euler_number(segment) == 2
+    assert segment.volume == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=2e-3)
+    radius = np.linalg.norm(segment.vertices - [0.03, -0.02, 0.05], axis=1)
+    assert np.abs(radius - 0.7).max() < 0.05 * 2 / 64, "a twentieth of a voxel"
+
+
+def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
+    whole = ball((0.0, 0.0, 0.0), 0.7)
+    box = BOX + 0.013  # no node on the interface
+    found = run(logits_of(half(whole, -1.0), half(whole, 1.0)), 2, 48, box)
+    left, right = found.surfaces.segments
+    together = run(logits_of(whole), 1, 48, box).surfaces.segments[0]
+    voxel = 2 / 48
+    walls = []
+    for segment in (left, right):
+        assert segment.edge_imbalance() == (0, 0) and euler_number(segment) == 2
+        on_wall = (np.abs(segment.vertices[:, 0]) < 1e-5) & (np.linalg.norm(segment.vertices, axis=1) < 0.7 - 2 * voxel)
+        walls.append(np.unique(segment.vertices[on_wall].round(5), axis=0))
+    assert len(walls[0]) > 200
+    np.testing.assert_allclose(walls[0], walls[1], atol=2e-5 * voxel + 1e-9)
+    assert left.volume + right.volume == pytest.approx(together.volume, rel=3e-3), (
+        "but for gaps below a voxel along the rim"
+    )
+
+
+def test_ties_on_nodes_leave_surfaces_closed() -> None:
+    """Interface and poles lie exactly on nodes, where two logits are equal."""
+    whole = ball((0.0, 0.0, 0.0), 0.5)
+    for segment in run(logits_of(half(whole, -1.0), half(whole, 1.0)), 2).surfaces.segments:
+        assert segment.edge_imbalance() == (0, 0)
+        assert segment.volume == pytest.approx(2 / 3 * np.pi * 0.125, rel=0.02)
+
+
+def test_a_segment_that_fills_the_box_is_closed_half_a_voxel_outside() -> None:
+    found = run(logits_of(ball((0.0, 0.0, 0.0), 9.0)), resolution=20)
+    segment = found.surfaces.segments[0]
+    assert found.grid.touched_sides().all()
+    assert segment.edge_imbalance() == (0, 0)
+    np.testing.assert_allclose(segment.bounds, [[-1.05] * 3, [1.05] * 3], rtol=1e-6)
+    assert 0.99 * 2.1**3 < segment.volume < 2.1**3
+
+
+def test_an_absent_segment_has_no_faces_but_keeps_its_place() -> None:
+    found = run(logits_of(ball((0.0, 0.0, 0.0), 0.5), lambda p: np.full(len(p), 5.0), ball((0.6, 0.6, 0.6), 0.2)), 3)
+    sizes = [len(segment.faces) for segment in found.surfaces.segments]
+    assert sizes[0] > 0 and sizes[1] == 0 and sizes[2] > 0
+    assert found.surfaces.names == found.grid.names == ("part 0", "part 1", "part 2")
+
+
+def test_voxels_are_cubes_and_the_resolution_is_that_of_the_longest_side() -> None:
+    box = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 0.55]])
+    grid = run(logits_of(ball((0.5, 1.0, 0.3), 0.2)), resolution=20, box=box).grid
+    assert grid.labels.shape == (11, 21, 7)
+    np.testing.assert_allclose(grid.spacing, 0.1)
+    x, y, z = grid.axes()
+    np.testing.assert_allclose([x[0], y[-1], z[-1]], [0.0, 2.0, 0.6])
+    np.testing.assert_allclose(grid.positions(np.array([[10, 20, 0]])), [[1.0, 2.0, 0.0]])
+
+
+def test_locate_grows_until_the_object_is_inside() -> None:
+    field = logits_of(ball((2.5, 0.0, 0.0), 2.0))
+    box = locate(field, BOX)
+    assert (box[0] < [0.5, -2.0, -2.0]).all() and (box[1] > [4.499, 2.0, 2.0]).all()
+    assert (box[1] - box[0]).max() < 6.0, "not much more than the ball"
+
+
+def test_extract_whole_grows_a_side_that_is_touched() -> None:
+    found = extract_whole(logits_of(ball((0.5, 0.0, 0.0), 0.8)), BOX, 24, ("a",), PALETTE[:1])
+    assert not found.grid.touched_sides().any()
+    assert found.surfaces.segments[0].volume == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=0.02)
+
+
+def test_nothing_to_locate() -> None:
+    with pytest.raises(ValueError, match="finds no segment near the cloud.*check the weights"):
+        locate(logits_of(lambda p: np.ones(len(p))), BOX)
+
+
+@pytest.mark.parametrize(
+    "box, resolution, text",
+    [
+        (BOX, 3, "the resolution is 3; at least 4"),
+        (BOX[::-1], 32, "all must be positive"),
+        (BOX * np.nan, 32, "all must be positive and finite"),
+        (BOX, 1000, "resolution 1000 makes a grid of 1001 x 1001 x 1001 nodes"),
+    ],
+)
+def test_impossible_grids(box: np.ndarray, resolution: int, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        _grid(box, resolution)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", shipped_names())
+def test_trained_networks_give_the_dense_labels(name: str, require_asset: object) -> None:
+    """Where labels differ the logits must agree to rounding: batches of other sizes add in another order."""
+    model = load_model(name)
+    if trained_scene(model) == "bunny":
+        require_asset("bunny/bunny.off")  # type: ignore[operator]
+    view = sample_view(load_scene(trained_scene(model)), GenerateConfig(), example_rng(1_000_003, 0))
+    code = model.encode(view.depth.to_points())
+    field: Field = lambda points: model.logits(code, points)  # noqa: E731
+    names, colors = model.names, model.colors
+    fine, dense = (do(field, view.mesh.bounds, 40, names, colors) for do in (extract, extract_dense))
+    odd = np.argwhere(fine.grid.labels != dense.grid.labels)
+    if len(odd):
+        logits = np.sort(field(fine.grid.positions(odd)), axis=1)
+        assert len(odd) < 10 and (logits[:, -1] - logits[:, -2]).max() < 1e-3

@@ -1,0 +1,225 @@
+"""From a cloud to segments, in the input's frame and units, and to files."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from analytic import AnalyticModel, ball, logits_of, union, untrained
+from PIL import Image
+
+import mereo
+from mereo.camera import Camera, PointCloud
+from mereo.frame import inverse_rigid, transform_points
+from mereo.output import write_camera
+from mereo.reconstruction import (
+    Frame,
+    Reconstruction,
+    read_input,
+    reconstruct,
+    reconstruct_file,
+    summarize,
+    write_reconstruction,
+)
+from mereo.scans import scanner_to_camera
+from mereo.weights import save_model
+
+NAMES = ("big", "small", "absent")
+BIG, SMALL = ((0.02, -0.03, 0.6), 0.06), ((0.02, 0.0605, 0.6), 0.03)
+
+
+def front(center: tuple[float, float, float], radius: float, toward: float, count: int = 600) -> np.ndarray:
+    """Points on the half of a sphere on the side of z that ``toward`` names."""
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points[:, 2] = toward * np.abs(points[:, 2])
+    return np.asarray(center) + radius * points
+
+
+def two_balls(points: np.ndarray) -> np.ndarray:
+    nowhere: Callable[[np.ndarray], np.ndarray] = lambda p: np.full(len(p), 1.0)  # noqa: E731
+    return 200.0 * logits_of(ball(*BIG), ball(*SMALL), nowhere)(points)
+
+
+def scene(frame: Frame) -> tuple[np.ndarray, AnalyticModel]:
+    """The two balls as given in ``frame``, and a model that knows them in the camera frame that is made of it."""
+    if frame == "camera":
+        return np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)]), AnalyticModel.of(two_balls, NAMES)
+    cloud = np.concatenate([front(*BIG, 1.0), front(*SMALL, 1.0)])
+    back = inverse_rigid(scanner_to_camera(cloud))
+    return cloud, AnalyticModel.of(lambda points: two_balls(transform_points(back, points)), NAMES)
+
+
+@pytest.fixture(scope="module", params=["camera", "scanner"])
+def found(request: pytest.FixtureRequest) -> tuple[Frame, np.ndarray, Reconstruction]:
+    cloud, model = scene(request.param)
+    return request.param, cloud, reconstruct(cloud, model, resolution=48, frame=request.param)
+
+
+def test_labels_are_the_fields_at_their_positions(found: tuple[Frame, np.ndarray, Reconstruction]) -> None:
+    """Grid, origin and spacing are in the input's frame: every voxel has the label of its own place."""
+    grid = found[2].labels
+    index = np.indices(grid.labels.shape).reshape(3, -1).T
+    expected = two_balls(grid.positions(index)).argmax(axis=1)
+    assert (grid.labels.ravel() != expected).mean() < 1e-4, "rounding on the surface"
+    assert grid.names == NAMES and not found[2].clipped
+
+
+def test_segments_are_where_they_are(found: tuple[Frame, np.ndarray, Reconstruction]) -> None:
+    for segment, surface, (center, radius) in zip(
+        found[2].segments, found[2].surfaces.segments, (BIG, SMALL), strict=False
+    ):
+        np.testing.assert_allclose(segment.centroid, center, atol=0.001)
+        np.testing.assert_allclose(segment.box, np.add(center, [[-radius] * 3, [radius] * 3]), atol=0.0005)
+        assert segment.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.02)
+        assert segment.volume == pytest.approx(surface.volume)
+        assert surface.edge_imbalance() == (0, 0)
+        assert segment.components == 1 and 0.5 < segment.confidence <= 1.0
+        np.testing.assert_allclose(surface.bounds, segment.box, atol=1e-9)
+
+
+def test_an_absent_segment_is_listed(found: tuple[Frame, np.ndarray, Reconstruction]) -> None:
+    absent = found[2].segments[2]
+    assert (absent.name, absent.volume, absent.voxels, absent.components) == ("absent", 0.0, 0, 0)
+    assert np.isnan(absent.confidence) and np.isnan(absent.box).all()
+    assert len(found[2].surfaces.segments[2].faces) == 0
+
+
+def test_components_are_counted_and_nothing_is_removed() -> None:
+    apart = logits_of(union(ball((0.0, 0.0, 5.0), 0.5), ball((0.0, 1.0, 5.0), 0.1), ball((0.8, 0.0, 5.0), 0.04)))
+    cloud = np.concatenate([front((0.0, 0.0, 5.0), 0.5, -1.0), front((0.0, 1.0, 5.0), 0.1, -1.0)])
+    segment = reconstruct(cloud, AnalyticModel.of(apart, ("one",)), resolution=96).segments[0]
+    assert segment.components == 3
+    assert segment.volume == pytest.approx(4 / 3 * np.pi * (0.5**3 + 0.1**3 + 0.04**3), rel=0.02)
+
+
+def test_confidence_is_the_mean_probability() -> None:
+    """Logits of a fixed lead: probability e^3 / (e^3 + 1) everywhere inside."""
+    inside = ball((0.0, 0.0, 5.0), 0.5)
+    model = AnalyticModel.of(
+        lambda p: np.stack([np.zeros(len(p)), np.where(inside(p) < 0, 3.0, -3.0)], axis=1), ("one",)
+    )
+    segment = reconstruct(front((0.0, 0.0, 5.0), 0.5, -1.0), model, resolution=24).segments[0]
+    assert segment.confidence == pytest.approx(np.exp(3) / (1 + np.exp(3)), rel=1e-5)
+
+
+def test_the_unit_of_the_cloud_does_not_matter() -> None:
+    """A factor of two to the ten is exact in floating point, so labels agree bit by bit."""
+    field = logits_of(ball((0.1, 0.2, 0.3), 0.9), ball((0.1, 0.2, 1.5), 0.4), ball((-0.9, -0.4, 0.0), 0.1))
+    cloud, model = scene("camera")[0], AnalyticModel.of(field, NAMES, normalized=True)
+    small, large = (reconstruct(factor * cloud, model, resolution=40) for factor in (1.0, 1024.0))
+    np.testing.assert_array_equal(small.labels.labels, large.labels.labels)
+    np.testing.assert_array_equal(1024.0 * small.labels.spacing, large.labels.spacing)
+    for a, b in zip(small.segments, large.segments, strict=True):
+        assert 1024.0**3 * a.volume == pytest.approx(b.volume, rel=1e-9)
+
+
+def test_files(found: tuple[Frame, np.ndarray, Reconstruction], tmp_path: Path) -> None:
+    frame, cloud, result = found
+    write_reconstruction(result, PointCloud(cloud), tmp_path / "out", frame=frame, title="two balls")
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "labels.npz",
+        "preview.png",
+        "report.html",
+        "segments.glb",
+        "summary.json",
+    ]
+    with np.load(tmp_path / "out/labels.npz") as stored:
+        np.testing.assert_array_equal(stored["labels"], result.labels.labels)
+        np.testing.assert_array_equal(stored["origin"], result.labels.origin)
+        assert tuple(stored["names"]) == NAMES
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert [(s["name"], s["volume"] > 0) for s in summary["segments"]] == [("big", 1), ("small", 1), ("absent", 0)]
+    assert summary["segments"][2]["confidence"] is None and summary["frame"] == frame
+    assert set(summary["timings_s"]) == {"encode", "locate", "extract", "measure", "write"}
+    loaded = trimesh.load_scene(tmp_path / "out/segments.glb")
+    assert set(loaded.geometry) == {"big", "small"}
+    np.testing.assert_allclose(loaded.geometry["big"].vertices.mean(axis=0), BIG[0], atol=0.002)
+    # the root node turns the frame for viewers: y up in both cases, z toward the viewer
+    place = loaded.graph.get("big")[0] @ [*BIG[0], 1.0]
+    np.testing.assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
+
+
+def test_an_existing_result_is_kept(found: tuple[Frame, np.ndarray, Reconstruction], tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine.txt").write_text("keep")
+    with pytest.raises(FileExistsError, match="choose another --output or pass --force"):
+        write_reconstruction(found[2], PointCloud(found[1]), tmp_path / "out")
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", "mine.txt"]
+
+
+def test_from_file_to_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cloud, model = scene("camera")
+    monkeypatch.setattr("mereo.reconstruction.load_model", lambda _: model)
+    np.save(tmp_path / "cloud.npy", cloud)
+    result = reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "out", resolution=16)
+    assert summarize(result)["segments"][0]["name"] == "big"
+    assert (tmp_path / "out/report.html").is_file()
+    assert "wrote" in capsys.readouterr().out
+    with pytest.raises(FileExistsError):
+        reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "out", resolution=16)
+
+
+def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
+    save_model(untrained(NAMES), tmp_path / "w.safetensors")
+    np.save(tmp_path / "cloud.npy", scene("camera")[0][:5])
+    with pytest.raises(ValueError, match="the cloud has 5 points; the encoder needs at least 32"):
+        reconstruct_file(tmp_path / "cloud.npy", tmp_path / "w.safetensors", tmp_path / "deep/out")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.npy", "w.safetensors"]
+
+
+def test_an_empty_field_is_said_so() -> None:
+    model = AnalyticModel.of(logits_of(lambda p: np.ones(len(p))), ("one",))
+    with pytest.raises(ValueError, match="the model finds no segment near the cloud"):
+        reconstruct(scene("camera")[0], model)
+
+
+# --- input -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_depth_image_becomes_the_points_it_shows(tmp_path: Path) -> None:
+    camera = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
+    write_camera(tmp_path / "k.json", camera)
+    depth = np.zeros((10, 20), dtype=np.uint16)
+    depth[2:7, 5:15] = 2500
+    Image.fromarray(depth).save(tmp_path / "d.png")
+    points = read_input(tmp_path / "d.png", tmp_path / "k.json", depth_scale=5000.0).points
+    assert len(points) == 50
+    np.testing.assert_allclose(points[:, 2], 0.5)
+    np.testing.assert_allclose(camera.project(points)[0], [5.5, 2.5])
+
+
+@pytest.mark.parametrize(
+    "name, options, text",
+    [
+        ("d.png", {}, "is a depth image without intrinsics; they are needed: give --intrinsics FILE"),
+        ("d.png", {"intrinsics": "k.json", "frame": "scanner"}, "those are always in the camera frame"),
+        ("c.ply", {"intrinsics": "k.json"}, "is read as a point cloud; leave out the intrinsics and the mask"),
+        ("c.ply", {"mask": "m.png"}, "is read as a point cloud; leave out the intrinsics and the mask"),
+    ],
+)
+def test_contradictory_inputs(name: str, options: dict[str, str], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        read_input(Path(name), **options)  # type: ignore[arg-type]
+
+
+# --- the package -----------------------------------------------------------------------------------------------------
+
+
+def test_every_public_name_exists() -> None:
+    for name in mereo.__all__:
+        assert getattr(mereo, name) is not None
+    assert set(mereo.__all__) <= set(dir(mereo))
+    with pytest.raises(AttributeError, match="module 'mereo' has no attribute 'reconstrukt'"):
+        mereo.reconstrukt  # noqa: B018
+
+
+def test_importing_the_package_is_instant_and_loads_nothing() -> None:
+    code = "import sys, mereo; print(sorted({'torch', 'numpy', 'scipy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
