@@ -17,6 +17,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.mesh import Segment, SegmentedMesh
+from mereo.winding import winding_grid
 
 _DIRECTIONS = np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32)
 """Two generic directions: not along any axis, face diagonal or each other."""
@@ -25,7 +26,7 @@ _DEVICE = rtcore.EmbreeDevice()
 
 
 def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> EmbreeScene:
-    """An Embree scene of one triangle mesh; it works in single precision, so keep coordinates near the origin."""
+    """An Embree scene of one triangle mesh. It works in single precision: keep coordinates near the origin."""
     scene = EmbreeScene(_DEVICE)
     TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
     return scene
@@ -77,9 +78,26 @@ class _Solid:
         behind = np.stack([normal @ direction for normal, direction in zip(normals, _DIRECTIONS, strict=True)]) > 0
         return behind & (hits["primID"].reshape(2, -1) >= 0)
 
-    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        squared, _, _ = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
-        return np.sqrt(squared)
+    def first_hit(
+        self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, " n"]:
+        """Ray parameter of the nearest hit, infinite where there is none."""
+        single = np.ascontiguousarray(directions, dtype=np.float32)
+        origins = np.broadcast_to((origin - self.center).astype(np.float32), single.shape).copy()
+        hits = self.rays.run(origins, single, output=True)
+        return np.where(hits["primID"] >= 0, hits["tfar"], np.inf).astype(np.float64)
+
+    def closest(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """Squared distance to the surface, face and place of the closest surface point."""
+        squared, face, place = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
+        return squared, face.astype(np.int64), place  # libigl's faces are C's long long, which numpy tells apart
+
+    def squared_distance_to_box(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """At most the squared distance to the surface, for points outside the box; 0 inside it."""
+        outside = np.maximum(np.maximum(self.low - points, points - self.high), 0.0)
+        return np.einsum("ij,ij->i", outside, outside)
 
 
 class Nearest(NamedTuple):
@@ -110,12 +128,8 @@ class Solids:
         self._solids = [_Solid(segment) for segment in mesh.segments]
 
     @cached_property
-    def _surface(self) -> tuple[igl.AABB, np.ndarray, np.ndarray, np.ndarray]:
-        vertices, faces, owner = self.mesh.merged()
-        vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
-        tree = igl.AABB()
-        tree.init(vertices, faces)
-        return tree, vertices, faces, owner
+    def _merged(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, " f"]]:
+        return self.mesh.merged()
 
     def boxes(self) -> Float[np.ndarray, "s 2 3"]:
         """Axis-aligned box of each segment."""
@@ -138,14 +152,31 @@ class Solids:
 
     def segment_distance(self, index: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Unsigned distance to segment ``index``'s surface."""
-        return self._solids[index].distance(points)
+        return np.sqrt(self._solids[index].closest(points)[0])
 
     def nearest(self, points: Float[np.ndarray, "n 3"]) -> Nearest:
         """The closest point over the surfaces of all segments."""
-        tree, vertices, faces, owner = self._surface
-        squared, face, closest = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
-        face = face.astype(np.int64)  # libigl's is C's long long, which numpy tells apart
-        return Nearest(np.sqrt(squared), closest, face, owner[face])
+        bounds = np.stack([solid.squared_distance_to_box(points) for solid in self._solids])
+        likely = bounds.argmin(axis=0)
+        squared, place = np.full(len(points), np.inf), np.empty_like(points)
+        face, owner = np.empty(len(points), dtype=np.int64), np.empty(len(points), dtype=np.int64)
+        first_faces = np.cumsum([0, *(len(solid.faces) for solid in self._solids)])
+        # first the segment whose box is nearest, then those whose boxes are nearer than what it gave: one to two each
+        for again in (False, True):
+            for index, solid in enumerate(self._solids):
+                rows = np.flatnonzero((likely != index) & (bounds[index] < squared) if again else likely == index)
+                found, faces, places = solid.closest(points[rows])
+                nearer = found < squared[rows]
+                kept = rows[nearer]
+                squared[kept], place[kept], owner[kept] = found[nearer], places[nearer], index
+                face[kept] = first_faces[index] + faces[nearer]
+        return Nearest(np.sqrt(squared), place, face, owner)
+
+    def first_hit(
+        self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, " n"]:
+        """For rays ``origin + t * direction`` the smallest t > 0 on any surface; infinite where nothing is hit."""
+        return np.minimum.reduce([solid.first_hit(origin, directions) for solid in self._solids])
 
     def nearest_segment(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
         """The segment whose surface is nearest."""
@@ -153,7 +184,7 @@ class Solids:
 
     def face_normals(self, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Unit normals of faces of ``mesh.merged()``."""
-        _, vertices, faces, _ = self._surface
+        vertices, faces, _ = self._merged
         a, b, c = (vertices[faces[face, i]] for i in range(3))
         normal = np.cross(b - a, c - a)
         return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
@@ -183,10 +214,8 @@ def label_grid(
 ) -> UInt8[np.ndarray, "nx ny nz"]:
     """Exact labels on the product grid of three ascending coordinate arrays; the first segment wins an overlap.
 
-    Instead of a test per node, every triangle is projected onto the (x, y) columns it covers; along each column the
-    signed crossings below a node add up to the winding number there. A column through an edge or a vertex counts as
-    one beside it, the same one for all triangles, so a closed segment has no cracks; a node exactly on a surface
-    has the label of the node just above it.
+    Signed crossings are counted along columns instead of testing every node, see ``winding``: a closed segment has no
+    cracks, and a node exactly on a surface has the label of the node just above it.
     """
     labels = np.zeros((len(x), len(y), len(z)), dtype=np.uint8)
     for index, segment in enumerate(mesh.segments):
@@ -198,64 +227,8 @@ def label_grid(
             continue
         box = tuple(slice(low, high) for low, high in zip(lows, highs, strict=True))
         block = labels[box]
-        block[(block == 0) & _winding_grid(segment, x[box[0]], y[box[1]], z[box[2]])] = index + 1
+        block[(block == 0) & winding_grid(segment, x[box[0]], y[box[1]], z[box[2]])] = index + 1
     return labels
-
-
-def _winding_grid(
-    segment: Segment, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
-) -> Bool[np.ndarray, "nx ny nz"]:
-    corners = segment.vertices[segment.faces]
-    triangle, i, j = _covered_columns(corners[..., :2], x, y)
-    weights, left = _edge_sides(corners[triangle][..., :2], segment.faces[triangle], x[i], y[j])
-    hit = np.flatnonzero(left.all(axis=1) | ~left.any(axis=1))
-    # counter-clockwise in the projection: on the way up the column leaves the solid here
-    step = np.where(left[hit, 0], -1, 1)
-    heights, weights = corners[triangle[hit]][..., 2], weights[hit]
-    height = (weights * heights).sum(axis=1) / weights.sum(axis=1)
-    height = np.clip(height, heights.min(axis=1), heights.max(axis=1))  # so that level faces stay level
-    crossings = np.zeros((len(x), len(y), len(z) + 1), dtype=np.int32)
-    np.add.at(crossings, (i[hit], j[hit], np.searchsorted(z, height)), step)
-    return crossings.cumsum(axis=2)[..., :-1] > 0
-
-
-def _edge_sides(
-    corners: Float[np.ndarray, "p 3 2"],
-    ids: Int[np.ndarray, "p 3"],
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
-) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, "p 3"]]:
-    """Barycentric weights (not normalized) of columns in triangles, and whether each is left of the opposite edge.
-
-    All triangles of an edge evaluate it from its lower vertex and so agree bit for bit. A column exactly on the edge
-    is moved by (e, e^2), e infinitely small (Edelsbrunner and Muecke's simulation of simplicity): then vertices too
-    are on one side of everything.
-    """
-    weights, left = np.empty((len(x), 3)), np.empty((len(x), 3), dtype=bool)
-    for k in range(3):
-        a, b = (k + 1) % 3, (k + 2) % 3
-        swap = ids[:, a] > ids[:, b]
-        start = np.where(swap[:, None], corners[:, b], corners[:, a])
-        edge = np.where(swap[:, None], corners[:, a], corners[:, b]) - start
-        value = edge[:, 0] * (y - start[:, 1]) - edge[:, 1] * (x - start[:, 0])
-        moved = (edge[:, 1] < 0) | ((edge[:, 1] == 0) & (edge[:, 0] > 0))
-        left[:, k] = np.where(value == 0, moved, value > 0) ^ swap
-        weights[:, k] = np.where(swap, -value, value)
-    return weights, left
-
-
-def _covered_columns(
-    corners: Float[np.ndarray, "f 3 2"], x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"]
-) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Pairs (triangle, column i, column j) whose column lies in the triangle's projected box."""
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    first_i, first_j = np.searchsorted(x, low[:, 0]), np.searchsorted(y, low[:, 1])
-    count_i = np.searchsorted(x, high[:, 0], "right") - first_i
-    count_j = np.searchsorted(y, high[:, 1], "right") - first_j
-    pairs = count_i * count_j
-    triangle = np.repeat(np.arange(len(corners)), pairs)
-    number = np.arange(len(triangle)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
-    return triangle, first_i[triangle] + number // count_j[triangle], first_j[triangle] + number % count_j[triangle]
 
 
 def check_overlap(mesh: SegmentedMesh, tolerance: float = 1e-3, cells: int = 64) -> None:

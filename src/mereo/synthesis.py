@@ -93,11 +93,10 @@ def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator)
     Raises:
         ValueError: no random view sees the object, or a segment cannot be sampled (``query_sampling``).
     """
-    view = sample_view(scene, settings, rng)
+    view, solids = _sample_view(scene, settings, rng)
     points = view.depth.to_points().points
     normalizer = Normalizer.fit(points)
     cloud = normalizer.apply(points)
-    solids = Solids(view.mesh)
     samples = sample_queries(solids, settings.sampling, rng)
     return Example(
         cloud=cloud[farthest_point_order(cloud, settings.points)],
@@ -111,14 +110,20 @@ def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator
 
     Raises ``ValueError`` naming the scene after ``ATTEMPTS`` such views.
     """
+    return _sample_view(scene, settings, rng)[0]
+
+
+def _sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> tuple[View, Solids]:
+    """The view, and the search structures on its mesh that rendering has built."""
     camera = Camera.from_fov(settings.image_size, settings.image_size, scene.workspace.fov_rad)
     for _ in range(ATTEMPTS):
         state = scene.sample_state(rng)
         T_world_camera = scene.workspace.sample(rng, state.mesh.bounds.mean(axis=0))
         mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
-        depth = add_depth_noise(render_depth(mesh, camera), settings.noise_std, rng)
+        solids = Solids(mesh)
+        depth = add_depth_noise(render_depth(solids, camera), settings.noise_std, rng)
         if depth.valid.sum() >= MIN_POINTS:
-            return View(mesh, depth, T_world_camera, state.deformations)
+            return View(mesh, depth, T_world_camera, state.deformations), solids
     raise ValueError(
         f"scene {scene.name!r} showed fewer than {MIN_POINTS} points in {ATTEMPTS} random views; "
         "its camera workspace must see the object: check its distance and field of view"
