@@ -200,6 +200,7 @@ class Evaluate:
         examples: how many.
         seed: test seeds start at 1,000,000.
         scene: the scene, where it is not the one that the weights were trained on.
+        scans: score the four real range scans of the bunny, whose poses are known, instead of rendered views.
     """
 
     weights: Positional[str]
@@ -207,10 +208,16 @@ class Evaluate:
     examples: int = 128
     seed: int = 1_000_000
     scene: str | None = None
+    scans: bool = False
 
     def run(self) -> None:
-        from mereo.evaluation import evaluate_weights
+        from mereo.evaluation import evaluate_scans, evaluate_weights, markdown_table
 
+        if self.scans:
+            from mereo.weights import load_model
+
+            print(markdown_table(evaluate_scans(load_model(self.weights), self.output)))
+            return
         evaluate_weights(self.weights, self.output, examples=self.examples, seed=self.seed, scene=self.scene)
 
 

@@ -1,0 +1,173 @@
+"""What a user sees after a mistake: one line that says value, rule and cure, exit code 2, and nothing half-written."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import save_file
+
+from mereo import __main__ as command_line
+from mereo.config import PRESETS
+from mereo.mesh import Segment, SegmentedMesh, check_segment
+from mereo.model import Model, Network
+from mereo.solid import check_overlap
+from mereo.weights import load_model, save_model
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
+    network = Network(PRESETS["tiny"].network, 2).eval()
+    save_model(Model(network, ("a", "b"), ((1, 2, 3), (4, 5, 6))), path)
+    return path
+
+
+def sphere(radius: float = 1.0, center: tuple[float, float, float] = (0.0, 0.0, 0.0), name: str = "ball") -> Segment:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(3, radius)
+    return Segment(name, (1, 2, 3), np.asarray(ball.vertices + np.array(center)), np.asarray(ball.faces, np.int64))
+
+
+def refused(capsys: pytest.CaptureFixture[str], folder: Path, text: str, *arguments: object) -> None:
+    """The command fails with one line that contains ``text`` and makes no output."""
+    before = sorted(folder.rglob("*"))
+    code = command_line.main([str(a) for a in arguments])
+    message = capsys.readouterr().err.strip()
+    assert code == 2, message
+    assert message.startswith("mereo: error: ") and "\n" not in message, message
+    assert text in message, message
+    assert sorted(folder.rglob("*")) == before
+
+
+def cloud(count: int = 200) -> np.ndarray:
+    return np.random.default_rng(0).normal(loc=(0.0, 0.0, 20.0), size=(count, 3))
+
+
+BAD_CLOUDS = {
+    "missing": (None, "missing.npy"),
+    "too few": (cloud(20), "has 20 points; the encoder needs at least 32"),
+    "nan": (np.where(np.arange(600).reshape(-1, 3) == 7, np.nan, cloud()), "NaN"),
+    "behind": (cloud() - [0.0, 0.0, 40.0], "behind the camera"),
+    "one place": (np.ones((100, 3)), "all points coincide"),
+    "two columns": (cloud()[:, :2], "3"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CLOUDS)
+def test_bad_clouds(case: str, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points, text = BAD_CLOUDS[case]
+    path = tmp_path / "missing.npy"
+    if points is not None:
+        np.save(path, points)
+    refused(capsys, tmp_path, text, "reconstruct", path, "--weights", weights, "--output", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("content", "text"), [(b"", "empty"), (b"ply\nformat ascii 1.0\nelement vertex 99\n", "cloud.ply")]
+)
+def test_broken_files(
+    content: bytes, text: str, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(content)
+    refused(capsys, tmp_path, text, "reconstruct", path, "--weights", weights, "--output", tmp_path / "out")
+
+
+def test_bad_depth_images(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image, camera = tmp_path / "depth.png", tmp_path / "camera.json"
+    camera.write_text(json.dumps({"fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, "width": 64, "height": 48}))
+    command = ("reconstruct", image, "--weights", weights, "--output", tmp_path / "out")
+    Image.fromarray(np.full((48, 64), 900, dtype=np.uint16)).save(image)
+    refused(capsys, tmp_path, "without intrinsics", *command)
+    # metres taken for millimetres: everything would be 0.9 km away
+    refused(capsys, tmp_path, "--depth-scale", *command, "--intrinsics", camera, "--depth-scale", 1)
+    Image.fromarray(np.zeros((48, 64), dtype=np.uint16)).save(image)
+    refused(capsys, tmp_path, "measures 0 pixels", *command, "--intrinsics", camera)
+    camera.write_text(json.dumps({"fx": -60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, "width": 64, "height": 48}))
+    refused(capsys, tmp_path, "focal length", *command, "--intrinsics", camera)
+
+
+def test_bad_weights(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "cloud.npy", cloud())
+    bad = tmp_path / "bad.safetensors"
+    command = ("reconstruct", tmp_path / "cloud.npy", "--weights", bad, "--output", tmp_path / "out")
+    refused(capsys, tmp_path, "there are no weights", *command)
+    bad.write_bytes(b"not weights at all")
+    refused(capsys, tmp_path, "is not a safetensors file", *command)
+    bad.write_bytes(weights.read_bytes()[:3000])
+    refused(capsys, tmp_path, "is not a safetensors file", *command)
+    save_file({"x": torch.zeros(1)}, bad)
+    refused(capsys, tmp_path, "no mereo header", *command)
+    save_file({"x": torch.zeros(1)}, bad, metadata={"mereo": json.dumps({"version": 99})})
+    refused(capsys, tmp_path, "weights format 99; this mereo reads format 1", *command)
+
+
+def test_an_existing_output_is_kept(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "cloud.npy", cloud())
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("precious")
+    command = ("reconstruct", tmp_path / "cloud.npy", "--weights", weights, "--output", tmp_path / "out")
+    refused(capsys, tmp_path, "exists and is not empty", *command)
+
+
+def test_test_seeds_are_not_for_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ("generate", "rope", "--examples", 4, "--seed", 1_000_000, "--output", tmp_path / "data")
+    refused(capsys, tmp_path, "for testing", *command)
+
+
+def test_bad_segments_are_named_with_the_cure() -> None:
+    ball = sphere()
+    cases = {
+        r"segment 'ball' has 3 open edges; it must be closed: fill its holes": replace(ball, faces=ball.faces[1:]),
+        r"segment 'ball' has volume -.*it must be positive.*reverse them": replace(ball, faces=ball.faces[:, ::-1]),
+        r"edges whose faces disagree in orientation": replace(
+            ball, faces=np.concatenate([ball.faces[:1, ::-1], ball.faces[1:]])
+        ),
+        r"NaN or infinite vertices": replace(ball, vertices=np.where(ball.vertices > 0.99, np.nan, ball.vertices)),
+        r"refers to vertex 700 of 642": replace(ball, faces=np.concatenate([ball.faces, [[0, 1, 700]]])),
+        r"has no faces": replace(ball, faces=ball.faces[:0]),
+    }
+    check_segment(ball)
+    for text, segment in cases.items():
+        with pytest.raises(ValueError, match=text):
+            check_segment(segment)
+
+
+def test_overlapping_segments_are_named() -> None:
+    apart = SegmentedMesh((sphere(), sphere(center=(2.1, 0, 0), name="other")))
+    check_overlap(apart)
+    crossing = SegmentedMesh((sphere(), sphere(center=(1.0, 0, 0), name="other")))
+    with pytest.raises(
+        ValueError, match=r"segments '\w+' and '\w+' overlap in .* 31 % of .*subtract one from the other"
+    ):
+        check_overlap(crossing)  # two unit balls one radius apart share 5/16 of each
+
+
+def test_segment_names_are_unique_and_few() -> None:
+    with pytest.raises(ValueError, match="'ball' is used twice"):
+        SegmentedMesh((sphere(), sphere()))
+    with pytest.raises(ValueError, match="0 segments"):
+        SegmentedMesh(())
+    with pytest.raises(ValueError, match="at most 254"):
+        SegmentedMesh(tuple(replace(sphere(), name=str(i)) for i in range(255)))
+
+
+def test_weights_come_back_as_they_were(weights: Path) -> None:
+    model = load_model(weights)
+    assert model.names == ("a", "b") and model.colors == ((1, 2, 3), (4, 5, 6))
+    assert model.network.config == PRESETS["tiny"].network and not model.network.training
+
+
+def test_half_precision_weights_answer_alike(weights: Path, tmp_path: Path) -> None:
+    model = load_model(weights)
+    save_model(model, tmp_path / "half.safetensors", torch.float16)
+    half = load_model(tmp_path / "half.safetensors")
+    points = cloud()
+    full, rounded = (m.query(m.encode(points), points[:50]).probability for m in (model, half))
+    assert np.abs(full - rounded).max() < 0.02
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * weights.stat().st_size
