@@ -5,6 +5,7 @@ Two frames, rendered from test seeds, come with the package, so that a fresh clo
 
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool
@@ -117,9 +118,10 @@ def load_frame(name: str | Path) -> Frame:
         known = ", ".join(shipped_frames()) or "none"
         raise FileNotFoundError(f"there is no frame {str(name)!r}; give a .npz file or a shipped name: {known}")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # opened here because numpy leaves a damaged file open
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             return _frame({key: file[key] for key in file.files})
-    except (KeyError, ValueError, OSError, EOFError) as error:
+    except (KeyError, ValueError, OSError, EOFError, BadZipFile) as error:
         raise ValueError(f"{path} is not a frame of mereo ({error}); write it with mereo.frames.save_frame") from None
 
 
