@@ -1,6 +1,6 @@
 """How fast complete examples are made, against a straightforward implementation with trimesh and embreex.
 
-    python benchmarks/generation.py [SCENE ...] [--examples N]     # needs: pip install rtree
+    python benchmarks/generation.py [SCENE ...] [--examples N]
 
 Both make the same thing at the paper's settings: a random state seen by a random camera, a noisy depth image,
 SortSample queries with labels, signed distances and directions. The rival uses trimesh's own functions, as its
