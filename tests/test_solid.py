@@ -91,7 +91,6 @@ def test_nearest_over_all_segments_is_the_least_of_each_segments_distance() -> N
     found = solids.nearest(points)
     assert np.allclose(found.distance, each.min(axis=0))
     assert np.array_equal(found.owner, each.argmin(axis=0))
-    assert np.array_equal(solids.nearest_segment(points), found.owner)
     assert np.allclose(np.linalg.norm(found.point - points, axis=1), found.distance)
 
 

@@ -178,10 +178,6 @@ class Solids:
         """For rays ``origin + t * direction`` the smallest t > 0 on any surface; infinite where nothing is hit."""
         return np.minimum.reduce([solid.first_hit(origin, directions) for solid in self._solids])
 
-    def nearest_segment(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-        """The segment whose surface is nearest."""
-        return self.nearest(points).owner
-
     def face_normals(self, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Unit normals of faces of ``mesh.merged()``."""
         vertices, faces, _ = self._merged

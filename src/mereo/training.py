@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -87,7 +88,7 @@ class Trainer:
         """Process 0 decides for all: clocks differ, and validation is collective."""
         if self.process.world == 1:
             return wish
-        flag = torch.tensor([float(wish)])
+        flag = torch.tensor([float(wish)], device=self.device)
         dist.broadcast(flag, src=0)
         return bool(flag.item())
 
@@ -96,7 +97,7 @@ class Trainer:
         per_process = self.config.batch // self.process.world
         while self.step < self.total:
             index = self._batch_index(self.step)[self.process.rank * per_process :][:per_process]
-            rng = torch.Generator().manual_seed(_mix(self.config.seed, self.step, self.process.rank))
+            rng = torch.Generator().manual_seed(_seed(self.config.seed, self.step, self.process.rank))
             yield self.data.batch(index, self.config.network.points, self.config.queries, self.config.augment, rng)
 
     def _batch_index(self, step: int) -> Tensor:
@@ -106,7 +107,7 @@ class Trainer:
         passes = {p // self.examples for p in positions}
         orders = {
             number: torch.randperm(
-                self.examples, generator=torch.Generator().manual_seed(_mix(self.config.seed, number, 1 << 20))
+                self.examples, generator=torch.Generator().manual_seed(_seed(self.config.seed, number, 1 << 20))
             )
             for number in passes
         }
@@ -237,9 +238,6 @@ def _parameter_groups(network: nn.Module, config: TrainConfig) -> list[dict[str,
     return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
 
 
-def _mix(*numbers: int) -> int:
+def _seed(*numbers: int) -> int:
     """One 63-bit seed from several numbers."""
-    mixed = 0x9E3779B97F4A7C15
-    for number in numbers:
-        mixed = ((mixed ^ number) * 0xBF58476D1CE4E5B9 + 0x94D049BB133111EB) & 0x7FFFFFFFFFFFFFFF
-    return mixed
+    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
