@@ -64,7 +64,7 @@ def main(output: str | Path = Path("out/demo")) -> None:
         try:
             case = make()
         except AssetUnavailable as error:
-            console.print(f"The real scan {REAL_SCAN} is left out: {error}\n", highlight=False)
+            console.print(f"The real scan {REAL_SCAN} is left out: {error}\n", highlight=False, soft_wrap=True)
             continue
         _show(case, model(case.weights), Path(output) / case.name, console)
     console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
@@ -107,7 +107,8 @@ def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
     console.print(_table(case, result, scores))
     stages = {**result.timings_s, "write": written_s}
     seconds = ", ".join(f"{stage} {value:.1f} s" for stage, value in stages.items())
-    console.print(f"{len(case.cloud)} points; {seconds}; look at {folder / 'report.html'}\n", highlight=False)
+    console.print(f"{len(case.cloud)} points; {seconds}", highlight=False, soft_wrap=True)
+    console.print(f"look at {folder / 'report.html'}\n", highlight=False, soft_wrap=True)
 
 
 def _table(case: Case, result: Reconstruction, scores: Scores) -> Table:

@@ -251,6 +251,7 @@ def print_segments(result: Reconstruction, title: str) -> None:
         table.add_row(found.name, *(row if found.voxels else ("0", "not found", "0", "")))
     console = Console()
     console.print(table)
-    console.print("seconds: " + ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in result.timings_s.items()))
+    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in result.timings_s.items())
+    console.print(f"seconds: {stages}", highlight=False, soft_wrap=True)
     if result.clipped:
         console.print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")
