@@ -20,7 +20,7 @@ def main(cloud_path: str | None = None, output: str = "out/example", weights: st
         x, y, z = segment.centroid
         print(f"{segment.name:<12} at ({x:.3f}, {y:.3f}, {z:.3f})  confidence {segment.confidence:.2f}")
     mereo.write_reconstruction(result, cloud, output, force=True)
-    print(f"open {Path(output) / 'report.html'}")
+    print(f"wrote {output}; open {Path(output) / 'report.html'}")
 
 
 if __name__ == "__main__":

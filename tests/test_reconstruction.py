@@ -5,7 +5,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from runpy import run_path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from PIL import Image
 import mereo
 from mereo.camera import Camera, PointCloud
 from mereo.frame import inverse_rigid, transform_points
-from mereo.frames import shipped_frames
 from mereo.output import write_camera
 from mereo.reconstruction import (
     Frame,
@@ -28,7 +26,7 @@ from mereo.reconstruction import (
     write_reconstruction,
 )
 from mereo.scans import scanner_to_camera
-from mereo.weights import save_model, shipped_names
+from mereo.weights import save_model
 
 NAMES = ("big", "small", "absent")
 BIG, SMALL = ((0.02, -0.03, 0.6), 0.06), ((0.02, 0.0605, 0.6), 0.03)
@@ -209,19 +207,6 @@ def test_a_depth_image_becomes_the_points_it_shows(tmp_path: Path) -> None:
 def test_contradictory_inputs(name: str, options: dict[str, str], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         read_input(Path(name), **options)  # type: ignore[arg-type]
-
-
-# --- examples --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif("bunny" not in shipped_names() or "bunny" not in shipped_frames(), reason="nothing is shipped")
-def test_examples_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = Path(__file__).parents[1] / "examples"
-    run_path(str(folder / "query_points.py"))["main"](queries=50)
-    run_path(str(folder / "reconstruct_cloud.py"))["main"](output=str(tmp_path / "out"))
-    out = capsys.readouterr().out
-    assert "50 points in" in out and "ear_left     at (" in out
-    assert (tmp_path / "out/segments.glb").is_file()
 
 
 # --- the package -----------------------------------------------------------------------------------------------------
