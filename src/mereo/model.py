@@ -26,8 +26,8 @@ MIN_POINTS = 32
 DENSE_FACTOR = 8
 """Clouds this many times denser than the network's input are thinned at random first: ordering all is quadratic."""
 
-QUERY_CHUNK = 32768
-"""Queries evaluated at once: bounds memory without costing speed."""
+CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 4096, 65536
+"""Queries evaluated at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
 
 
 class Network(nn.Module):
@@ -155,10 +155,11 @@ class Model:
         answer: Callable[[Prediction], tuple[Tensor, ...]],
     ) -> list[np.ndarray]:
         normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
+        size = CUDA_QUERY_CHUNK if self.device.type == "cuda" else CPU_QUERY_CHUNK
         chunks = []
         with torch.inference_mode():
-            for start in range(0, max(len(normalized), 1), QUERY_CHUNK):
-                queries = torch.from_numpy(normalized[start : start + QUERY_CHUNK])[None].to(self.device)
+            for start in range(0, max(len(normalized), 1), size):
+                queries = torch.from_numpy(normalized[start : start + size])[None].to(self.device)
                 chunks.append([part[0].cpu() for part in answer(self.network.query(code.code, queries))])
         return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
 
