@@ -78,6 +78,17 @@ class Dataset:
             manifest=manifest,
         )
 
+    def domain(self, margin: float = 0.15) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Lower and upper corner of where segments occur in the normalized training data, widened on each side.
+
+        Beyond it the network has hardly been told anything, so a model answers "empty" there.
+        """
+        occupied = self.positions[self.labels > 0]
+        low, high = occupied.amin(dim=0), occupied.amax(dim=0)
+        widen = margin * (high - low)
+        (x0, y0, z0), (x1, y1, z1) = (low - widen).tolist(), (high + widen).tolist()
+        return (x0, y0, z0), (x1, y1, z1)
+
     def batch(
         self,
         index: Int[Tensor, " b"],

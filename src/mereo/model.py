@@ -23,11 +23,19 @@ from mereo.ordering import farthest_point_order
 MIN_POINTS = 32
 """Fewer observed points say too little about an object; training views with fewer are drawn again."""
 
+SURE_LOGIT = 20.0
+"""Lead of empty space where there can be nothing; trained networks reach about this in plainly empty space."""
+
 DENSE_FACTOR = 8
 """Clouds this many times denser than the network's input are thinned at random first: ordering all is quadratic."""
 
 CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 4096, 65536
 """Queries evaluated at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
+
+
+Vector = tuple[float, float, float]
+Box = tuple[Vector, Vector]
+"""Lower and upper corner."""
 
 
 class Network(nn.Module):
@@ -95,6 +103,8 @@ class Model:
         names, colors: of the segments; label i + 1 is names[i].
         provenance: how it was trained: scene, seeds, dataset, recipe, versions.
         loss: the terms it was trained with; "l1" alone knows inside from outside but no segments.
+        domain: normalized box outside which everything is answered as empty: nothing was ever there in training, and
+            a network may say anything where it was never corrected. None means no limit.
     """
 
     network: Network
@@ -102,6 +112,7 @@ class Model:
     colors: tuple[Color, ...]
     loss: str = "ce+l1"
     provenance: dict[str, object] = field(default_factory=dict)
+    domain: Box | None = None
 
     @property
     def device(self) -> torch.device:
@@ -125,8 +136,8 @@ class Model:
     def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
         """Segment, probabilities, signed distance and direction at each point."""
 
-        def answer(prediction: Prediction) -> tuple[Tensor, Tensor, Tensor]:
-            logits = self._class_logits(prediction)
+        def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            logits = self._class_logits(prediction, queries)
             direction = nn.functional.normalize(prediction.direction, dim=-1)
             return logits.softmax(dim=-1), prediction.distance, direction
 
@@ -140,19 +151,26 @@ class Model:
 
     def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
         """Class logits only: what surface extraction needs."""
-        return self._chunked(code, points, lambda prediction: (self._class_logits(prediction),))[0]
+        return self._chunked(code, points, lambda *found: (self._class_logits(*found),))[0]
 
-    def _class_logits(self, prediction: Prediction) -> Tensor:
-        if "ce" in self.loss:
-            return prediction.logits
-        # trained on distances alone: inside is one class, and -distance its margin (paper, section 4.4)
-        return torch.stack([prediction.distance, -prediction.distance], dim=-1)
+    def _class_logits(self, prediction: Prediction, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q c"]:
+        logits = prediction.logits
+        if "ce" not in self.loss:
+            # trained on distances alone: inside is one class, and -distance its margin (paper, section 4.4)
+            logits = torch.stack([prediction.distance, -prediction.distance], dim=-1)
+        if self.domain is None:
+            return logits
+        low, high = torch.tensor(self.domain, device=queries.device)
+        outside = ((queries < low) | (queries > high)).any(dim=-1)
+        surely_empty = torch.zeros_like(logits[0, 0])
+        surely_empty[0] = SURE_LOGIT
+        return torch.where(outside[..., None], surely_empty, logits)
 
     def _chunked(
         self,
         code: EncodedCloud,
         points: Float[np.ndarray, "n 3"],
-        answer: Callable[[Prediction], tuple[Tensor, ...]],
+        answer: Callable[[Prediction, Tensor], tuple[Tensor, ...]],
     ) -> list[np.ndarray]:
         normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
         size = CUDA_QUERY_CHUNK if self.device.type == "cuda" else CPU_QUERY_CHUNK
@@ -160,7 +178,7 @@ class Model:
         with torch.inference_mode():
             for start in range(0, max(len(normalized), 1), size):
                 queries = torch.from_numpy(normalized[start : start + size])[None].to(self.device)
-                chunks.append([part[0].cpu() for part in answer(self.network.query(code.code, queries))])
+                chunks.append([part[0].cpu() for part in answer(self.network.query(code.code, queries), queries)])
         return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
 
 

@@ -218,6 +218,7 @@ class Trainer:
             colors=tuple(tuple(s["color"]) for s in manifest["segments"]),
             loss=self.config.loss,
             provenance=provenance,
+            domain=self.data.domain(),
         )
 
     def resume(self) -> bool:

@@ -23,6 +23,7 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
         "colors": model.colors,
         "loss": model.loss,
         "normalizer": "center and half of the longest side of the observed cloud's box",
+        "domain": model.domain,
         "provenance": model.provenance,
     }
     tensors = {
@@ -86,4 +87,5 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
         colors=tuple(tuple(color) for color in header["colors"]),
         loss=header["loss"],
         provenance=header["provenance"],
+        domain=None if header["domain"] is None else (tuple(header["domain"][0]), tuple(header["domain"][1])),
     )
