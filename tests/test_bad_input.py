@@ -171,3 +171,17 @@ def test_half_precision_weights_answer_alike(weights: Path, tmp_path: Path) -> N
     full, rounded = (m.query(m.encode(points), points[:50]).probability for m in (model, half))
     assert np.abs(full - rounded).max() < 0.02
     assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * weights.stat().st_size
+
+
+def test_nothing_is_found_where_nothing_ever_was_in_training(weights: Path) -> None:
+    """An untrained network says anything anywhere; outside its domain the answer is empty all the same."""
+    points = cloud()
+    wild = replace(load_model(weights), domain=None)
+    code = wild.encode(points)
+    places = code.normalizer.invert(np.random.default_rng(1).uniform(-4, 4, size=(3000, 3)))
+    outside = (np.abs(code.normalizer.apply(places)) > 1.5).any(axis=1)
+    tame = replace(wild, domain=((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)))
+    assert (wild.query(code, places).label[outside] > 0).any()
+    answer = tame.query(code, places)
+    assert (answer.label[outside] == 0).all() and answer.probability[outside, 0].min() > 0.999
+    assert np.array_equal(answer.label[~outside], wild.query(code, places).label[~outside])

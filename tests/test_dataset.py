@@ -120,3 +120,11 @@ def test_truncated_shard_is_named(tmp_path: Path) -> None:
 def test_a_directory_without_manifest_is_not_a_dataset(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"has no manifest\.json; a dataset is a directory made by"):
         Dataset.load(tmp_path)
+
+
+def test_domain_holds_every_segment_point_with_a_margin(data: Dataset) -> None:
+    low, high = (torch.tensor(corner) for corner in data.domain(margin=0.15))
+    occupied = data.positions[data.labels > 0]
+    extent = occupied.amax(dim=0) - occupied.amin(dim=0)
+    assert torch.allclose(occupied.amin(dim=0) - low, 0.15 * extent, atol=1e-5)
+    assert torch.allclose(high - occupied.amax(dim=0), 0.15 * extent, atol=1e-5)
