@@ -1,5 +1,8 @@
 """Every built-in scene in many random states: closed, positive, apart, in view, and invertible."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -15,21 +18,10 @@ STATES = 12
 
 
 @pytest.fixture(scope="module", params=SCENES)
-def scene(request: pytest.FixtureRequest) -> Scene:
+def scene(request: pytest.FixtureRequest, require_asset: Callable[[str], Path]) -> Scene:
     if request.param == "bunny":
-        request.getfixturevalue("assets_if_needed")
+        require_asset("bunny/bunny.off")
     return load_scene(request.param)
-
-
-@pytest.fixture(scope="module")
-def assets_if_needed() -> None:
-    """The bunny needs its mesh: skip with the registry's own sentence where it cannot be had."""
-    from mereo.assets import AssetUnavailable, get
-
-    try:
-        get("bunny/bunny.off")
-    except AssetUnavailable as error:
-        pytest.skip(str(error))
 
 
 def test_rest_pose_is_sound(scene: Scene) -> None:

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
+
+from mereo.output import atomic_file
 
 NAME = "checkpoint.safetensors"
 
@@ -28,13 +30,8 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> None:
         tensors |= {f"{prefix}/{name}": value.contiguous() for name, value in module.state_dict().items()}
     for index, state in checkpoint.optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{name}": value.contiguous() for name, value in state.items()}
-    path = run_dir / NAME
-    temporary = path.with_name(NAME + ".tmp")
-    try:
-        save_file(tensors, temporary, metadata={"step": str(checkpoint.step)})
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_file(run_dir / NAME) as partial:
+        partial.write_bytes(save(tensors, metadata={"step": str(checkpoint.step)}))
 
 
 def load_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> int | None:

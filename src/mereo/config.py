@@ -3,11 +3,14 @@
 Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypedDict
 
 TEST_SEED_START = 1_000_000
 """Seeds from here up are for testing; generation for training refuses them."""
+
+MIN_POINTS = 32
+"""Fewer observed points say too little about an object: they are refused, drawn again, or left as they were."""
 
 Sampler = Literal["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"]
 
@@ -214,30 +217,26 @@ PRESETS: dict[str, TrainConfig] = {
         **_MODERN_RECIPE,
     ),
     # two minutes on two CPU cores: for tests and for a first look at one's own object
-    "tiny": TrainConfig(
-        network=NetworkConfig(
-            points=256,
-            neighbors=16,
-            mlp1=(32, 32, 64),
-            mlp2=(64, 64, 128),
-            mlp_global=(128, 256),
-            width=128,
-            local_neighbors=4,
-            local_width=64,
-            sight_neighbors=4,
+    "tiny": replace(
+        TrainConfig(
+            network=NetworkConfig(
+                points=256,
+                neighbors=16,
+                mlp1=(32, 32, 64),
+                mlp2=(64, 64, 128),
+                mlp_global=(128, 256),
+                width=128,
+                local_neighbors=4,
+                local_width=64,
+                sight_neighbors=4,
+            ),
+            batch=32,
+            epochs=10,
+            holdout=32,
+            **_MODERN_RECIPE,
         ),
-        loss="ce+l1+cd",
-        l1_weight=10.0,
-        batch=32,
         queries=256,
-        epochs=10,
         learning_rate=4e-3,
-        weight_decay=0.01,
-        schedule="cosine",
-        warmup=0.05,
-        clip_norm=1.0,
         ema_decay=0.99,
-        augment=_MODERN,
-        holdout=32,
     ),
 }

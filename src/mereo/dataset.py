@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from mereo.config import AugmentConfig
+from mereo.config import MIN_POINTS, AugmentConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ def choose_points(
     position = torch.arange(stored, device=device)
     padding = position >= count[:, None]
     # a cloud that loses nearly everything is left as it is: there would be nothing to reconstruct from
-    dropped &= (~dropped & ~padding).sum(dim=1, keepdim=True) >= 32
+    dropped &= (~dropped & ~padding).sum(dim=1, keepdim=True) >= MIN_POINTS
     unwanted = dropped | padding
     order = (position + stored * unwanted).argsort(dim=1)
     left = (~unwanted).sum(dim=1, keepdim=True)

@@ -13,15 +13,12 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from mereo.camera import PointCloud
-from mereo.config import NetworkConfig
+from mereo.config import MIN_POINTS, NetworkConfig
 from mereo.decoder import Code, Decoder, Prediction
 from mereo.encoders.pointnet2 import PointNet2
 from mereo.frame import Normalizer
 from mereo.mesh import Color
 from mereo.ordering import farthest_point_order
-
-MIN_POINTS = 32
-"""Fewer observed points say too little about an object; training views with fewer are drawn again."""
 
 SURE_LOGIT = 20.0
 """Lead of empty space where there can be nothing; trained networks reach about this in plainly empty space."""

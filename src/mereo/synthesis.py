@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mereo.camera import Camera, DepthImage
-from mereo.config import GenerateConfig
+from mereo.config import MIN_POINTS, GenerateConfig
 from mereo.deformation import Deformation, invert
 from mereo.frame import Normalizer, inverse_rigid, transform_points
 from mereo.mesh import SegmentedMesh
@@ -23,9 +23,6 @@ from mereo.query_sampling import Samples, sample_queries
 from mereo.rendering import add_depth_noise, render_depth
 from mereo.scene import Scene
 from mereo.solid import Nearest, Solids, signed_distance_and_direction
-
-MIN_POINTS = 32
-"""A view of fewer points says too little about the object; it is drawn again."""
 
 ATTEMPTS = 100
 """Views drawn before giving up on a scene."""

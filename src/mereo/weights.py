@@ -6,9 +6,10 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from mereo.model import Model, Network, config_from_dict
+from mereo.output import atomic_file
 
 FORMAT_VERSION = 1
 SHIPPED = Path(__file__).parent / "weights"
@@ -30,12 +31,8 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
         name: (value.to(dtype) if value.is_floating_point() else value).contiguous()
         for name, value in model.network.state_dict().items()
     }
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        save_file(tensors, temporary, metadata={"mereo": json.dumps(header)})
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_file(path) as partial:
+        partial.write_bytes(save(tensors, metadata={"mereo": json.dumps(header)}))
 
 
 def shipped_names() -> tuple[str, ...]:
