@@ -37,8 +37,9 @@ def settled(config: NetworkConfig, segments: int = 3) -> Network:
 def test_every_preset_answers_with_its_shapes(name: str) -> None:
     network = settled(PRESETS[name].network, segments=5)
     with torch.inference_mode():
-        logits, distance, direction = network(cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3))
+        logits, distance, direction, rest = network(cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3))
     assert logits.shape == (2, 11, 6) and distance.shape == (2, 11) and direction.shape == (2, 11, 3)
+    assert rest is None if name == "paper" else rest is not None and rest.shape == (2, 11, 3)
 
 
 def test_paper_preset_has_the_papers_sizes() -> None:
@@ -49,7 +50,7 @@ def test_paper_preset_has_the_papers_sizes() -> None:
     assert [layer.in_features for layer in network.decoder.hidden] == [512] * 6
     assert len(network.decoder.norms) == 7
     assert network.decoder.latent2.in_features == 1024 and network.decoder.query2.in_features == 60
-    assert not network.decoder.local and config.sight_neighbors == 0
+    assert not network.decoder.local and config.sight_neighbors == 0 and network.aligner is None
 
 
 def test_encoder_ignores_the_order_within_its_last_half() -> None:
@@ -78,7 +79,7 @@ def test_encoder_ignores_repeated_points() -> None:
 
 def test_split_latent_layer_equals_concatenation() -> None:
     """W [z; x] = W_z z + W_x x: the paper's concatenated query vector, without building it."""
-    network = settled(replace(TINY, local_neighbors=0, sight_neighbors=0))
+    network = settled(replace(TINY, local_neighbors=0, sight_neighbors=0, align_points=0))
     decoder, cloud = network.decoder, cloud_of(TINY)
     points = torch.randn(2, 9, 3)
     with torch.inference_mode():
@@ -94,7 +95,7 @@ def test_split_latent_layer_equals_concatenation() -> None:
                 hidden = hidden + vector @ skip.T
             hidden = torch.relu(norm(hidden.flatten(0, 1))).view_as(hidden)
         expected = decoder.head(hidden)[..., :4]
-        logits, _, _ = network(cloud, viewpoint_of(), points)
+        logits, *_ = network(cloud, viewpoint_of(), points)
     assert torch.allclose(logits, expected, atol=1e-4)
 
 

@@ -61,5 +61,5 @@ def _example(rng: np.random.Generator, points: int, queries: int) -> dict[str, n
         "labels": labels.astype(np.uint8),
         "distances": distance.astype(np.float32),
         "directions": direction.astype(np.float16),
-        "rest": offset.astype(np.float16),
+        "rest": np.where(labels[:, None] > 0, offset, np.nan).astype(np.float16),
     }

@@ -71,6 +71,7 @@ class NetworkConfig:
         local_neighbors: set-abstraction centres per level that a query attends to; 0 switches local features off.
         local_width: channels of that attention.
         sight_neighbors: observed points nearest to the query's line of sight that it compares depth with; 0 is off.
+        align_points: points from which the object's rest-pose frame is estimated first; 0 works in the camera frame.
     """
 
     points: int = 1024
@@ -91,6 +92,7 @@ class NetworkConfig:
     local_neighbors: int = 0
     local_width: int = 128
     sight_neighbors: int = 0
+    align_points: int = 0
 
     @property
     def latent(self) -> int:
@@ -166,8 +168,8 @@ class TrainConfig:
 _MODERN = AugmentConfig(keep_points=(0.5, 1.0), hole_probability=0.4, jitter_std=0.005, roll=True)
 
 _HALF = NetworkConfig(
-    points=512,
     neighbors=24,
+    ratio1=0.25,
     mlp1=(32, 32, 64),
     mlp2=(64, 64, 128),
     mlp_global=(128, 256, 512),
@@ -175,6 +177,7 @@ _HALF = NetworkConfig(
     local_neighbors=6,
     local_width=64,
     sight_neighbors=4,
+    align_points=256,
 )
 
 
@@ -212,7 +215,7 @@ PRESETS: dict[str, TrainConfig] = {
     "base": TrainConfig(network=_HALF, epochs=60, **_MODERN_RECIPE),
     # the same with the paper's widths, for a GPU
     "large": TrainConfig(
-        network=NetworkConfig(points=1024, neighbors=32, local_neighbors=6, sight_neighbors=4),
+        network=NetworkConfig(points=1024, neighbors=32, local_neighbors=6, sight_neighbors=4, align_points=256),
         epochs=100,
         **_MODERN_RECIPE,
     ),
@@ -229,6 +232,7 @@ PRESETS: dict[str, TrainConfig] = {
                 local_neighbors=4,
                 local_width=64,
                 sight_neighbors=4,
+                align_points=128,
             ),
             batch=32,
             epochs=10,

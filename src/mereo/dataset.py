@@ -19,7 +19,10 @@ from mereo.config import MIN_POINTS, AugmentConfig
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What one training step reads; all normalized by the (augmented) cloud."""
+    """What one training step reads; all normalized by the (augmented) cloud.
+
+    ``rest`` are rest-pose coordinates (``synthesis.LabelledPoints``); NaN outside.
+    """
 
     cloud: Float[Tensor, "b n 3"]
     viewpoint: Float[Tensor, "b 3"]
@@ -27,6 +30,7 @@ class Batch:
     labels: Int[Tensor, "b q"]
     distances: Float[Tensor, "b q"]
     directions: Float[Tensor, "b q 3"]
+    rest: Float[Tensor, "b q 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,7 @@ class Dataset:
     labels: UInt8[Tensor, "e q"]
     distances: Float[Tensor, "e q"]
     directions: Float[Tensor, "e q 3"]
+    rest: Float[Tensor, "e q 3"]
     manifest: dict[str, Any]
 
     def __len__(self) -> int:
@@ -63,18 +68,16 @@ class Dataset:
                 f"{directory} holds {have} of {manifest['examples']} examples; training needs all of them: "
                 "finish it with mereo generate ... --resume"
             )
+        queries = ("positions", "labels", "distances", "directions", "rest")
         joined = {}
-        for key in ("cloud", "cloud_count", "center", "scale", "positions", "labels", "distances", "directions"):
+        for key in ("cloud", "cloud_count", "center", "scale", *queries):
             joined[key] = torch.cat([part.pop(key) for part in parts]).to(device)
         viewpoint = (-joined["center"] * joined["scale"][:, None]).float()
         return cls(
             cloud=joined["cloud"],
             count=joined["cloud_count"].long(),
             viewpoint=viewpoint,
-            positions=joined["positions"],
-            labels=joined["labels"],
-            distances=joined["distances"],
-            directions=joined["directions"],
+            **{key: joined[key] for key in queries},
             manifest=manifest,
         )
 
@@ -119,6 +122,7 @@ class Dataset:
             labels=self.labels[rows, chosen].long(),
             distances=self.distances[rows, chosen],
             directions=self.directions[rows, chosen].float(),
+            rest=self.rest[rows, chosen].float(),
         )
         return augment_batch(batch, augment, rng)
 
@@ -202,4 +206,5 @@ def augment_batch(batch: Batch, augment: AugmentConfig, rng: torch.Generator) ->
         labels=batch.labels,
         distances=batch.distances * scale[:, None],
         directions=batch.directions @ roll.transpose(1, 2),
+        rest=batch.rest,
     )

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mereo.alignment import Alignment
 from mereo.config import NetworkConfig
 from mereo.encoders.pointnet2 import Encoding, Level
 from mereo.neighbors import gather, nearest
@@ -24,8 +25,9 @@ class Code:
     Attributes:
         latent1, latent2: the latent half of the first layer and of the layer after the skip connection.
         levels: set-abstraction centres with features projected for attention; empty without local features.
-        cloud: the observed points, farthest-point order, normalized.
+        cloud: the observed points, farthest-point order, normalized, in the camera frame.
         viewpoint: the camera's position in normalized coordinates.
+        alignment: from the camera frame to the frame in which the levels are; None where it is the same.
     """
 
     latent1: Float[Tensor, "b h"]
@@ -33,6 +35,7 @@ class Code:
     levels: tuple[Level, ...]
     cloud: Float[Tensor, "b n 3"]
     viewpoint: Float[Tensor, "b 3"]
+    alignment: Alignment | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +107,13 @@ def line_of_sight(
     return torch.cat([evidence.clamp(-3.0, 3.0), (8.0 * evidence).clamp(-1.0, 1.0)], dim=-1)
 
 
-class Decoder(nn.Module):
-    """Code and query points -> class logits, signed distance, direction."""
+class ConditionedMLP(nn.Module):
+    """Code and query points -> features: the decoder's layers, whatever is asked of them.
 
-    def __init__(self, config: NetworkConfig, classes: int) -> None:
+    Queries are in the camera frame; the levels of the code may be in an aligned one.
+    """
+
+    def __init__(self, config: NetworkConfig, outputs: int) -> None:
         super().__init__()
         self.config = config
         self.encode = FrequencyEncoding(config.lowest_exponent, config.highest_exponent)
@@ -127,22 +133,29 @@ class Decoder(nn.Module):
             self.local1 = nn.Linear(2 * config.local_width, width, bias=False)
         if config.sight_neighbors:
             self.sight1 = nn.Linear(6 * config.sight_neighbors, width, bias=False)
-        self.head = nn.Linear(width, classes + 4)
-        self.classes = classes
+        self.head = nn.Linear(width, outputs)
 
-    def prepare(self, encoding: Encoding, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
+    def prepare(
+        self,
+        encoding: Encoding,
+        cloud: Float[Tensor, "b n 3"],
+        viewpoint: Float[Tensor, "b 3"],
+        alignment: Alignment | None = None,
+    ) -> Code:
         """The part of the work that does not depend on the queries."""
         levels = tuple(
             Level(level.centers, attention.project(level.features))  # type: ignore[operator]
             for level, attention in zip(encoding.levels, self.local, strict=False)
         )
-        return Code(self.latent1(encoding.latent), self.latent2(encoding.latent), levels, cloud, viewpoint)
+        return Code(self.latent1(encoding.latent), self.latent2(encoding.latent), levels, cloud, viewpoint, alignment)
 
-    def forward(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Prediction:
-        encoded = self.encode(queries) if self.config.encode_positions else queries
+    def features(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q f"]:
+        """The last layer's outputs."""
+        placed = queries if code.alignment is None else code.alignment.apply(queries)
+        encoded = self.encode(placed) if self.config.encode_positions else placed
         hidden = self.query1(encoded) + code.latent1[:, None]
         if self.config.local_neighbors:
-            local = [layer(level, queries) for layer, level in zip(self.local, code.levels, strict=True)]
+            local = [layer(level, placed) for layer, level in zip(self.local, code.levels, strict=True)]
             hidden = hidden + self.local1(torch.cat(local, dim=-1))
         if self.config.sight_neighbors:
             sight = line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors)
@@ -153,5 +166,18 @@ class Decoder(nn.Module):
             if number == self.config.skip_after:
                 hidden = hidden + self.query2(encoded) + code.latent2[:, None]
             hidden = torch.relu(norm(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
-        logits, distance, direction = self.head(hidden).float().split([self.classes, 1, 3], dim=-1)
+        return self.head(hidden).float()
+
+
+class Decoder(ConditionedMLP):
+    """Code and query points -> class logits, signed distance, direction."""
+
+    def __init__(self, config: NetworkConfig, classes: int) -> None:
+        super().__init__(config, classes + 4)
+        self.classes = classes
+
+    def forward(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Prediction:
+        logits, distance, direction = self.features(code, queries).split([self.classes, 1, 3], dim=-1)
+        if code.alignment is not None:
+            direction = code.alignment.turn_back(direction)
         return Prediction(logits, distance[..., 0], direction)

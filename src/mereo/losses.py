@@ -17,7 +17,7 @@ def occupancy_loss(
     loss: Loss,
     l1_weight: float,
 ) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
-    """``CE + l1_weight * L1 - mean cosine``, or the terms that ``loss`` names; also each term by name, detached.
+    """``CE + l1_weight * L1 - mean cosine``, or the terms that ``loss`` names; also each term by name.
 
     Distances are signed and normalized, directions unit vectors to the nearest surface in the camera frame.
     """
@@ -30,4 +30,15 @@ def occupancy_loss(
         terms["cd"] = -F.cosine_similarity(prediction.direction, directions, dim=-1).mean()
     weights = {"ce": 1.0, "l1": l1_weight, "cd": 1.0}
     total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
-    return total, {name: value.detach() for name, value in terms.items()}
+    return total, terms
+
+
+def alignment_loss(predicted: Float[Tensor, "b q 3"], rest: Float[Tensor, "b q 3"]) -> Float[Tensor, ""]:
+    """Mean distance between predicted and true rest-pose coordinates; rows that are NaN (outside) are left out.
+
+    The distance, not its square, so that the ends of wide bends do not outweigh the rest.
+    """
+    known = ~rest.isnan().any(dim=-1)
+    offset = torch.where(known[..., None], predicted - rest, torch.zeros_like(rest))
+    distance = (offset.square().sum(dim=-1) + 1e-8).sqrt()
+    return (distance * known).sum() / known.sum().clamp(min=1)

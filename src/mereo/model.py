@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from mereo.aligner import AlignmentNet
+from mereo.alignment import Alignment
 from mereo.camera import PointCloud
 from mereo.config import MIN_POINTS, NetworkConfig
 from mereo.decoder import Code, Decoder, Prediction
@@ -30,6 +32,9 @@ CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 4096, 65536
 """Queries evaluated at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
 
 
+ALIGNED_QUERIES = 128
+"""Queries per example that train the alignment: neighbours say much the same about a nearly rigid motion."""
+
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]
 """Lower and upper corner."""
@@ -43,10 +48,17 @@ class Network(nn.Module):
         self.config, self.segments = config, segments
         self.encoder = PointNet2(config)
         self.decoder = Decoder(config, segments + 1)
+        self.aligner = AlignmentNet(config) if config.align_points else None
 
     def encode(self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
         """``cloud`` in farthest-point order."""
-        return self.decoder.prepare(self.encoder(cloud), cloud, viewpoint)
+        return self._encode(cloud, viewpoint, None if self.aligner is None else self.aligner(cloud).alignment)
+
+    def _encode(
+        self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], alignment: Alignment | None
+    ) -> Code:
+        encoding = self.encoder(cloud if alignment is None else alignment.apply(cloud))
+        return self.decoder.prepare(encoding, cloud, viewpoint, alignment)
 
     def query(self, code: Code, points: Float[Tensor, "b q 3"]) -> Prediction:
         prediction: Prediction = self.decoder(code, points)
@@ -54,9 +66,16 @@ class Network(nn.Module):
 
     def forward(
         self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], points: Float[Tensor, "b q 3"]
-    ) -> tuple[Float[Tensor, "b q c"], Float[Tensor, "b q"], Float[Tensor, "b q 3"]]:
-        prediction = self.query(self.encode(cloud, viewpoint), points)
-        return prediction.logits, prediction.distance, prediction.direction
+    ) -> tuple[Float[Tensor, "b q c"], Float[Tensor, "b q"], Float[Tensor, "b q 3"], Float[Tensor, "b a 3"] | None]:
+        """What training needs: logits, distance, direction, and rest-pose coordinates at the first queries.
+
+        The coordinates are those the alignment is made from, at the first ``ALIGNED_QUERIES``; None without alignment.
+        """
+        alignment, rest = None, None
+        if self.aligner is not None:
+            alignment, rest = self.aligner(cloud, points[:, :ALIGNED_QUERIES])
+        prediction = self.query(self._encode(cloud, viewpoint, alignment), points)
+        return prediction.logits, prediction.distance, prediction.direction, rest
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from mereo.curves import MetricsLog
 from mereo.dataset import Batch, Dataset
 from mereo.decoder import Prediction
 from mereo.hardware import compiling_pays, keep_freed_memory, pick_device, pick_precision
-from mereo.losses import occupancy_loss
+from mereo.losses import alignment_loss, occupancy_loss
 from mereo.metrics import confusion_matrix, intersection_over_union
 from mereo.model import Model, Network
 from mereo.run import Process, claim_run, fit_config, join_processes
@@ -133,8 +133,8 @@ class Trainer:
 
     def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         with torch.autocast(self.device.type, self.autocast) if self.autocast else nullcontext():
-            outputs = self.module(batch.cloud, batch.viewpoint, batch.positions)
-        return occupancy_loss(
+            *outputs, rest = self.module(batch.cloud, batch.viewpoint, batch.positions)
+        loss, terms = occupancy_loss(
             Prediction(*outputs),
             batch.labels,
             batch.distances,
@@ -142,6 +142,10 @@ class Trainer:
             self.config.loss,
             self.config.l1_weight,
         )
+        if rest is not None:
+            terms["align"] = alignment_loss(rest, batch.rest[:, : rest.shape[1]])
+            loss = loss + terms["align"]
+        return loss, {name: value.detach() for name, value in terms.items()}
 
     def _learning_rate(self) -> float:
         config = self.config
@@ -182,7 +186,7 @@ class Trainer:
         for start in range(self.examples, len(self.data), self.config.batch):
             index = torch.arange(start, min(start + self.config.batch, len(self.data)))
             batch = self.data.batch(index, self.config.network.points, 0, quiet, torch.Generator().manual_seed(0))
-            logits, distance, _ = self.average(batch.cloud, batch.viewpoint, batch.positions)
+            logits, distance, *_ = self.average(batch.cloud, batch.viewpoint, batch.positions)
             guess = logits.argmax(-1) if "ce" in self.config.loss else (distance < 0).long()
             truth = batch.labels if "ce" in self.config.loss else (batch.labels > 0).long()
             total += torch.from_numpy(confusion_matrix(truth.cpu().numpy(), guess.cpu().numpy(), classes))

@@ -1,0 +1,53 @@
+"""Alignment of an observed cloud with the object's rest pose, before anything else looks at it.
+
+A free camera shows an object in any orientation, and a network that must recognize each of them separately learns
+slowly. Here a small network first predicts rest-pose coordinates (normalized object coordinates; Wang et al., CVPR
+2019) at the observed points; the rigid motion that fits them best takes cloud and queries into the rest pose's frame.
+What deformation and the estimate's error leave over is for the network behind it. Regressing the rotation directly, as
+T-Net does (PointNet; Qi et al., CVPR 2017), learned far more slowly: docs/design/0003-alignment.md.
+
+Notation: b clouds, n points, q queries.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mereo.alignment import Alignment, fit_rigid
+from mereo.config import NetworkConfig
+from mereo.decoder import ConditionedMLP
+from mereo.encoders.pointnet2 import PointNet2
+
+
+class Aligned(NamedTuple):
+    """The motion, and the rest-pose coordinates predicted at the queries, for the loss."""
+
+    alignment: Alignment
+    rest: Float[Tensor, "b q 3"]
+
+
+class AlignmentNet(nn.Module):
+    """Cloud in farthest-point order -> ``Alignment``, by way of rest-pose coordinates."""
+
+    FITTED = 128
+    """Observed points whose coordinates are predicted and fitted."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.points = config.align_points
+        small = replace(
+            config, neighbors=min(config.neighbors, 16), ratio1=0.5, depth=3, skip_after=2, sight_neighbors=0
+        )
+        self.encoder = PointNet2(small)
+        self.decoder = ConditionedMLP(small, outputs=3)
+
+    def forward(self, cloud: Float[Tensor, "b n 3"], queries: Float[Tensor, "b q 3"] | None = None) -> Aligned:
+        seen = cloud[:, : self.FITTED]
+        code = self.decoder.prepare(self.encoder(cloud[:, : self.points]), cloud, cloud[:, 0])
+        places = seen if queries is None else torch.cat([seen, queries], dim=1)
+        rest = self.decoder.features(code, places).float()
+        alignment = fit_rigid(seen, rest[:, : seen.shape[1]].detach())
+        return Aligned(alignment, rest[:, seen.shape[1] :])

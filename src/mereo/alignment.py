@@ -1,0 +1,40 @@
+"""Rigid motions between the camera frame and the frame of an object's rest pose, in batches.
+
+Notation: b clouds, n points, q queries.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """``aligned = rotation @ x + shift``, one rigid motion per cloud, from normalized camera coordinates.
+
+    There is no scale: cloud and rest pose are both about two units long, and an unsure estimate would shrink.
+    """
+
+    rotation: Float[Tensor, "b 3 3"]
+    shift: Float[Tensor, "b 3"]
+
+    def apply(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
+        """Points from the camera frame to the aligned frame."""
+        return points @ self.rotation.transpose(1, 2) + self.shift[:, None]
+
+    def turn_back(self, directions: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
+        """Directions from the aligned frame to the camera's."""
+        return directions @ self.rotation
+
+
+@torch.no_grad()
+def fit_rigid(source: Float[Tensor, "b n 3"], target: Float[Tensor, "b n 3"]) -> Alignment:
+    """The rotation and shift with the least squared distance of moved ``source`` to ``target`` (Kabsch, 1976)."""
+    middle, aim = source.mean(dim=1, keepdim=True), target.mean(dim=1, keepdim=True)
+    u, _, v = torch.linalg.svd((target - aim).transpose(1, 2) @ (source - middle))
+    flip = torch.ones_like(source[:, 0])
+    flip[:, 2] = torch.det(u @ v).sign()
+    rotation = (u * flip[:, None]) @ v
+    return Alignment(rotation, (aim - middle @ rotation.transpose(1, 2))[:, 0])
