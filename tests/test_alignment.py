@@ -63,6 +63,14 @@ def test_flat_clouds_are_fitted_too() -> None:
     assert torch.allclose(torch.det(found.rotation), torch.ones(3), atol=1e-5)
 
 
+def test_autocast_does_not_touch_coordinates() -> None:
+    motion, cloud = random_motion(4), cloud_of(4, 50)
+    moved = motion.apply(cloud)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(motion.apply(cloud), moved)
+        assert torch.allclose(fit_rigid(cloud, moved).apply(cloud), moved, atol=1e-5)
+
+
 def test_directions_turn_back() -> None:
     motion, cloud = random_motion(2), cloud_of(2, 9)
     ahead = motion.apply(cloud + 0.5) - motion.apply(cloud)

@@ -101,6 +101,18 @@ def test_run_directory_tells_the_story(dataset: Path, tmp_path: Path) -> None:
     assert model.provenance["training_seed"] == 5 and model.provenance["scene"] == "toy"
 
 
+def test_class_offsets_are_in_the_last_bias_and_nowhere_else(dataset: Path, tmp_path: Path) -> None:
+    weights = load_model(training.train(dataset, tmp_path / "run", SMALL))
+    offsets = weights.provenance["class_offsets"]
+    assert isinstance(offsets, list) and len(offsets) == 3 and offsets[0] == 0
+    average = load_file(tmp_path / "run" / "checkpoint.safetensors")
+    for name, value in weights.network.state_dict().items():
+        expected = average[f"average/{name}"].clone()
+        if name == "decoder.head.bias":
+            expected[:3] += torch.tensor(offsets)
+        assert torch.equal(value, expected), name
+
+
 def test_batches_visit_every_example_once_per_pass(dataset: Path, tmp_path: Path) -> None:
     data = training.Dataset.load(dataset)
     config = replace(SMALL, holdout=4, epochs=4)
@@ -134,6 +146,11 @@ def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, lo
     cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 50.0), size=(80, 3))
     answer = model.query(model.encode(cloud), cloud[:7])
     assert answer.label.shape == (7,) and np.isfinite(answer.distance).all()
+
+
+def test_bfloat16_trains(dataset: Path, tmp_path: Path) -> None:
+    model = load_model(training.train(dataset, tmp_path / "run", replace(SMALL, precision="bfloat16")))
+    assert all(torch.isfinite(value).all() for value in model.network.state_dict().values())
 
 
 def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ def write_toy_dataset(directory: Path, examples: int = 64, points: int = 96, que
         "examples": examples,
         "version": "0",
         "any_roll": False,
+        "settings": {"sampling": {"per_segment": 0}},
         "segments": [{"name": name, "color": [50 * i, 90, 200]} for i, name in enumerate(NAMES)],
     }
     (directory / "manifest.json").write_text(json.dumps(manifest))

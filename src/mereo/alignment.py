@@ -22,19 +22,27 @@ class Alignment:
 
     def apply(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
         """Points from the camera frame to the aligned frame."""
-        return points @ self.rotation.transpose(1, 2) + self.shift[:, None]
+        with exact(points):
+            return points @ self.rotation.transpose(1, 2) + self.shift[:, None]
 
     def turn_back(self, directions: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
         """Directions from the aligned frame to the camera's."""
-        return directions @ self.rotation
+        with exact(directions):
+            return directions @ self.rotation
+
+
+def exact(tensor: Tensor) -> torch.autocast:
+    """Switches autocast off: in bfloat16 a coordinate near 1 would be off by up to 0.004, more than sensor noise."""
+    return torch.autocast(tensor.device.type, enabled=False)
 
 
 @torch.no_grad()
 def fit_rigid(source: Float[Tensor, "b n 3"], target: Float[Tensor, "b n 3"]) -> Alignment:
     """The rotation and shift with the least squared distance of moved ``source`` to ``target`` (Kabsch, 1976)."""
     middle, aim = source.mean(dim=1, keepdim=True), target.mean(dim=1, keepdim=True)
-    u, _, v = torch.linalg.svd((target - aim).transpose(1, 2) @ (source - middle))
-    flip = torch.ones_like(source[:, 0])
-    flip[:, 2] = torch.det(u @ v).sign()
-    rotation = (u * flip[:, None]) @ v
-    return Alignment(rotation, (aim - middle @ rotation.transpose(1, 2))[:, 0])
+    with exact(source):
+        u, _, v = torch.linalg.svd((target - aim).transpose(1, 2) @ (source - middle))
+        flip = torch.ones_like(source[:, 0])
+        flip[:, 2] = torch.det(u @ v).sign()
+        rotation = (u * flip[:, None]) @ v
+        return Alignment(rotation, (aim - middle @ rotation.transpose(1, 2))[:, 0])

@@ -140,6 +140,7 @@ class TrainConfig:
         clip_norm: largest gradient norm; 0 means no clipping.
         ema_decay: decay of the exponential moving average of the weights that is saved; 0 is off.
         augment: changes to the observed clouds.
+        offset_examples: training examples from which the finished network's class offsets are chosen; 0 is off.
         holdout: examples at the end of the dataset kept for the validation curve.
         precision: auto takes bfloat16 on CUDA and on CPUs with AMX, else float32.
         compile: torch.compile of the network; auto means where it pays: on CUDA, and for long runs on a CPU.
@@ -159,6 +160,7 @@ class TrainConfig:
     clip_norm: float = 0.0
     ema_decay: float = 0.0
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    offset_examples: int = 0
     holdout: int = 128
     precision: Precision = "auto"
     compile: Literal["auto", "on", "off"] = "auto"
@@ -192,6 +194,7 @@ class _Recipe(TypedDict):
     clip_norm: float
     ema_decay: float
     augment: AugmentConfig
+    offset_examples: int
 
 
 _MODERN_RECIPE = _Recipe(
@@ -205,6 +208,7 @@ _MODERN_RECIPE = _Recipe(
     clip_norm=1.0,
     ema_decay=0.999,
     augment=_MODERN,
+    offset_examples=1000,
 )
 
 PRESETS: dict[str, TrainConfig] = {

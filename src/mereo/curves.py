@@ -22,8 +22,9 @@ class MetricsLog:
         self.rows: list[Row] = []
         self.board = _tensorboard(run_dir)
 
-    def add_step(self, step: int, rate: float, loss: float, terms: dict[str, float]) -> None:
-        self._add({"step": step, "rate": rate, "loss": loss, **terms})
+    def add_step(self, step: int, rate: float, losses: dict[str, float]) -> None:
+        """``losses`` are the total under "loss" and its terms."""
+        self._add({"step": step, "rate": rate, **losses})
 
     def add_validation(self, step: int, iou: float, miou: float) -> None:
         """Validation of the state after ``step``: joins the row of that step."""

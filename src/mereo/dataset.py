@@ -81,6 +81,12 @@ class Dataset:
             manifest=manifest,
         )
 
+    @property
+    def uniform_queries(self) -> int:
+        """How many queries of an example, its last ones, are uniform in the joint box."""
+        near: int = self.manifest["settings"]["sampling"]["per_segment"] * len(self.manifest["segments"])
+        return self.positions.shape[1] - near
+
     def domain(self, margin: float = 0.15) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
         """Lower and upper corner of where segments occur in the normalized training data, widened on each side.
 

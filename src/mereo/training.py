@@ -4,6 +4,7 @@ Everything random in step t is drawn from (seed, t), so a resumed run repeats an
 ``torchrun`` each process takes its share of every batch; process 0 writes.
 """
 
+import copy
 import math
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from mereo.calibration import class_offsets
 from mereo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mereo.config import TrainConfig
 from mereo.curves import MetricsLog
@@ -49,11 +51,15 @@ def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_e
         trainer.train_step(batch)
         finished = trainer.step == trainer.total
         if finished or trainer.agree(time.monotonic() - last_save > checkpoint_every_s):
-            trainer.validate_and_save()
+            trainer.validate_and_save(finished)
             last_save = time.monotonic()
     if process.world > 1:
         dist.destroy_process_group()
     return run_dir / "weights.safetensors"
+
+
+REPORT_EVERY = 20
+"""Steps between two lines of progress."""
 
 
 class Trainer:
@@ -69,9 +75,11 @@ class Trainer:
         self.average.load_state_dict(self.network.state_dict())
         self.optimizer = torch.optim.AdamW(_parameter_groups(self.network, config), lr=config.learning_rate, fused=True)
         self.examples = len(data) - config.holdout
+        self.orders: dict[int, Tensor] = {}
         self.total = max(1, math.ceil(config.epochs * self.examples / config.batch))
         self.step = 0
         self.log = MetricsLog(run_dir) if process.is_main else None
+        self.unread: list[tuple[int, float, dict[str, Tensor]]] = []
         self.autocast = pick_precision(config.precision, device)
         self.module: nn.Module = self.network
         if process.world > 1:
@@ -104,14 +112,15 @@ class Trainer:
         """Batches run through one shuffled pass after another; a batch may straddle two passes."""
         first = step * self.config.batch
         positions = range(first, first + self.config.batch)
-        passes = {p // self.examples for p in positions}
-        orders = {
-            number: torch.randperm(
-                self.examples, generator=torch.Generator().manual_seed(_seed(self.config.seed, number, 1 << 20))
-            )
-            for number in passes
-        }
-        return torch.stack([orders[p // self.examples][p % self.examples] for p in positions])
+        return torch.stack([self._order(p // self.examples)[p % self.examples] for p in positions])
+
+    def _order(self, number: int) -> Tensor:
+        """The shuffled examples of pass ``number``; the two latest are kept."""
+        if number not in self.orders:
+            generator = torch.Generator().manual_seed(_seed(self.config.seed, number, 1 << 20))
+            order = torch.randperm(self.examples, generator=generator)
+            self.orders = {n: kept for n, kept in self.orders.items() if n == number - 1} | {number: order}
+        return self.orders[number]
 
     def train_step(self, batch: Batch) -> None:
         """One optimizer step."""
@@ -128,8 +137,9 @@ class Trainer:
         self.step += 1
         self._update_average()
         if self.log is not None:
-            self.log.add_step(self.step, rate, float(loss.detach()), {k: float(v) for k, v in terms.items()})
-            self._report_progress(float(loss.detach()))
+            self.unread.append((self.step, rate, {"loss": loss.detach(), **terms}))
+            if self.step % REPORT_EVERY == 0 or self.step == self.total:
+                self._report_progress()
 
     def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         with torch.autocast(self.device.type, self.autocast) if self.autocast else nullcontext():
@@ -166,9 +176,19 @@ class Trainer:
             else:
                 mean.copy_(value)
 
-    def _report_progress(self, loss: float) -> None:
-        if self.step % 20 and self.step != self.total:
+    def _read_losses(self) -> None:
+        """Log the steps since the last call, all with one copy from the device, which would wait at every step."""
+        if self.log is None or not self.unread:
             return
+        values = torch.stack([torch.stack(list(terms.values())) for _, _, terms in self.unread]).tolist()
+        for (step, rate, terms), row in zip(self.unread, values, strict=True):
+            self.log.add_step(step, rate, dict(zip(terms, row, strict=True)))
+        self.unread.clear()
+
+    def _report_progress(self) -> None:
+        self._read_losses()
+        assert self.log is not None
+        loss = self.log.rows[-1]["loss"]
         rate = (self.step - self.first_step) / (time.monotonic() - self.started)
         left_s = (self.total - self.step) / max(rate, 1e-9)
         self.say(
@@ -181,43 +201,64 @@ class Trainer:
         """IoU and mIoU of the averaged weights on the held-out examples' queries (not the paper's grid metric)."""
         classes = self.network.segments + 1
         total = torch.zeros(classes, classes, dtype=torch.long)
-        self.average.eval()
-        quiet = TrainConfig().augment
-        for start in range(self.examples, len(self.data), self.config.batch):
-            index = torch.arange(start, min(start + self.config.batch, len(self.data)))
-            batch = self.data.batch(index, self.config.network.points, 0, quiet, torch.Generator().manual_seed(0))
-            logits, distance, *_ = self.average(batch.cloud, batch.viewpoint, batch.positions)
+        for batch, logits, distance in self._answers(range(self.examples, len(self.data))):
             guess = logits.argmax(-1) if "ce" in self.config.loss else (distance < 0).long()
             truth = batch.labels if "ce" in self.config.loss else (batch.labels > 0).long()
             total += torch.from_numpy(confusion_matrix(truth.cpu().numpy(), guess.cpu().numpy(), classes))
         scores = intersection_over_union(total.numpy())
         return scores.iou, scores.miou
 
-    def validate_and_save(self) -> None:
+    def _answers(self, examples: range) -> Iterator[tuple[Batch, Tensor, Tensor]]:
+        """Logits and distances of the averaged network at all queries of stored examples, batch by batch."""
+        self.average.eval()
+        quiet = TrainConfig().augment
+        for start in examples[:: self.config.batch]:
+            index = torch.arange(start, min(start + self.config.batch, examples.stop))
+            batch = self.data.batch(index, self.config.network.points, 0, quiet, torch.Generator().manual_seed(0))
+            logits, distance, *_ = self.average(batch.cloud, batch.viewpoint, batch.positions)
+            yield batch, logits, distance
+
+    @torch.no_grad()
+    def offsets(self) -> Tensor | None:
+        """Class offsets (``calibration``) of the averaged network from the first training examples; None when off."""
+        count, uniform = min(self.config.offset_examples, self.examples), self.data.uniform_queries
+        if not (count and uniform and "ce" in self.config.loss):
+            return None
+        found = [(logits[:, -uniform:], b.labels[:, -uniform:]) for b, logits, _ in self._answers(range(count))]
+        return class_offsets(*(torch.cat(part).flatten(0, 1).cpu() for part in zip(*found, strict=True)))
+
+    def validate_and_save(self, finished: bool) -> None:
         """Write metrics, curves, the checkpoint and the weights; every file atomically."""
         if self.log is not None:
+            self._read_losses()
             if self.config.holdout:
                 self.log.add_validation(self.step, *self.validate())
             self.log.write()
             save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
-            save_model(self.model(), self.run_dir / "weights.safetensors")
+            save_model(self.model(self.offsets() if finished else None), self.run_dir / "weights.safetensors")
             self.say(f"saved at step {self.step}: {self.log.summary()}")
         if self.process.world > 1:
             dist.barrier()
 
-    def model(self) -> Model:
-        """The averaged network with the header that travels with its weights."""
+    def model(self, offsets: Tensor | None = None) -> Model:
+        """The averaged network, class offsets in its last bias, with the header that travels with its weights."""
         manifest = self.data.manifest
+        network = self.average
+        if offsets is not None:
+            network = copy.deepcopy(network)  # the running average must stay what it is
+            with torch.no_grad():
+                network.decoder.head.bias[: len(offsets)] += offsets.to(self.device)
         provenance: dict[str, object] = {
             "scene": manifest["scene"],
             "training_seed": manifest["seed"],
             "training_examples": manifest["examples"],
             "steps": self.step,
             "mereo": manifest["version"],
+            "class_offsets": None if offsets is None else offsets.tolist(),
             "recipe": asdict(self.config),
         }
         return Model(
-            network=self.average,
+            network=network,
             names=tuple(s["name"] for s in manifest["segments"]),
             colors=tuple(tuple(s["color"]) for s in manifest["segments"]),
             loss=self.config.loss,
