@@ -16,7 +16,7 @@ from toy_data import NAMES, write_toy_dataset
 
 from mereo import training
 from mereo.config import PRESETS, AugmentConfig, TrainConfig
-from mereo.run import claim_run
+from mereo.run import claim_run, start_network
 from mereo.weights import load_model
 
 SMALL = replace(
@@ -116,7 +116,8 @@ def test_class_offsets_are_in_the_last_bias_and_nowhere_else(dataset: Path, tmp_
 def test_batches_visit_every_example_once_per_pass(dataset: Path, tmp_path: Path) -> None:
     data = training.Dataset.load(dataset)
     config = replace(SMALL, holdout=4, epochs=4)
-    trainer = training.Trainer(config, data, tmp_path, training.Process(), torch.device("cpu"))
+    network = start_network(config, data)
+    trainer = training.Trainer(config, data, network, tmp_path, training.Process(), torch.device("cpu"))
     seen = torch.cat([trainer._batch_index(step) for step in range(trainer.total)])
     assert trainer.total * 8 == 4 * 60
     assert torch.equal(seen.bincount(), torch.full((60,), 4))
@@ -151,6 +152,21 @@ def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, lo
 def test_bfloat16_trains(dataset: Path, tmp_path: Path) -> None:
     model = load_model(training.train(dataset, tmp_path / "run", replace(SMALL, precision="bfloat16")))
     assert all(torch.isfinite(value).all() for value in model.network.state_dict().values())
+
+
+def test_training_starts_from_given_weights(dataset: Path, tmp_path: Path) -> None:
+    """Without any step, the network is that of the weights; other networks and segments are refused."""
+    first = training.train(dataset, tmp_path / "first", replace(SMALL, epochs=0.2))
+    data, config = training.Dataset.load(dataset), replace(SMALL, init=str(first))
+    network = start_network(config, data)
+    assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
+    with pytest.raises(ValueError, match="another network setting width"):
+        start_network(replace(config, network=replace(config.network, width=32)), data)
+    with pytest.raises(ValueError, match="know the segments base, segment_1"):
+        start_network(replace(config, init="rope"), data)
+    with pytest.raises(FileNotFoundError, match="no weights 'lost'"):
+        training.train(dataset, tmp_path / "second", replace(config, init="lost"))
+    assert not (tmp_path / "second").exists()
 
 
 def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:

@@ -128,6 +128,7 @@ class TrainConfig:
 
     Attributes:
         network: the architecture.
+        init: weights to start from, of the same architecture and segments: a shipped name or a file; empty is random.
         loss: which terms: cross-entropy, L1 on the distance, cosine on the direction.
         l1_weight: the paper's lambda.
         batch: examples per step, over all processes together.
@@ -148,6 +149,7 @@ class TrainConfig:
     """
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    init: str = ""
     loss: Loss = "ce+l1"
     l1_weight: float = 100.0
     batch: int = 40

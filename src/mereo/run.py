@@ -2,7 +2,7 @@
 
 import json
 import os
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,9 @@ import torch.distributed as dist
 
 from mereo.config import TrainConfig
 from mereo.dataset import Dataset
+from mereo.model import Network
 from mereo.output import write_json
+from mereo.weights import load_model
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,36 @@ def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
     holdout = min(config.holdout, len(data) // 10)
     augment = replace(config.augment, roll=config.augment.roll and bool(data.manifest["any_roll"]))
     return replace(config, holdout=holdout, augment=augment)
+
+
+def start_network(config: TrainConfig, data: Dataset) -> Network:
+    """A network to train: random from the seed, or with the weights that ``config.init`` names.
+
+    Raises ``ValueError`` when those weights are of another architecture or know other segments.
+    """
+    names = tuple(segment["name"] for segment in data.manifest["segments"])
+    torch.manual_seed(config.seed)
+    network = Network(config.network, len(names))
+    if config.init:
+        start = load_model(config.init)
+        if start.names != names:
+            raise ValueError(
+                f"the weights {config.init} know the segments {', '.join(start.names)}, the dataset has "
+                f"{', '.join(names)}; both must be the same in the same order: "
+                "start from other weights, or without --init"
+            )
+        odd = [
+            f.name
+            for f in fields(config.network)
+            if getattr(start.network.config, f.name) != getattr(config.network, f.name)
+        ]
+        if odd:
+            raise ValueError(
+                f"the weights {config.init} have another network setting {odd[0]}; continuing needs the same "
+                "network: use the preset and settings they were trained with, or train without --init"
+            )
+        network.load_state_dict(start.network.state_dict())
+    return network
 
 
 def join_processes() -> Process:

@@ -27,7 +27,7 @@ from mereo.hardware import compiling_pays, keep_freed_memory, pick_device, pick_
 from mereo.losses import alignment_loss, occupancy_loss
 from mereo.metrics import confusion_matrix, intersection_over_union
 from mereo.model import Model, Network
-from mereo.run import Process, claim_run, fit_config, join_processes
+from mereo.run import Process, claim_run, fit_config, join_processes, start_network
 from mereo.weights import save_model
 
 
@@ -41,9 +41,10 @@ def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_e
     device = pick_device(process.rank)
     data = Dataset.load(dataset_dir, device)
     config = fit_config(config, data)
+    network = start_network(config, data)  # before anything is written: the weights it starts from may be unusable
     claim_run(run_dir, config, data, process)
     keep_freed_memory()
-    trainer = Trainer(config, data, run_dir, process, device)
+    trainer = Trainer(config, data, network, run_dir, process, device)
     if trainer.resume():
         trainer.say(f"continuing from step {trainer.step} of {trainer.total}")
     last_save = time.monotonic()
@@ -66,13 +67,17 @@ class Trainer:
     """The mutable state of a run: network, optimizer, averaged weights, step."""
 
     def __init__(
-        self, config: TrainConfig, data: Dataset, run_dir: Path, process: Process, device: torch.device
+        self,
+        config: TrainConfig,
+        data: Dataset,
+        network: Network,
+        run_dir: Path,
+        process: Process,
+        device: torch.device,
     ) -> None:
         self.config, self.data, self.run_dir, self.process, self.device = config, data, run_dir, process, device
-        torch.manual_seed(config.seed)
-        self.network = Network(config.network, len(data.manifest["segments"])).to(device)
-        self.average = Network(config.network, len(data.manifest["segments"])).to(device)
-        self.average.load_state_dict(self.network.state_dict())
+        self.network = network.to(device)
+        self.average = copy.deepcopy(self.network)
         self.optimizer = torch.optim.AdamW(_parameter_groups(self.network, config), lr=config.learning_rate, fused=True)
         self.examples = len(data) - config.holdout
         self.orders: dict[int, Tensor] = {}
