@@ -46,7 +46,8 @@ class AlignmentNet(nn.Module):
 
     def forward(self, cloud: Float[Tensor, "b n 3"], queries: Float[Tensor, "b q 3"] | None = None) -> Aligned:
         seen = cloud[:, : self.FITTED]
-        code = self.decoder.prepare(self.encoder(cloud[:, : self.points]), cloud, cloud[:, 0])
+        unused = torch.zeros_like(cloud[:, 0])  # the viewpoint: rest coordinates need no lines of sight
+        code = self.decoder.prepare(self.encoder(cloud[:, : self.points]), cloud, unused)
         places = seen if queries is None else torch.cat([seen, queries], dim=1)
         rest = self.decoder.features(code, places).float()
         alignment = fit_rigid(seen, rest[:, : seen.shape[1]].detach())

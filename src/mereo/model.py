@@ -31,7 +31,6 @@ DENSE_FACTOR = 8
 CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 4096, 65536
 """Queries evaluated at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
 
-
 ALIGNED_QUERIES = 128
 """Queries per example that train the alignment: neighbours say much the same about a nearly rigid motion."""
 
