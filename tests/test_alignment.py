@@ -9,7 +9,7 @@ from torch import Tensor
 from mereo.aligner import AlignmentNet
 from mereo.alignment import Alignment, fit_rigid
 from mereo.config import PRESETS
-from mereo.losses import alignment_loss
+from mereo.losses import rest_loss
 from mereo.model import Network
 
 TINY = PRESETS["tiny"].network
@@ -98,7 +98,7 @@ def test_loss_is_the_mean_distance_inside() -> None:
     rest = torch.zeros(1, 4, 3)
     rest[0, 2:] = torch.nan
     predicted = torch.tensor([[[3.0, 0, 4.0], [0, 1.0, 0], [9.0, 9.0, 9.0], [0, 0, 0]]], requires_grad=True)
-    loss = alignment_loss(predicted, rest)
+    loss = rest_loss(predicted, rest)
     loss.backward()  # type: ignore[no-untyped-call]
     assert torch.isclose(loss, torch.tensor(3.0), atol=1e-3)
     assert predicted.grad is not None and torch.isfinite(predicted.grad).all()
@@ -108,7 +108,7 @@ def test_loss_is_the_mean_distance_inside() -> None:
 def test_loss_without_rest_coordinates_is_zero() -> None:
     """A scene whose deformation cannot be inverted trains without this term, not into NaN."""
     predicted = torch.randn(2, 5, 3, requires_grad=True)
-    loss = alignment_loss(predicted, torch.full((2, 5, 3), torch.nan))
+    loss = rest_loss(predicted, torch.full((2, 5, 3), torch.nan))
     loss.backward()  # type: ignore[no-untyped-call]
     assert loss.item() == 0 and predicted.grad is not None and torch.isfinite(predicted.grad).all()
 
@@ -127,7 +127,7 @@ def test_aligner_learns_a_turned_object() -> None:
 
     for step in range(80):
         cloud, rest = batch(step)
-        loss = alignment_loss(aligner(cloud, cloud).rest, rest)
+        loss = rest_loss(aligner(cloud, cloud).rest, rest)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()

@@ -37,9 +37,12 @@ def settled(config: NetworkConfig, segments: int = 3) -> Network:
 def test_every_preset_answers_with_its_shapes(name: str) -> None:
     network = settled(PRESETS[name].network, segments=5)
     with torch.inference_mode():
-        logits, distance, direction, rest = network(cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3))
+        logits, distance, direction, rest, coarse = network(
+            cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3)
+        )
     assert logits.shape == (2, 11, 6) and distance.shape == (2, 11) and direction.shape == (2, 11, 3)
-    assert rest is None if name == "paper" else rest is not None and rest.shape == (2, 11, 3)
+    for found in (rest, coarse):
+        assert found is None if name == "paper" else found is not None and found.shape == (2, 11, 3)
 
 
 def test_paper_preset_has_the_papers_sizes() -> None:

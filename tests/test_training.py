@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -129,6 +130,7 @@ def test_it_learns_the_two_halves(dataset: Path, tmp_path: Path) -> None:
     with (tmp_path / "run" / "metrics.csv").open() as file:
         last = list(csv.DictReader(file))[-1]
     assert float(last["val_iou"]) > 0.85 and float(last["val_miou"]) > 0.75
+    assert float(last["rest"]) < 0.2
     model = load_model(tmp_path / "run" / "weights.safetensors")
     rng = np.random.default_rng(0)
     front = rng.normal(size=(300, 3))
@@ -167,6 +169,31 @@ def test_training_starts_from_given_weights(dataset: Path, tmp_path: Path) -> No
     with pytest.raises(FileNotFoundError, match="no weights 'lost'"):
         training.train(dataset, tmp_path / "second", replace(config, init="lost"))
     assert not (tmp_path / "second").exists()
+
+
+def test_a_lookup_may_be_added_to_given_weights(dataset: Path, tmp_path: Path) -> None:
+    """Its grid is the dataset's; all else is that of the weights."""
+    plain = replace(SMALL, network=replace(SMALL.network, rest_template=False))
+    first = training.train(dataset, tmp_path / "first", replace(plain, epochs=0.2))
+    data = training.Dataset.load(dataset)
+    network = start_network(replace(SMALL, init=str(first)), data)
+    state = network.state_dict()
+    assert all(torch.equal(state[k], v) for k, v in load_file(first).items())
+    assert data.template is not None and torch.equal(state["decoder.lookup.distance"], data.template)
+
+
+def test_a_dataset_without_template_is_refused(dataset: Path, tmp_path: Path) -> None:
+    """Unless the network does not read it; before anything is written."""
+    old = tmp_path / "old"
+    shutil.copytree(dataset, old)
+    (old / "template.safetensors").unlink()
+    with pytest.raises(
+        ValueError, match=r"has no template.safetensors.*continue it with mereo generate \.\.\. --resume"
+    ):
+        training.train(old, tmp_path / "run", SMALL)
+    assert not (tmp_path / "run").exists()
+    plain = replace(SMALL, epochs=0.2, network=replace(SMALL.network, rest_template=False))
+    training.train(old, tmp_path / "run", plain)
 
 
 def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:

@@ -10,6 +10,9 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
+from mereo.config import TEMPLATE
+from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
+
 NAMES = ("left", "right")
 SHARD = 32
 
@@ -32,7 +35,16 @@ def write_toy_dataset(directory: Path, examples: int = 64, points: int = 96, que
         "segments": [{"name": name, "color": [50 * i, 90, 200]} for i, name in enumerate(NAMES)],
     }
     (directory / "manifest.json").write_text(json.dumps(manifest))
+    save_file({"distance": _template()}, directory / TEMPLATE)
     return directory
+
+
+def _template() -> np.ndarray:
+    """Signed distances to the two halves of the unit ball; on the far side of the wall, to the wall's plane."""
+    axis = np.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    ball = np.sqrt(x**2 + y**2 + z**2) - 1
+    return np.stack([np.maximum(ball, x), np.maximum(ball, -x)]).astype(np.float16)
 
 
 def _example(rng: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:

@@ -49,6 +49,6 @@ class AlignmentNet(nn.Module):
         unused = torch.zeros_like(cloud[:, 0])  # the viewpoint: rest coordinates need no lines of sight
         code = self.decoder.prepare(self.encoder(cloud[:, : self.points]), cloud, unused)
         places = seen if queries is None else torch.cat([seen, queries], dim=1)
-        rest = self.decoder.features(code, places).float()
+        rest, _ = self.decoder.features(code, places)
         alignment = fit_rigid(seen, rest[:, : seen.shape[1]].detach())
         return Aligned(alignment, rest[:, seen.shape[1] :])

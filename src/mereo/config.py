@@ -12,6 +12,9 @@ TEST_SEED_START = 1_000_000
 MIN_POINTS = 32
 """Fewer observed points say too little about an object: they are refused, drawn again, or left as they were."""
 
+TEMPLATE = "template.safetensors"
+"""A dataset's file with the segments at rest (``rest_pose``)."""
+
 Sampler = Literal["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"]
 
 
@@ -72,6 +75,7 @@ class NetworkConfig:
         local_width: channels of that attention.
         sight_neighbors: observed points nearest to the query's line of sight that it compares depth with; 0 is off.
         align_points: points from which the object's rest-pose frame is estimated first; 0 works in the camera frame.
+        rest_template: look queries up in the rest pose's model, at predicted rest coordinates.
     """
 
     points: int = 1024
@@ -93,6 +97,7 @@ class NetworkConfig:
     local_width: int = 128
     sight_neighbors: int = 0
     align_points: int = 0
+    rest_template: bool = False
 
     @property
     def latent(self) -> int:
@@ -182,6 +187,7 @@ _HALF = NetworkConfig(
     local_width=64,
     sight_neighbors=4,
     align_points=256,
+    rest_template=True,
 )
 
 
@@ -221,7 +227,9 @@ PRESETS: dict[str, TrainConfig] = {
     "base": TrainConfig(network=_HALF, epochs=60, **_MODERN_RECIPE),
     # the same with the paper's widths, for a GPU
     "large": TrainConfig(
-        network=NetworkConfig(points=1024, neighbors=32, local_neighbors=6, sight_neighbors=4, align_points=256),
+        network=NetworkConfig(
+            points=1024, neighbors=32, local_neighbors=6, sight_neighbors=4, align_points=256, rest_template=True
+        ),
         epochs=100,
         **_MODERN_RECIPE,
     ),
@@ -239,6 +247,7 @@ PRESETS: dict[str, TrainConfig] = {
                 local_width=64,
                 sight_neighbors=4,
                 align_points=128,
+                rest_template=True,
             ),
             batch=32,
             epochs=10,

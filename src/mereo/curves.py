@@ -7,7 +7,7 @@ from typing import Any
 
 from mereo.output import atomic_file
 
-FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "val_iou", "val_miou")
+FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "val_iou", "val_miou")
 Row = dict[str, float]
 
 

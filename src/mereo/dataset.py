@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from mereo.config import MIN_POINTS, AugmentConfig
+from mereo.config import MIN_POINTS, TEMPLATE, AugmentConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +41,7 @@ class Dataset:
         cloud: observed points in farthest-point order; only the first ``count`` of each are real.
         viewpoint: the camera's position in normalized coordinates.
         manifest: how the dataset was made.
+        template: signed distances to the segments at rest (``rest_pose.rest_distances``); None in older datasets.
     """
 
     cloud: Float[Tensor, "e p 3"]
@@ -52,6 +53,7 @@ class Dataset:
     directions: Float[Tensor, "e q 3"]
     rest: Float[Tensor, "e q 3"]
     manifest: dict[str, Any]
+    template: Float[Tensor, "s n n n"] | None = None
 
     def __len__(self) -> int:
         return len(self.cloud)
@@ -79,6 +81,7 @@ class Dataset:
             viewpoint=viewpoint,
             **{key: joined[key] for key in queries},
             manifest=manifest,
+            template=_read_template(directory),
         )
 
     @property
@@ -150,6 +153,11 @@ def _read_shard(path: Path) -> dict[str, Tensor]:
         return load_file(path)
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path} cannot be read ({error}); delete it and run mereo generate ... --resume") from None
+
+
+def _read_template(directory: Path) -> Tensor | None:
+    path = directory / TEMPLATE
+    return _read_shard(path)["distance"].float() if path.is_file() else None
 
 
 def choose_points(

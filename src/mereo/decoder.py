@@ -16,6 +16,7 @@ from mereo.alignment import Alignment
 from mereo.config import NetworkConfig
 from mereo.encoders.pointnet2 import Encoding, Level
 from mereo.neighbors import gather, nearest
+from mereo.template import RestLookup
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +41,15 @@ class Code:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Raw outputs at each query: class logits (0 is empty), signed distance, direction (not yet unit length)."""
+    """Raw outputs at each query: class logits (0 is empty), signed distance, direction (not yet unit length).
+
+    ``rest`` are rest coordinates (``rest_pose``), meant inside the object; None where the network predicts none.
+    """
 
     logits: Float[Tensor, "b q c"]
     distance: Float[Tensor, "b q"]
     direction: Float[Tensor, "b q 3"]
+    rest: Float[Tensor, "b q 3"] | None = None
 
 
 class FrequencyEncoding(nn.Module):
@@ -113,9 +118,9 @@ class ConditionedMLP(nn.Module):
     Queries are in the camera frame; the levels of the code may be in an aligned one.
     """
 
-    def __init__(self, config: NetworkConfig, outputs: int) -> None:
+    def __init__(self, config: NetworkConfig, outputs: int, lookup: RestLookup | None = None) -> None:
         super().__init__()
-        self.config = config
+        self.config, self.lookup = config, lookup
         self.encode = FrequencyEncoding(config.lowest_exponent, config.highest_exponent)
         query, width = self.encode.channels if config.encode_positions else 3, config.width
         self.latent1 = nn.Linear(config.latent, width, bias=False)
@@ -149,8 +154,10 @@ class ConditionedMLP(nn.Module):
         )
         return Code(self.latent1(encoding.latent), self.latent2(encoding.latent), levels, cloud, viewpoint, alignment)
 
-    def features(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q f"]:
-        """The last layer's outputs."""
+    def features(
+        self, code: Code, queries: Float[Tensor, "b q 3"]
+    ) -> tuple[Float[Tensor, "b q f"], Float[Tensor, "b q 3"] | None]:
+        """The last layer's outputs, and the rest coordinates of the lookup on the way, if there is one."""
         placed = queries if code.alignment is None else code.alignment.apply(queries)
         encoded = self.encode(placed) if self.config.encode_positions else placed
         hidden = self.query1(encoded) + code.latent1[:, None]
@@ -160,24 +167,31 @@ class ConditionedMLP(nn.Module):
         if self.config.sight_neighbors:
             sight = line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors)
             hidden = hidden + self.sight1(sight)
+        rest = None
         for number, norm in enumerate(self.norms):  # layer `number` is counted from 0
+            before = hidden
             if number > 0:
                 hidden = self.hidden[number - 1](hidden)
             if number == self.config.skip_after:
                 hidden = hidden + self.query2(encoded) + code.latent2[:, None]
+                if self.lookup is not None:
+                    rest, known = self.lookup(before, placed)
+                    hidden = hidden + known
             hidden = torch.relu(norm(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
-        return self.head(hidden).float()
+        return self.head(hidden).float(), rest
 
 
 class Decoder(ConditionedMLP):
     """Code and query points -> class logits, signed distance, direction."""
 
     def __init__(self, config: NetworkConfig, classes: int) -> None:
-        super().__init__(config, classes + 4)
+        lookup = RestLookup(config.width, classes - 1) if config.rest_template else None
+        super().__init__(config, classes + 4, lookup)
         self.classes = classes
 
     def forward(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Prediction:
-        logits, distance, direction = self.features(code, queries).split([self.classes, 1, 3], dim=-1)
+        features, rest = self.features(code, queries)
+        logits, distance, direction = features.split([self.classes, 1, 3], dim=-1)
         if code.alignment is not None:
             direction = code.alignment.turn_back(direction)
-        return Prediction(logits, distance[..., 0], direction)
+        return Prediction(logits, distance[..., 0], direction, rest)

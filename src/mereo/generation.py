@@ -6,6 +6,8 @@ again, and ``shard-00000.safetensors`` and so on, whose tensors are (e examples,
     cloud f32 [e, p, 3], cloud_count i32 [e], center f64 [e, 3], scale f64 [e],
     positions f32 [e, q, 3], labels u8 [e, q], distances f32 [e, q], directions f16 [e, q, 3], rest f16 [e, q, 3]
 
+and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``rest_pose``).
+
 Workers only compute; this process alone writes. So one place meets a full disk, and whatever kills a worker leaves
 nothing half-written.
 """
@@ -28,10 +30,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from mereo.config import TEST_SEED_START, GenerateConfig
+from mereo.config import TEMPLATE, TEST_SEED_START, GenerateConfig
 from mereo.output import atomic_file, write_json
 from mereo.parallel import in_processes
 from mereo.query_sampling import check_settings
+from mereo.rest_pose import rest_distances
 from mereo.scene import Scene, load_scene
 from mereo.synthesis import Example, example_rng, synthesize
 
@@ -108,12 +111,16 @@ def generate(
     """
     _check_request(examples, seed, workers, shard, test)
     check_settings(settings.sampling)
-    manifest = make_manifest(load_scene(scene) if isinstance(scene, str) else scene, settings, examples, seed)
+    loaded = load_scene(scene) if isinstance(scene, str) else scene
+    manifest = make_manifest(loaded, settings, examples, seed)
     shards = [
         _Shard(output / f"shard-{n:05d}.safetensors", n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
         for n in range(shard[0], -(-examples // SHARD_SIZE), shard[1])
     ]
     _claim_directory(output, manifest, shards, resume, alone=shard[1] == 1)
+    if not (output / TEMPLATE).exists():
+        with atomic_file(output / TEMPLATE) as temporary:
+            temporary.write_bytes(save({"distance": rest_distances(loaded.rest)}))
     missing = [item for item in shards if not item.is_complete()]
     total = sum(item.end - item.first for item in missing)
     work = partial(_make_shard, _Work(scene, settings, seed))

@@ -33,8 +33,12 @@ def occupancy_loss(
     return total, terms
 
 
-def alignment_loss(predicted: Float[Tensor, "b q 3"], rest: Float[Tensor, "b q 3"]) -> Float[Tensor, ""]:
-    """Mean distance between predicted and true rest-pose coordinates; rows that are NaN (outside) are left out.
+REST_WEIGHT = 3.0
+"""Weight of the rest coordinates by which the decoder looks queries up in the rest pose."""
+
+
+def rest_loss(predicted: Float[Tensor, "b q 3"], rest: Float[Tensor, "b q 3"]) -> Float[Tensor, ""]:
+    """Mean distance between predicted and true rest coordinates; rows that are NaN (outside) are left out.
 
     The distance, not its square, so that the ends of wide bends do not outweigh the rest.
     """

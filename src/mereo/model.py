@@ -65,16 +65,23 @@ class Network(nn.Module):
 
     def forward(
         self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], points: Float[Tensor, "b q 3"]
-    ) -> tuple[Float[Tensor, "b q c"], Float[Tensor, "b q"], Float[Tensor, "b q 3"], Float[Tensor, "b a 3"] | None]:
-        """What training needs: logits, distance, direction, and rest-pose coordinates at the first queries.
+    ) -> tuple[
+        Float[Tensor, "b q c"],
+        Float[Tensor, "b q"],
+        Float[Tensor, "b q 3"],
+        Float[Tensor, "b q 3"] | None,
+        Float[Tensor, "b a 3"] | None,
+    ]:
+        """What training needs: logits, distance, direction, and rest coordinates twice.
 
-        The coordinates are those the alignment is made from, at the first ``ALIGNED_QUERIES``; None without alignment.
+        First those of the template lookup, then those that the alignment is made from, at the first
+        ``ALIGNED_QUERIES``; None where the network has no such part.
         """
-        alignment, rest = None, None
+        alignment, coarse = None, None
         if self.aligner is not None:
-            alignment, rest = self.aligner(cloud, points[:, :ALIGNED_QUERIES])
+            alignment, coarse = self.aligner(cloud, points[:, :ALIGNED_QUERIES])
         prediction = self.query(self._encode(cloud, viewpoint, alignment), points)
-        return prediction.logits, prediction.distance, prediction.direction, rest
+        return prediction.logits, prediction.distance, prediction.direction, prediction.rest, coarse
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,9 +228,11 @@ def thin(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.ndarray, "m 3
 
 
 def config_from_dict(values: dict[str, object]) -> NetworkConfig:
-    """Inverse of ``dataclasses.asdict`` after a trip through JSON; unknown or missing keys raise ``ValueError``."""
-    known = {f.name for f in fields(NetworkConfig)}
-    if set(values) != known:
-        odd = sorted(set(values) ^ known)
+    """Inverse of ``dataclasses.asdict`` after a trip through JSON; unknown keys raise ``ValueError``.
+
+    Settings that older weights do not state have their defaults: what they switch on did not exist then.
+    """
+    odd = sorted(set(values) - {f.name for f in fields(NetworkConfig)})
+    if odd:
         raise ValueError(f"the network settings differ in {odd[0]!r} from this version of mereo; train again")
     return NetworkConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from mereo.config import TrainConfig
+from mereo.config import TEMPLATE, TrainConfig
 from mereo.dataset import Dataset
 from mereo.model import Network
 from mereo.output import write_json
@@ -51,18 +51,28 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
                 f"{', '.join(names)}; both must be the same in the same order: "
                 "start from other weights, or without --init"
             )
-        odd = [
-            f.name
-            for f in fields(config.network)
-            if getattr(start.network.config, f.name) != getattr(config.network, f.name)
-        ]
-        if odd:
+        _copy_weights(start.network, network, config.init)
+    lookup = network.decoder.lookup
+    if lookup is not None:
+        if data.template is None:
             raise ValueError(
-                f"the weights {config.init} have another network setting {odd[0]}; continuing needs the same "
-                "network: use the preset and settings they were trained with, or train without --init"
+                f"the dataset has no {TEMPLATE}, which this network reads; an older mereo made it: continue it with "
+                "mereo generate ... --resume, or train with --network.rest-template False"
             )
-        network.load_state_dict(start.network.state_dict())
+        lookup.distance.copy_(data.template)
     return network
+
+
+def _copy_weights(start: Network, network: Network, name: str) -> None:
+    """Weights of the same architecture; only the template lookup, which begins as nothing, may be new."""
+    known = replace(start.config, rest_template=start.config.rest_template or network.config.rest_template)
+    odd = [f.name for f in fields(known) if getattr(known, f.name) != getattr(network.config, f.name)]
+    if odd:
+        raise ValueError(
+            f"the weights {name} have another network setting {odd[0]}; continuing needs the same "
+            "network: use the preset and settings they were trained with, or train without --init"
+        )
+    network.load_state_dict(network.state_dict() | start.state_dict())
 
 
 def join_processes() -> Process:

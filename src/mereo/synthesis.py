@@ -21,6 +21,7 @@ from mereo.mesh import SegmentedMesh
 from mereo.ordering import farthest_point_order
 from mereo.query_sampling import Samples, sample_queries
 from mereo.rendering import add_depth_noise, render_depth
+from mereo.rest_pose import rest_frame
 from mereo.scene import Scene
 from mereo.solid import Nearest, Solids, signed_distance_and_direction
 
@@ -53,8 +54,8 @@ class LabelledPoints:
         positions, labels: where, and which segment (0 is empty space).
         distances: signed, to the nearest segment surface, negative inside any segment.
         directions: unit vector to that surface.
-        rest: rest-pose coordinates of inside points, ``(rest - box centre) / half of the box's longest side`` of the
-            joint rest box; NaN outside, and where the deformation could not be inverted.
+        rest: rest coordinates (``rest_pose``) of inside points; NaN outside, and where the deformation could not be
+            inverted.
     """
 
     positions: Float[np.ndarray, "q 3"]
@@ -142,7 +143,6 @@ def label_queries(scene: Scene, view: View, solids: Solids, samples: Samples, no
 
 def rest_coordinates(scene: Scene, view: View, samples: Samples, nearest: Nearest) -> Float[np.ndarray, "q 3"]:
     """Where inside points were before the deformation, normalized by the joint rest box; NaN for the others."""
-    low, high = scene.rest.bounds
     inside = np.flatnonzero(samples.labels)
     world = transform_points(view.T_world_camera, samples.points[inside])
     guess = _rest_guess(scene.rest, view.mesh, samples.points[inside], nearest.point[inside], nearest.face[inside])
@@ -154,7 +154,8 @@ def rest_coordinates(scene: Scene, view: View, samples: Samples, nearest: Neares
         if len(members):
             found, converged = invert(deformation, world[members], guess[members])
             rest[inside[members[converged]]] = found[converged]
-    return (rest - (low + high) / 2) / ((high - low).max() / 2)
+    center, half = rest_frame(scene.rest)
+    return (rest - center) / half
 
 
 def _rest_guess(

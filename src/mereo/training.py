@@ -24,7 +24,7 @@ from mereo.curves import MetricsLog
 from mereo.dataset import Batch, Dataset
 from mereo.decoder import Prediction
 from mereo.hardware import compiling_pays, keep_freed_memory, pick_device, pick_precision
-from mereo.losses import alignment_loss, occupancy_loss
+from mereo.losses import REST_WEIGHT, occupancy_loss, rest_loss
 from mereo.metrics import confusion_matrix, intersection_over_union
 from mereo.model import Model, Network
 from mereo.run import Process, claim_run, fit_config, join_processes, start_network
@@ -148,18 +148,22 @@ class Trainer:
 
     def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         with torch.autocast(self.device.type, self.autocast) if self.autocast else nullcontext():
-            *outputs, rest = self.module(batch.cloud, batch.viewpoint, batch.positions)
+            *outputs, coarse = self.module(batch.cloud, batch.viewpoint, batch.positions)
+        prediction = Prediction(*outputs)
         loss, terms = occupancy_loss(
-            Prediction(*outputs),
+            prediction,
             batch.labels,
             batch.distances,
             batch.directions,
             self.config.loss,
             self.config.l1_weight,
         )
-        if rest is not None:
-            terms["align"] = alignment_loss(rest, batch.rest[:, : rest.shape[1]])
+        if coarse is not None:
+            terms["align"] = rest_loss(coarse, batch.rest[:, : coarse.shape[1]])
             loss = loss + terms["align"]
+        if prediction.rest is not None:
+            terms["rest"] = rest_loss(prediction.rest, batch.rest)
+            loss = loss + REST_WEIGHT * terms["rest"]
         return loss, {name: value.detach() for name, value in terms.items()}
 
     def _learning_rate(self) -> float:
