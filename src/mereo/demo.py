@@ -29,8 +29,8 @@ OWN_OBJECT = """[bold]On your own data[/bold]
 [bold]On your own object[/bold]: describe it as in src/mereo/scenes/rope.py, then
   mereo scene check NAME
   mereo scene preview NAME --output states.png
-  mereo generate NAME --examples 9600 --seed 1 --output data/NAME
-  mereo train data/NAME --output runs/NAME --preset base
+  mereo generate NAME --examples 12000 --seed 1 --sampler nested-sort-sample --uniform-fraction 0.5 --output data/NAME
+  mereo train data/NAME --output runs/NAME --preset base --epochs 20
   mereo evaluate runs/NAME/weights.safetensors --output runs/NAME/test
   mereo reconstruct frame.ply --weights runs/NAME/weights.safetensors --output result"""
 
