@@ -57,7 +57,7 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
         if data.template is None:
             raise ValueError(
                 f"the dataset has no {TEMPLATE}, which this network reads; an older mereo made it: continue it with "
-                "mereo generate ... --resume, or train with --network.rest-template False"
+                "mereo generate ... --resume, or train with --network.no-rest-template"
             )
         lookup.distance.copy_(data.template)
     return network
