@@ -66,7 +66,7 @@ def test_killed_and_resumed_equals_uninterrupted(
         patch.setattr(generation, "synthesize", stops)
         generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3)
     complete = contents(tmp_path / "data")
-    assert len(complete) == 1 + calls // 4
+    assert len(complete) == 2 + calls // 4  # manifest and template come first
     assert complete.items() <= contents(whole).items()
     generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, resume=True)
     assert contents(tmp_path / "data") == contents(whole)
@@ -238,17 +238,23 @@ def test_a_dataset_is_not_overwritten_without_being_asked(whole: Path) -> None:
         generate(TOY, whole, SMALL, examples=10, seed=3)
 
 
-def test_a_full_disk_is_one_sentence_and_leaves_no_half_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("victim", ["template", "shard-00000"])
+def test_a_full_disk_is_one_sentence_and_leaves_no_half_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, victim: str
+) -> None:
     written = Path.write_bytes
 
     def full(path: Path, data: bytes) -> int:
+        if victim not in path.name:
+            return written(path, data)
         written(path, data[: len(data) // 2])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match=r"the disk is full while writing .*shard-00000\.safetensors; free space or"):
+    with pytest.raises(OSError, match=rf"the disk is full while writing .*{victim}\.safetensors; free space or"):
         generate(TOY, tmp_path / "data", SMALL, examples=4, seed=1)
-    assert [path.name for path in (tmp_path / "data").iterdir()] == ["manifest.json"]
+    whole = ["manifest.json"] if victim == "template" else ["manifest.json", "template.safetensors"]
+    assert sorted(contents(tmp_path / "data")) == whole
 
 
 def test_what_a_killed_run_was_writing_is_removed_on_resume(whole: Path, tmp_path: Path) -> None:
