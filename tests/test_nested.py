@@ -20,6 +20,7 @@ from mereo.ownership import owner_labels
 from mereo.query_sampling import label_uniform, nested_sort_sample, sample_queries, sort_sample, volume_uniform
 from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
 from mereo.scene import Scene
+from mereo.shading import Viewpoint, shade
 from mereo.solid import Solids, check_overlap, label_grid, signed_distance_and_direction
 from mereo.synthesis import example_rng, sample_view, synthesize
 
@@ -226,6 +227,14 @@ def test_the_outer_surface_includes_the_wall_of_the_cavity_and_volumes_add_up() 
     assert inner.volume == pytest.approx(4 / 3 * np.pi * 0.45**3, rel=0.02)
     assert inner.volume + outer.volume == pytest.approx(4 / 3 * np.pi, rel=0.01)
     assert cKDTree(outer.vertices).query(inner.vertices)[0].max() < 1e-5  # marching cubes is in single precision
+
+
+def test_a_picture_shows_what_is_nested_through_what_is_around_it() -> None:
+    def middle(mesh: SegmentedMesh) -> np.ndarray:
+        return shade(mesh, Viewpoint.along(mesh.bounds, (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)), (40, 40))[20, 14].astype(int)
+
+    alone, within = middle(organ(())), middle(organ())
+    assert np.abs(alone - within).max() > 40
 
 
 # --- a scene ----------------------------------------------------------------------------------------------------------

@@ -58,10 +58,10 @@ class Fit:
         return Rigid(np.array(self.rotation_rad), np.array(self.shift), np.array(self.center))(points)
 
 
-SEAT = Fit((-3.493, 0.331, 8.069), (0.0416, -0.1896, 0.0117), (0.3001, -0.348, 0.1869))
+SEAT = Fit((-3.493, 0.331, 8.069), (0.0434, -0.1474, 0.0008), (0.1938, -0.3709, 0.1674))
 """Of the lower teeth into the mandible: the smallest motion that has all roots in the bone."""
 
-CLOSE = Fit((3.493, -0.162, 1.455), (-0.0158, 0.5760, -0.0129), (-0.5887, -0.0331, 0.2394))
+CLOSE = Fit((3.493, -0.162, 1.455), (-0.0076, 0.5850, -0.0082), (-0.5965, 0.0297, 0.2335))
 """Of the mandible: the cusps of its teeth come as near to the upper teeth as they can without touching, and its joints
 leave the skull."""
 
@@ -108,11 +108,24 @@ def jaw_motion(joint: Joint, open_rad: float, protrusion: float, lateral_rad: fl
     )
 
 
+def jaw_state(opening: float, forward: float, side: float) -> tuple[float, float, float]:
+    """Opening angle, protrusion and lateral angle from shares: of the opening, and of what it leaves free.
+
+    Closed teeth hold the jaw, and so do its ligaments when the mouth is wide open: Posselt's envelope, roughly.
+
+    Args:
+        opening, forward: 0 to 1.
+        side: -1 to 1.
+    """
+    open_rad = opening * OPEN_RAD
+    free = min(1.0, open_rad / DISENGAGED_RAD) * (1.0 - 0.6 * opening)
+    return open_rad, free * forward * PROTRUSION, free * side * LATERAL_RAD
+
+
 def sample_jaw(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Opening, protrusion and lateral angle; one mouth in seven is closed (Posselt's envelope, roughly)."""
-    open_rad = 0.0 if rng.uniform() < 1 / 7 else rng.uniform(0.0, OPEN_RAD)
-    freedom = min(1.0, open_rad / DISENGAGED_RAD) * (1.0 - 0.6 * open_rad / OPEN_RAD)
-    return open_rad, freedom * rng.uniform(0.0, PROTRUSION), freedom * rng.uniform(-LATERAL_RAD, LATERAL_RAD)
+    """A random ``jaw_state``; one mouth in seven is closed."""
+    opening = 0.0 if rng.uniform() < 1 / 7 else rng.uniform()
+    return jaw_state(opening, rng.uniform(), rng.uniform(-1.0, 1.0))
 
 
 # --- the model --------------------------------------------------------------------------------------------------------
