@@ -106,12 +106,11 @@ def test_the_jaw_never_touches_the_skull() -> None:
         jaw = skull.jaw_motion(joint, open_rad, protrusion, lateral_rad)
         state = rest.with_vertices([s.vertices if i < 2 else jaw(s.vertices) for i, s in enumerate(rest.segments)])
         moved = [segment.vertices for segment in state.segments[2:]]
-        # closed, the joint's own gap is the smallest
-        assert min(signed(still, index, points).min() for index in (0, 1) for points in moved) > 0.04
+        assert min(signed(still, index, points).min() for index in (0, 1) for points in moved) > 0.09
         turned = Solids(state)
         around = cranium.vertices[cranium.vertices[:, 2] > 0.0]
-        assert min(signed(turned, index, upper.vertices).min() for index in (2, 3)) > 0.04
-        assert signed(turned, 3, around).min() > 0.04
+        assert min(signed(turned, index, upper.vertices).min() for index in (2, 3)) > 0.09
+        assert signed(turned, 3, around).min() > 0.09
         if share == 1.0 and forward == side == 0:
             gap = upper.vertices[:, 0].min() - moved[0][:, 0].max()
             assert 1.0 < gap < 6.0, "the mouth is open by 8 to 50 mm"

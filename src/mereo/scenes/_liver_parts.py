@@ -33,7 +33,7 @@ SHORTEST_SIDE_MM = 162.68
 MM = SHORTEST_SIDE / SHORTEST_SIDE_MM
 """Scene units per millimetre."""
 
-CENTER_MM = (-3.337, -3.869, 0.0)
+CENTER_MM = (-3.333, -3.867, 0.0)
 """Middle of the liver's box in the frame of the source."""
 
 LIVER_FACES, GALLBLADDER_FACES = 5000, 2000

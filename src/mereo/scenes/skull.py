@@ -8,7 +8,7 @@ filled.
 Segments: `upper_teeth` and `lower_teeth` (16 each, crowns and roots), `cranium` and `mandible`, from which the roots
 are cut: teeth own what they share with bone. The source shows the mouth open, the jaw's joints pushed into the skull
 and the lower teeth beside their bone; here the lower teeth are seated in it and the jaw is closed, both by a rigid
-motion (`SEAT`, `CLOSE`). At rest all upper and lower teeth are 0.1 units apart or more.
+motion (`SEAT`, `CLOSE`). At rest nothing of the jaw is nearer than 0.1 units (1 mm) to the skull.
 
 Degrees of freedom: the jaw turns about the axis through both condyles by 0 to 28 degrees, which glide forward by up to
 1 unit (8 mm) and down by 0.35 on the way. From 0 to 6 degrees on it also shifts forward by up to 0.7 units (6 mm)
@@ -61,7 +61,7 @@ class Fit:
 SEAT = Fit((-3.493, 0.331, 8.069), (0.0434, -0.1474, 0.0008), (0.1938, -0.3709, 0.1674))
 """Of the lower teeth into the mandible: the smallest motion that has all roots in the bone."""
 
-CLOSE = Fit((3.493, -0.162, 1.455), (-0.0076, 0.5850, -0.0082), (-0.5965, 0.0297, 0.2335))
+CLOSE = Fit((3.493, -0.162, 1.455), (-0.0076, 0.5850, -0.0082), (-0.64, 0.03, 0.24))
 """Of the mandible: the cusps of its teeth come as near to the upper teeth as they can without touching, and its joints
 leave the skull."""
 
@@ -203,6 +203,6 @@ def scene() -> Scene:
         name="skull",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(21.0))),
+        workspace=Workspace(fov_rad=float(np.deg2rad(22.0))),
         source="SOFA framework, LGPL-2.1-or-later; teeth seated and jaw closed by mereo",
     )
