@@ -30,7 +30,9 @@ Polygon = Float[np.ndarray, "v 2"]
 
 
 class Polygons2D:
-    """Segments as simple polygons, corners in order, either way round. Satisfies ``query_sampling.Shape``."""
+    """Segments as simple polygons, corners in order, either way round. Satisfies ``ownership.Shape``."""
+
+    nesting: tuple[tuple[int, int], ...] = ()
 
     def __init__(self, *outlines: Polygon) -> None:
         self.outlines = outlines

@@ -14,13 +14,13 @@ from PIL import Image
 from mereo import query_sampling
 from mereo.config import SamplingConfig
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.ownership import Shape, owner_labels
 from mereo.query_sampling import (
     Samples,
     extended_boxes,
     joint_box,
     label_uniform,
     nested_sort_sample,
-    owner_labels,
     sample_queries,
     sort_sample,
     volume_uniform,
@@ -43,9 +43,9 @@ def example() -> ModuleType:
 class Balls:
     """Balls in any dimension; every answer in closed form."""
 
-    def __init__(self, *balls: tuple[tuple[float, ...], float]) -> None:
+    def __init__(self, *balls: tuple[tuple[float, ...], float], nesting: tuple[tuple[int, int], ...] = ()) -> None:
         self.centers, self.radii = np.array([c for c, _ in balls]), np.array([r for _, r in balls])
-        self.count = len(balls)
+        self.count, self.nesting = len(balls), nesting
 
     def boxes(self) -> np.ndarray:
         return np.stack([self.centers - self.radii[:, None], self.centers + self.radii[:, None]], axis=1)
@@ -77,7 +77,7 @@ def cube(name: str, shift: float) -> Segment:
     return Segment(name, PALETTE[0], corners, faces)
 
 
-def shapes() -> dict[str, query_sampling.Shape]:
+def shapes() -> dict[str, Shape]:
     """Two dimensions and three, one segment and several, touching and apart, convex and not."""
     outlines, _ = example().read_outlines()
     return {
@@ -101,7 +101,7 @@ def halves(samples: Samples, keep: int) -> list[tuple[Samples, Samples]]:
 # --- the algorithm ---------------------------------------------------------------------------------------------------
 
 
-def one_at_a_time(shape: query_sampling.Shape, keep: int, draw: int, seed: int, nested: bool) -> Samples:
+def one_at_a_time(shape: Shape, keep: int, draw: int, seed: int, nested: bool) -> Samples:
     """The paper's loop, one draw after the other."""
     seeds = np.random.default_rng(seed).integers(0, 2**32, size=(shape.count, 4), dtype=np.uint32)
     points, labels = [], []

@@ -54,7 +54,7 @@ class SceneList:
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """Check that every segment is closed and outward oriented and that no two overlap.
+    """Check that every segment is closed and outward oriented, and that no two overlap unless declared nested.
 
     Attributes:
         scene: a name from `mereo scene list`.
@@ -69,9 +69,10 @@ class SceneCheck:
         scene = load_scene(self.scene)
         scene.rest.check()
         check_overlap(scene.rest)
-        for segment in scene.rest.segments:
-            print(f"{segment.name:<20} {len(segment.faces):>7} faces   volume {segment.volume:.4g} cubic units")
-        print(f"{scene.name}: {len(scene.rest.segments)} segments, closed, outward oriented, without overlap")
+        for segment, volume in zip(scene.rest.segments, scene.rest.owned_volumes, strict=True):
+            print(f"{segment.name:<20} {len(segment.faces):>7} faces   volume {volume:.4g} cubic units")
+        nested = "".join(f", {inner} nested in {outer}" for inner, outer in scene.rest.nested)
+        print(f"{scene.name}: {len(scene.rest.segments)} segments, closed, outward oriented, without overlap{nested}")
         print(f"source: {scene.source}")
 
 

@@ -164,6 +164,7 @@ def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: i
         "scene": scene.name,
         "source": scene.source,
         "segments": [{"name": s.name, "color": s.color} for s in scene.rest.segments],
+        "nested": scene.rest.nested,
         "any_roll": scene.workspace.any_roll,
         "workspace": asdict(scene.workspace),
         "settings": asdict(settings),

@@ -70,9 +70,17 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class SegmentedMesh:
-    """An object: closed segments that touch but do not overlap (unless the caller declares them nested)."""
+    """An object: closed segments that touch but do not overlap, except that one may lie inside another.
+
+    Attributes:
+        segments: in label order.
+        nested: pairs of names (inner, outer): ``outer``'s mesh is its outer surface alone, and the volume inside
+            ``inner`` belongs to ``inner``. The inner segment comes first in ``segments``, so that "the first segment
+            wins" decides everywhere. See docs/design/0005-nested.md.
+    """
 
     segments: tuple[Segment, ...]
+    nested: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         names = [segment.name for segment in self.segments]
@@ -83,6 +91,17 @@ class SegmentedMesh:
             raise ValueError(f"segment name {repeated[0]!r} is used twice; names must be unique: rename one of them")
         if len(names) > 254:
             raise ValueError(f"a segmented mesh has {len(names)} segments; labels hold at most 254: merge some")
+        for inner, outer in self.nested:
+            if missing := [name for name in (inner, outer) if name not in names]:
+                raise ValueError(
+                    f"{inner!r} is declared nested in {outer!r}, but no segment is called {missing[0]!r}; the segments "
+                    f"are {', '.join(names)}: correct the name"
+                )
+            if names.index(inner) >= names.index(outer):
+                raise ValueError(
+                    f"segment {inner!r} is declared nested in {outer!r} but does not come before it; the first of two "
+                    f"segments owns what both hold: put {inner!r} first"
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,9 +117,27 @@ class SegmentedMesh:
         boxes = np.stack([segment.bounds for segment in self.segments])
         return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
+    @property
+    def nesting(self) -> tuple[tuple[int, int], ...]:
+        """``nested`` as indices of segments, with what follows: a in b and b in c puts a in c."""
+        index = {name: i for i, name in enumerate(self.names)}
+        pairs = {(index[inner], index[outer]) for inner, outer in self.nested}
+        while more := {(a, d) for a, b in pairs for c, d in pairs if b == c} - pairs:
+            pairs |= more
+        return tuple(sorted(pairs))
+
+    @property
+    def owned_volumes(self) -> Float[np.ndarray, " s"]:
+        """The volume that belongs to each segment: its mesh's without that of the segments nested in it."""
+        volumes = np.array([segment.volume for segment in self.segments])
+        for outer in range(len(volumes)):  # the inner ones come first and are done
+            volumes[outer] -= sum(volumes[inner] for inner, other in self.nesting if other == outer)
+        return volumes
+
     def with_vertices(self, vertices: Sequence[Float[np.ndarray, "_ 3"]]) -> "SegmentedMesh":
         """The same segments at other positions; ``vertices[i]`` belongs to ``segments[i]``."""
-        return SegmentedMesh(tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True)))
+        moved = tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True))
+        return replace(self, segments=moved)
 
     def transformed(self, transform: Float[np.ndarray, "4 4"]) -> "SegmentedMesh":
         """All vertices mapped by a homogeneous transform."""

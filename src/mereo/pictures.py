@@ -131,7 +131,7 @@ def _from_side(view: View, size: int, up: tuple[float, float, float]) -> Picture
     toward = view.T_world_camera[:3, 3] - center
     arrow = _arrow(center, toward / np.linalg.norm(toward), radius)
     # an arrow that points away from the viewer is hidden by the object, as it should be
-    shown = SegmentedMesh((*world.segments, arrow))
+    shown = replace(world, segments=(*world.segments, arrow))
     z = np.asarray(up) / np.linalg.norm(up)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     direction = -(x / np.linalg.norm(x) + 0.35 * np.cross(z, x) + 0.4 * z)

@@ -9,13 +9,14 @@ result does not depend on the size of a batch: it is, bit for bit, that of drawi
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import cKDTree
 
 from mereo.config import SamplingConfig
+from mereo.ownership import Shape, owner_labels
 
 MAX_DRAWS = 2_000_000
 """Draws for one segment after which sampling gives up: its share of its box is too small to be sampled from."""
@@ -24,29 +25,6 @@ _FIRST_BATCH = 8
 """The first batch draws this many times n; a segment usually fills a tenth to a quarter of its extended box."""
 
 _LARGEST_BATCH = 1 << 17
-
-
-@runtime_checkable
-class Shape(Protocol):
-    """What a sampler asks of an object; ``solid.Solids`` and the polygons of ``examples/sampling_2d.py`` satisfy it.
-
-    Points are [n, d] in the object's frame, distances are in its units.
-    """
-
-    count: int
-    """Number of segments."""
-
-    def boxes(self) -> Float[np.ndarray, "s 2 d"]:
-        """Lower and upper corner of each segment's axis-aligned box."""
-
-    def label(self, points: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, " n"]:
-        """0 in empty space, else index + 1 of the segment that holds the point; the first one where two overlap."""
-
-    def inside(self, index: int, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-        """Whether each point lies in segment ``index``."""
-
-    def segment_distance(self, index: int, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        """Unsigned distance to segment ``index``'s surface."""
 
 
 class Samples(NamedTuple):
@@ -76,24 +54,6 @@ def joint_box(shape: Shape) -> Float[np.ndarray, "2 d"]:
     return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
-def owner_labels(shape: Shape, points: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, " n"]:
-    """Labels where solids may overlap, an organ inside an organ: the segment whose surface is nearest owns the point.
-
-    Only segments that hold the point compete. The nearest surface of all may belong to one that does not: just outside
-    the innermost of three nested balls, it is the innermost ball's.
-    """
-    holds = np.stack([shape.inside(index, points) for index in range(shape.count)])
-    labels = np.where(holds.any(axis=0), holds.argmax(axis=0) + 1, 0).astype(np.uint8)
-    shared = np.flatnonzero(holds.sum(axis=0) > 1)
-    distance = np.full((shape.count, len(shared)), np.inf)
-    for index in np.flatnonzero(holds[:, shared].any(axis=1)):
-        mine = holds[index, shared]
-        distance[index, mine] = shape.segment_distance(int(index), points[shared[mine]])
-    if len(shared):
-        labels[shared] = distance.argmin(axis=0) + 1
-    return labels
-
-
 def volume_uniform(shape: Shape, count: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
     """Volume Uniform: ``count`` points per segment, uniform in its draw box, whatever they hit.
 
@@ -118,7 +78,8 @@ def sort_sample(shape: Shape, keep: int, draw: int, rng: np.random.Generator, bo
     """SortSample: per segment, the ``keep`` points nearest to its surface inside it, and as many in empty space.
 
     Points are drawn uniformly in the segment's draw box until ``draw`` of them lie inside the segment and ``draw`` in
-    empty space; those in other segments are dropped. Where segments overlap, the first one owns the point.
+    empty space; those in other segments are dropped. Where segments overlap, the first one owns the point. A segment
+    declared nested has no empty space around it: draws in those around it are its outside, with their labels.
 
     Args:
         shape: the object, with d-dimensional points.
@@ -186,8 +147,8 @@ def check_settings(settings: SamplingConfig) -> None:
 class _Draws:
     """The draws for one segment, up to the one at which both sides hold ``need``."""
 
-    def __init__(self, index: int, box: Float[np.ndarray, "2 d"], need: int, others: bool, seed: np.ndarray) -> None:
-        self.index, self.box, self.need, self.others = index, box, need, others
+    def __init__(self, index: int, box: Float[np.ndarray, "2 d"], need: int, outside: np.ndarray, seed: np.ndarray):
+        self.index, self.box, self.need, self.outside = index, box, need, outside
         self.rng = np.random.default_rng(seed)
         self.points = np.empty((0, box.shape[1]))
         self.labels = np.empty(0, dtype=np.uint8)
@@ -195,9 +156,7 @@ class _Draws:
 
     def sides(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows of the draws inside the segment and of those that count as outside, in drawing order."""
-        inside = self.labels == self.index + 1
-        outside = ~inside if self.others else self.labels == 0
-        return np.flatnonzero(inside), np.flatnonzero(outside)
+        return np.flatnonzero(self.labels == self.index + 1), np.flatnonzero(self.outside[self.labels])
 
     def next_batch(self) -> Float[np.ndarray, "b d"]:
         """About as many draws as are still missing, from the hit rate so far; at most four times those made."""
@@ -225,7 +184,7 @@ class _Draws:
         found, where = inside, "inside it"
         cure = "check that it is closed and no earlier segment covers it, or split it into shorter parts"
         if inside >= self.need:
-            found, where = outside, "outside it" if self.others else "in the empty space around it"
+            found, where = outside, "outside it" if self.outside.sum() > 1 else "in the empty space around it"
             cure = "widen box_margin, or use nested-sort-sample for a segment enclosed by others"
         raise ValueError(
             f"segment {self.index} has {found} of {MAX_DRAWS:,} draws {where}; {self.need} are needed: {cure}"
@@ -239,7 +198,8 @@ def _draw_all(
     boxes = extended_boxes(shape) if boxes is None else boxes
     # a stream per segment: how many draws one segment's batches hold changes no other segment's points
     seeds = rng.integers(0, 2**32, size=(shape.count, 4), dtype=np.uint32)
-    draws = [_Draws(i, box, need, others, seed) for i, (box, seed) in enumerate(zip(boxes, seeds, strict=True))]
+    outside = _outside(shape, others)
+    draws = [_Draws(i, boxes[i], need, outside[i], seeds[i]) for i in range(shape.count)]
     pending = draws
     while pending:
         batches = [d.next_batch() for d in pending]
@@ -247,6 +207,16 @@ def _draw_all(
         labels = np.split(label(np.concatenate(batches)), ends)
         pending = [d for d, b, part in zip(pending, batches, labels, strict=True) if not d.add(b, part)]
     return draws
+
+
+def _outside(shape: Shape, others: bool) -> Bool[np.ndarray, "s c"]:
+    """For each segment which labels count as outside it: empty space, what it is nested in, and maybe all others."""
+    table = np.full((shape.count, shape.count + 1), others)
+    table[:, 0] = True
+    for inner, outer in shape.nesting:
+        table[inner, outer + 1] = True
+    table[np.arange(shape.count), np.arange(shape.count) + 1] = False
+    return table
 
 
 def _sort(

@@ -24,7 +24,7 @@ def rest_frame(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "3"], float]:
 
 
 def rest_distances(rest: SegmentedMesh) -> Float16[np.ndarray, "s n n n"]:
-    """Signed distance to each segment, negative inside, in rest coordinates; axes [segment, x, y, z]."""
+    """Signed distance to what each segment owns, negative inside, in rest coordinates; axes [segment, x, y, z]."""
     center, half = rest_frame(rest)
     axis = np.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) * half + center
@@ -33,4 +33,6 @@ def rest_distances(rest: SegmentedMesh) -> Float16[np.ndarray, "s n n n"]:
         np.where(solids.inside(index, nodes), -1.0, 1.0) * solids.segment_distance(index, nodes)
         for index in range(solids.count)
     ]
+    for inner, outer in rest.nesting:  # exact, because the inner segment lies inside
+        rows[outer] = np.maximum(rows[outer], -rows[inner])
     return (np.stack(rows) / half).astype(np.float16).reshape(-1, *(TEMPLATE_NODES,) * 3)

@@ -19,6 +19,9 @@ from mereo.mesh import Color, SegmentedMesh
 
 SUPERSAMPLE = 2
 BACKGROUND = 1.0
+SEE_THROUGH = 0.55
+"""How much of a nested segment shows through the one around it."""
+
 CREASE_COSINE = 0.6
 """Normals are smoothed across edges flatter than about 53 degrees, so that cuts and box edges stay sharp."""
 
@@ -232,7 +235,18 @@ def _light(normal: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"]) -> F
 def shade(
     mesh: SegmentedMesh, view: Viewpoint, size: tuple[int, int], colors: list[Color] | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A shaded picture of ``size`` (width, height) pixels on white, each segment in its colour (or ``colors``)."""
+    """A shaded picture of ``size`` (width, height) pixels on white, each segment in its colour (or ``colors``).
+
+    Segments that are declared nested shine through those around them.
+    """
+    colors = list(mesh.colors) if colors is None else colors
     canvas = Canvas.empty(view, size)
     canvas.draw_triangles(Triangles.of(mesh, colors))
+    inner = sorted({index for index, _ in mesh.nesting})
+    if inner:
+        within = Canvas.empty(view, size)
+        parts = SegmentedMesh(tuple(mesh.segments[index] for index in inner))
+        within.draw_triangles(Triangles.of(parts, [colors[index] for index in inner]))
+        hidden = np.isfinite(within.depth) & (within.depth > canvas.depth + 1e-6)
+        canvas.rgb[hidden] = (1 - SEE_THROUGH) * canvas.rgb[hidden] + SEE_THROUGH * within.rgb[hidden]
     return canvas.picture()

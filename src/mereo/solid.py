@@ -103,6 +103,9 @@ class _Solid:
 class Nearest(NamedTuple):
     """The closest surface point of each query point.
 
+    For a point of a nested segment, or of the one around it, the surface of all that is nearest bounds what its owner
+    owns: the way out of the inner segment meets the inner surface first, the way in from empty space the outer one.
+
     Attributes:
         distance: unsigned.
         point: where it is.
@@ -117,7 +120,7 @@ class Nearest(NamedTuple):
 
 
 class Solids:
-    """Queries on all segments of an object. Satisfies ``query_sampling.Shape``.
+    """Queries on all segments of an object. Satisfies ``ownership.Shape``.
 
     Points are [n, 3] in the mesh's frame; distances are in its units.
     """
@@ -125,6 +128,7 @@ class Solids:
     def __init__(self, mesh: SegmentedMesh) -> None:
         self.mesh = mesh
         self.count = len(mesh.segments)
+        self.nesting = mesh.nesting
         self._solids = [_Solid(segment) for segment in mesh.segments]
 
     @cached_property
@@ -143,7 +147,7 @@ class Solids:
         return result
 
     def label(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-        """0 in empty space, else index + 1; where segments overlap the first one owns the point."""
+        """0 in empty space, else index + 1; where segments overlap the first one owns the point (so a nested one)."""
         labels = np.zeros(len(points), dtype=np.uint8)
         for index, solid in enumerate(self._solids):
             candidates = np.flatnonzero((labels == 0) & solid.in_box(points))
@@ -230,22 +234,49 @@ def label_grid(
 def check_overlap(mesh: SegmentedMesh, tolerance: float = 1e-3, cells: int = 64) -> None:
     """Raise ``ValueError`` naming two segments whose common volume exceeds ``tolerance`` of the smaller one.
 
-    Segments that touch share no volume. The common volume is measured on a grid of ``cells`` per axis over the smaller
-    segment's box.
+    Segments that touch share no volume. A pair that ``mesh.nested`` declares may share any, but at most ``tolerance``
+    of the inner segment may lie outside the outer one. Volumes are measured on a grid of ``cells`` per axis over the
+    first segment's box.
     """
+    nested = {(mesh.names[inner], mesh.names[outer]) for inner, outer in mesh.nesting}
+    for inner, outer in sorted(nested):
+        _check_within(mesh.segments[mesh.names.index(inner)], mesh.segments[mesh.names.index(outer)], tolerance, cells)
     order = sorted(mesh.segments, key=lambda segment: abs(segment.volume))
     for number, small in enumerate(order):
-        low, high = small.bounds
-        axes = [low[k] + (np.arange(cells) + 0.5) * (high[k] - low[k]) / cells for k in range(3)]
-        alone = label_grid(SegmentedMesh((small,)), *axes) > 0
+        grid = _Filled(small, cells)
         for large in order[number + 1 :]:
-            if (large.bounds[1] <= low).any() or (large.bounds[0] >= high).any():
-                continue
-            both = int((alone & (label_grid(SegmentedMesh((large,)), *axes) > 0)).sum())
-            share, volume = both / max(int(alone.sum()), 1), both * float(np.prod((high - low) / cells))
+            share = 0.0 if {(small.name, large.name), (large.name, small.name)} & nested else grid.share_in(large)
             if share > tolerance:
                 raise ValueError(
-                    f"segments {small.name!r} and {large.name!r} overlap in a volume of {volume:.3g}, "
+                    f"segments {small.name!r} and {large.name!r} overlap in a volume of {share * grid.volume:.3g}, "
                     f"{100 * share:.2g} % of {small.name!r}; at most {100 * tolerance:.2g} % is allowed: "
-                    "subtract one from the other (for example trimesh.boolean.difference)"
+                    "subtract one from the other (for example trimesh.boolean.difference), or declare the inner one "
+                    "nested"
                 )
+
+
+def _check_within(inner: Segment, outer: Segment, tolerance: float, cells: int) -> None:
+    outside = 1.0 - _Filled(inner, cells).share_in(outer)
+    if outside > tolerance:
+        raise ValueError(
+            f"segment {inner.name!r} is declared nested in {outer.name!r}, but {100 * outside:.2g} % of it lies "
+            f"outside; at most {100 * tolerance:.2g} % is allowed: move it, or cut it off at the outer surface"
+        )
+
+
+class _Filled:
+    """A segment as the filled cells of a grid over its box."""
+
+    def __init__(self, segment: Segment, cells: int) -> None:
+        low, high = segment.bounds
+        self.box = segment.bounds
+        self.axes = [low[k] + (np.arange(cells) + 0.5) * (high[k] - low[k]) / cells for k in range(3)]
+        self.filled = label_grid(SegmentedMesh((segment,)), *self.axes) > 0
+        self.volume = int(self.filled.sum()) * float(np.prod((high - low) / cells))
+
+    def share_in(self, other: Segment) -> float:
+        """How much of the filled volume lies in another segment, from 0 to 1."""
+        if (other.bounds[1] <= self.box[0]).any() or (other.bounds[0] >= self.box[1]).any():
+            return 0.0
+        both = self.filled & (label_grid(SegmentedMesh((other,)), *self.axes) > 0)
+        return float(both.sum() / max(int(self.filled.sum()), 1))

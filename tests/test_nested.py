@@ -1,0 +1,264 @@
+"""A segment inside a segment: every rule of docs/design/0005-nested.md, on balls whose answers are in closed form."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from analytic import ball as distance_to_ball
+from analytic import logits_of
+from scipy.spatial import cKDTree
+from shapes import ball, box
+from toy_scene import Shear
+
+from mereo.config import GenerateConfig, SamplingConfig
+from mereo.deformation import Deformation
+from mereo.extraction import extract, extract_dense
+from mereo.frame import rigid, transform_points
+from mereo.generation import make_manifest
+from mereo.mesh import SegmentedMesh
+from mereo.ownership import owner_labels
+from mereo.query_sampling import label_uniform, nested_sort_sample, sample_queries, sort_sample, volume_uniform
+from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
+from mereo.scene import Scene
+from mereo.shading import Viewpoint, shade
+from mereo.solid import Solids, check_overlap, label_grid, signed_distance_and_direction
+from mereo.synthesis import example_rng, sample_view, synthesize
+
+CORE, ORGAN = ((2.0, 0.0, 0.0), 2.6), ((0.0, 0.0, 0.0), 5.0)
+"""Centre and radius; the core comes as near as 0.4 to the organ's surface."""
+
+
+def organ(nested: tuple[tuple[str, str], ...] = (("core", "organ"),)) -> SegmentedMesh:
+    return SegmentedMesh((ball(*CORE, "core", 0), ball(*ORGAN, "organ", 1)), nested)
+
+
+def onion() -> SegmentedMesh:
+    balls = [ball((0, 0, 0), radius, name, i) for i, (name, radius) in enumerate((("a", 1.0), ("b", 2.0), ("c", 3.0)))]
+    return SegmentedMesh(tuple(balls), (("a", "b"), ("b", "c")))
+
+
+def radius(points: np.ndarray, part: tuple[tuple[float, float, float], float]) -> np.ndarray:
+    return np.linalg.norm(points - part[0], axis=1)
+
+
+def draws(count: int, reach: float = 6.0, seed: int = 0) -> np.ndarray:
+    """Uniform points, clear of the surfaces by more than the balls' facets deviate."""
+    points = np.random.default_rng(seed).uniform(-reach, reach, size=(count, 3))
+    return points[(np.abs(radius(points, CORE) - CORE[1]) > 0.02) & (np.abs(radius(points, ORGAN) - ORGAN[1]) > 0.02)]
+
+
+def true_labels(points: np.ndarray) -> np.ndarray:
+    """1 in the core, 2 in the rest of the organ."""
+    return np.where(radius(points, CORE) < CORE[1], 1, np.where(radius(points, ORGAN) < ORGAN[1], 2, 0))
+
+
+# --- the declaration --------------------------------------------------------------------------------------------------
+
+
+def test_what_is_nested_in_a_nested_segment_is_nested_too() -> None:
+    assert onion().nesting == ((0, 1), (0, 2), (1, 2))
+    assert organ(()).nesting == ()
+
+
+def test_a_moved_mesh_keeps_its_declaration() -> None:
+    mesh = organ()
+    assert mesh.with_vertices([s.vertices + 1 for s in mesh.segments]).nested == mesh.nested
+    assert mesh.transformed(rigid(np.eye(3), np.ones(3))).nested == mesh.nested
+    assert nested_scene().sample_state(np.random.default_rng(0)).mesh.nested == mesh.nested
+
+
+def test_the_inner_segment_comes_first() -> None:
+    with pytest.raises(ValueError, match=r"'organ' is declared nested in 'core' but does not come before it;.*first"):
+        organ((("organ", "core"),))
+    with pytest.raises(ValueError, match="'core' is declared nested in 'core' but does not come before it"):
+        organ((("core", "core"),))
+
+
+def test_a_declaration_of_unknown_segments_names_them() -> None:
+    with pytest.raises(ValueError, match=r"'core' is declared nested in 'liver', but no segment is called 'liver'"):
+        organ((("core", "liver"),))
+
+
+def test_the_manifest_of_a_dataset_states_it() -> None:
+    assert make_manifest(nested_scene(), GenerateConfig(), 1, 0)["nested"] == [["core", "organ"]]
+
+
+# --- overlap ----------------------------------------------------------------------------------------------------------
+
+
+def test_declared_pairs_may_overlap_and_no_others() -> None:
+    check_overlap(organ())
+    check_overlap(onion())
+    with pytest.raises(ValueError, match=r"'core' and 'organ' overlap in a volume of 7\d.*or declare the inner one"):
+        check_overlap(organ(()))
+    vein = SegmentedMesh((*organ().segments, box((-4, -1, -1), (-3, 1, 1), "vein")), organ().nested)
+    with pytest.raises(ValueError, match="'vein' and 'organ' overlap"):
+        check_overlap(vein)
+
+
+def test_the_inner_segment_must_be_inside() -> None:
+    half_out = SegmentedMesh(
+        (box((4, -1, -1), (6, 1, 1), "core"), box((0, -5, -5), (5, 5, 5), "organ")), organ().nested
+    )
+    with pytest.raises(
+        ValueError, match=r"'core' is declared nested in 'organ', but 50 % of it lies outside; at most 0.1"
+    ):
+        check_overlap(half_out)
+    larger = SegmentedMesh((ball(*ORGAN, "core"), ball(*CORE, "organ", 1)), organ().nested)
+    with pytest.raises(ValueError, match=r"but 86 % of it lies outside"):
+        check_overlap(larger)
+
+
+# --- who owns a point -------------------------------------------------------------------------------------------------
+
+
+def test_the_inner_segment_owns_its_points() -> None:
+    points, solids = draws(20_000), Solids(organ())
+    assert np.array_equal(solids.label(points), true_labels(points))
+
+
+def test_the_nearest_surface_is_the_inner_ones_too() -> None:
+    """The authors' rule needs no declaration: the way to the outer surface meets the inner one first."""
+    points = draws(20_000)
+    assert np.array_equal(owner_labels(Solids(organ(())), points), true_labels(points))
+    onions = np.random.default_rng(0).uniform(-3, 3, size=(5000, 3))
+    clear = np.abs(np.linalg.norm(onions, axis=1)[:, None] - [1, 2, 3]).min(axis=1) > 0.02
+    assert np.array_equal(owner_labels(Solids(onion()), onions[clear]), Solids(onion()).label(onions[clear]))
+
+
+def test_label_grids_agree_and_add_up_to_the_owned_volumes() -> None:
+    mesh, axis = organ(), np.linspace(-5.2, 5.2, 105)
+    grid = label_grid(mesh, axis, axis, axis)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)[::7]
+    assert np.array_equal(grid.ravel()[::7], Solids(mesh).label(nodes))
+    volumes = np.bincount(grid.ravel())[1:] * (axis[1] - axis[0]) ** 3
+    np.testing.assert_allclose(volumes, mesh.owned_volumes, rtol=0.01)
+
+
+def test_owned_volumes_are_those_of_shells() -> None:
+    meshes = np.array([segment.volume for segment in onion().segments])
+    np.testing.assert_allclose(onion().owned_volumes, np.diff(meshes, prepend=0.0))
+    np.testing.assert_allclose(onion().owned_volumes / (4 / 3 * np.pi), [1, 7, 19], rtol=0.01)
+
+
+# --- distance ---------------------------------------------------------------------------------------------------------
+
+
+def test_distance_and_direction_lead_to_the_surface_of_what_the_owner_owns() -> None:
+    points, solids = draws(5000), Solids(organ())
+    labels = solids.label(points)
+    distance, direction = signed_distance_and_direction(solids, points, labels)
+    to_core, to_organ = radius(points, CORE) - CORE[1], radius(points, ORGAN) - ORGAN[1]
+    expected = np.select([labels == 1, labels == 2], [to_core, -np.minimum(-to_organ, to_core)], to_organ)
+    np.testing.assert_allclose(distance, expected, atol=0.02)  # facets lie up to 0.01 inside the ball
+    wall = (labels == 1) | ((labels == 2) & (to_core < -to_organ))
+    center = np.where(wall[:, None], CORE[0], ORGAN[0])
+    outward = (points - center) / np.linalg.norm(points - center, axis=1, keepdims=True)
+    within = np.where(wall, to_core, to_organ) < 0
+    cosine = np.einsum("ni,ni->n", direction, np.where(within[:, None], outward, -outward))
+    tie = np.abs(np.abs(to_core) - np.abs(to_organ)) < 0.03
+    assert (cosine[~tie & (np.abs(distance) > 0.2)] > 0.95).all()
+
+
+def test_the_template_has_the_signed_distance_to_what_each_segment_owns() -> None:
+    mesh = organ()
+    axis = np.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)[::3]
+    center, half = rest_frame(mesh)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) * half + center
+    to_core, to_organ = radius(points, CORE) - CORE[1], radius(points, ORGAN) - ORGAN[1]
+    grid = rest_distances(mesh)[:, ::3, ::3, ::3].reshape(2, -1).astype(float) * half
+    np.testing.assert_allclose(grid[0], to_core, atol=0.03)
+    np.testing.assert_allclose(grid[1], np.maximum(to_organ, -to_core), atol=0.03)
+
+
+# --- samplers ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_outside_of_a_nested_segment_is_the_segment_around_it() -> None:
+    solids, keep = Solids(organ()), 200
+    samples = sort_sample(solids, keep, 2 * keep, np.random.default_rng(0))
+    core_in, core_out, organ_in, organ_out = np.split(samples.labels, 4)
+    assert (core_in == 1).all() and (organ_in == 2).all() and (organ_out == 0).all()
+    assert (core_out == 2).mean() > 0.9 and set(core_out) <= {0, 2}  # a part of its draw box reaches out of the organ
+    points = np.split(samples.points, 4)
+    for side, part in ((0, CORE), (1, CORE), (2, ORGAN), (3, ORGAN)):
+        # equal volumes on both sides of the own surface: the organ's inside points gather at its outer surface
+        assert np.median(np.abs(radius(points[side], part) - part[1])) < 0.2 * part[1]
+
+
+def test_a_segment_in_the_middle_borders_on_the_ones_around_it_only() -> None:
+    samples = sort_sample(Solids(onion()), 100, 100, np.random.default_rng(1))
+    sides = [set(part.tolist()) for part in np.split(samples.labels, 6)]
+    assert sides == [{1}, {2}, {2}, {3}, {3}, {0}]
+
+
+@pytest.mark.parametrize("sampler", ["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"])
+def test_every_sampler_gives_points_to_their_owner(sampler: str) -> None:
+    settings = SamplingConfig(sampler=sampler, per_segment=128, uniform_fraction=1.0)  # type: ignore[arg-type]
+    samples = sample_queries(Solids(organ()), settings, np.random.default_rng(2))
+    assert len(samples.points) == settings.total(2)
+    clear = np.all([np.abs(radius(samples.points, part) - part[1]) > 0.02 for part in (CORE, ORGAN)], axis=0)
+    assert np.array_equal(samples.labels[clear], true_labels(samples.points[clear]))
+    assert set(samples.labels.tolist()) == {0, 1, 2}
+
+
+@pytest.mark.parametrize("sampler", [label_uniform, nested_sort_sample, volume_uniform])
+def test_the_other_samplers_keep_all_labels_around_a_nested_segment(sampler: Callable[..., object]) -> None:
+    arguments = (64, 64) if sampler is nested_sort_sample else (64,)
+    samples = sampler(Solids(onion()), *arguments, np.random.default_rng(3))
+    assert set(samples.labels.tolist()) == {0, 1, 2, 3}  # type: ignore[attr-defined]
+
+
+# --- surfaces ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_outer_surface_includes_the_wall_of_the_cavity_and_volumes_add_up() -> None:
+    core, whole = distance_to_ball((0.3, 0.1, -0.2), 0.45), distance_to_ball((0, 0, 0), 1.0)
+    field = logits_of(core, lambda points: np.maximum(whole(points), -core(points)))
+    box_around = np.array([[-1.2] * 3, [1.2] * 3])
+    found, dense = (
+        run(field, box_around, 48, ("core", "organ"), ((1, 2, 3), (4, 5, 6))) for run in (extract, extract_dense)
+    )
+    assert np.array_equal(found.grid.labels, dense.grid.labels)
+    found.surfaces.check()
+    inner, outer = found.surfaces.segments
+    for segment, euler in ((inner, 2), (outer, 4)):  # two spheres bound the organ
+        assert len(segment.vertices) - len(segment.faces) // 2 == euler
+    assert inner.volume == pytest.approx(4 / 3 * np.pi * 0.45**3, rel=0.02)
+    assert inner.volume + outer.volume == pytest.approx(4 / 3 * np.pi, rel=0.01)
+    assert cKDTree(outer.vertices).query(inner.vertices)[0].max() < 1e-5  # marching cubes is in single precision
+
+
+def test_a_picture_shows_what_is_nested_through_what_is_around_it() -> None:
+    def middle(mesh: SegmentedMesh) -> np.ndarray:
+        return shade(mesh, Viewpoint.along(mesh.bounds, (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)), (40, 40))[20, 14].astype(int)
+
+    alone, within = middle(organ(())), middle(organ())
+    assert np.abs(alone - within).max() > 40
+
+
+# --- a scene ----------------------------------------------------------------------------------------------------------
+
+
+def move_together(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    shear = Shear(*(rng.uniform(-1, 1, size=3) * [1.5, 0.2, 0.15]))
+    return (shear, shear)
+
+
+def nested_scene() -> Scene:
+    return Scene("organ", organ(), move_together)
+
+
+def test_rest_coordinates_lie_in_the_owner_at_rest() -> None:
+    scene, settings = nested_scene(), GenerateConfig(sampling=SamplingConfig(per_segment=128))
+    example, view = synthesize(scene, settings, example_rng(1, 0)), sample_view(scene, settings, example_rng(1, 0))
+    queries, (center, half) = example.queries, rest_frame(scene.rest)
+    rest = queries.rest * half + center
+    inside = queries.labels > 0
+    assert np.array_equal(np.isnan(rest).any(axis=1), ~inside)
+    world = transform_points(view.T_world_camera, example.normalizer.invert(queries.positions))
+    assert np.abs(view.deformations[0](rest[inside]) - world[inside]).max() < 1e-3
+    # faces are flat before and after, the map between them is not: points beside a face may change sides
+    clear = inside & (np.abs(radius(rest, CORE) - CORE[1]) > 0.06) & (np.abs(radius(rest, ORGAN) - ORGAN[1]) > 0.06)
+    assert np.array_equal(true_labels(rest[clear]), queries.labels[clear]) and clear.sum() > 150
+    check_overlap(view.mesh, tolerance=0.02)
