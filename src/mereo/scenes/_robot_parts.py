@@ -13,13 +13,13 @@ from mereo.scenes._machine_parts import Vector, bolts, box, hull, plate, ring_of
 SHOULDER: Vector = (3.5, 0.0, 19.0)
 """A point of the second axis, which is along y."""
 
-ELBOW: Vector = (3.5, 0.0, 39.0)
+ELBOW: Vector = (3.5, 0.0, 37.0)
 """A point of the third axis, which is along y."""
 
-FOREARM_HEIGHT = 41.5
+FOREARM_HEIGHT = 39.5
 """The fourth axis is along x at this height, 2.5 above the elbow; at rest the sixth continues it."""
 
-WRIST: Vector = (24.0, 0.0, FOREARM_HEIGHT)
+WRIST: Vector = (21.5, 0.0, FOREARM_HEIGHT)
 """Where the fifth axis, along y, crosses the fourth."""
 
 GAP = 0.2
@@ -80,10 +80,10 @@ def upper_arm() -> Manifold:
     )
     ribs = [
         box((-4, far - 2.0, -0.35), (4, far - 0.3, 0.35)).rotate((0, angle, 0)).translate((x, 0, height))
-        for height in (27.0, 31.5)
+        for height in (26.0, 30.0)
         for angle in (40.0, -40.0)
     ]
-    beam = union(without(beam, pocket), *(rib ^ pocket for rib in ribs))
+    beam = union(without(beam, pocket), *(rib ^ beam for rib in ribs))
     covers = [
         union(
             shaft("y", (x, far - 0.1, z), 0.7, radius, sides=24),
@@ -92,7 +92,7 @@ def upper_arm() -> Manifold:
         )
         for z, radius, count in ((low, 3.4, 10), (high, 2.8, 8))
     ]
-    clamp = box((x - 4.5, 4.2, 29.0), (x - 2.5, 6.2, 31.5), 0.3)
+    clamp = box((x - 4.6, 4.2, 27.0), (x - 2.5, 6.2, 29.8), 0.3)
     return union(beam, *covers, clamp)
 
 
@@ -116,23 +116,23 @@ def elbow() -> Manifold:
         shaft("x", (7.2, 0, FOREARM_HEIGHT), 1.8, 3.3, sides=28),
         bolts("x", ring_of("x", (7.2, 0, FOREARM_HEIGHT), 2.9, 10, 0.3), -0.9, 0.4),
     )
-    box_on_top = box((2.0, -1.5, 44.0), (5.6, 1.5, 45.6), 0.4)
+    box_on_top = box((2.0, -1.5, FOREARM_HEIGHT + 2.5), (5.6, 1.5, FOREARM_HEIGHT + 4.1), 0.4)
     return union(hull(hub, barrel), cover, *motors, flange, box_on_top)
 
 
 def forearm() -> Manifold:
     """Tapered tube with ribs and a cable duct on one side; at its end a fork with bolted bearing caps."""
     wrist_x, _, z = WRIST
-    tube = turned("x", (0, 0, z), [(9.2, 3.1), (10.3, 3.1), (10.8, 2.5), (18.5, 2.0), (19.5, 2.0)], 24)
+    tube = turned("x", (0, 0, z), [(9.2, 3.1), (10.3, 3.1), (10.8, 2.6), (16.0, 2.1), (17.0, 2.1)], 24)
     ribs = [
-        plate("y", [(-3.0, 9.8), (3.0, 9.8), (2.1, 18.8), (-2.1, 18.8)], -0.3, 0.3).rotate((angle, 0, 0))
+        plate("y", [(-3.0, 9.8), (3.0, 9.8), (2.2, 16.4), (-2.2, 16.4)], -0.3, 0.3).rotate((angle, 0, 0))
         for angle in (0.0, 45.0, 90.0, 135.0)
     ]
-    duct = plate("y", [(0.0, 10.6), (3.1, 10.6), (3.1, 14.6), (2.4, 17.6), (0.0, 17.6)], -0.75, 0.75)
+    duct = plate("y", [(0.0, 10.6), (3.1, 10.6), (3.1, 13.0), (2.4, 15.4), (0.0, 15.4)], -0.75, 0.75)
     ring = bolts("x", ring_of("x", (10.3, 0, 0), 2.72, 8, np.pi / 8), 0.4, 0.38)
     turning = union(*ribs, duct, ring).translate((0, 0, z))
     block = hull(
-        box((18.6, -3.1, z - 1.9), (20.0, 3.1, z + 1.9), 0.4), shaft("y", (wrist_x, -3.1, z), 6.2, 1.9, sides=24)
+        box((16.2, -3.1, z - 1.9), (17.6, 3.1, z + 1.9), 0.4), shaft("y", (wrist_x, -3.1, z), 6.2, 1.9, sides=24)
     )
     slot = box((wrist_x - 2.5, -1.8, z - 5), (wrist_x + 5, 1.8, z + 5))
     caps = [
@@ -164,16 +164,16 @@ def hand() -> Manifold:
         shaft("x", (x + 0.5, 0, z), 1.5, 1.7, sides=20),
         bolts("x", ring_of("x", (x + 0.8, 0, z), 2.05, 6), 0.35, 0.27),
     )
-    housing = box((x + 1.6, -3.5, z - 1.9), (x + 5.2, 3.5, z + 1.9), 0.4)
+    housing = box((x + 1.6, -3.9, z - 2.2), (x + 5.2, 3.9, z + 2.2), 0.4)
     slots = [
-        box((x + 2.2 + 0.9 * k, side * 2.2 - 0.8, level - 0.35), (x + 2.65 + 0.9 * k, side * 2.2 + 0.8, level + 0.35))
+        box((x + 2.2 + 0.9 * k, side * 2.5 - 0.8, level - 0.35), (x + 2.65 + 0.9 * k, side * 2.5 + 0.8, level + 0.35))
         for k in range(3)
         for side in (-1, 1)
-        for level in (z - 1.9, z + 1.9)
+        for level in (z - 2.2, z + 2.2)
     ]
-    rails = [box((x + 5.0, -3.5, z + dz - 0.3), (x + 5.6, 3.5, z + dz + 0.3)) for dz in (-1.0, 1.0)]
+    rails = [box((x + 5.0, -3.9, z + dz - 0.35), (x + 5.6, 3.9, z + dz + 0.35)) for dz in (-1.2, 1.2)]
     socket = union(
-        box((x + 2.2, -1.0, z + 1.5), (x + 4.6, 1.0, z + 3.0), 0.25), shaft("x", (x + 2.6, 0, z + 2.4), -1.3, 0.45)
+        box((x + 2.2, -1.0, z + 1.8), (x + 4.6, 1.0, z + 3.3), 0.25), shaft("x", (x + 2.6, 0, z + 2.7), -1.3, 0.45)
     )
     return union(flange, without(housing, *slots), *rails, socket)
 
@@ -181,17 +181,18 @@ def hand() -> Manifold:
 def finger(side: int) -> Manifold:
     """A jaw on its carriage; ``side`` is +1 for +y and -1 for -y. The gripping face is notched for round bars."""
     x, z, inner = WRIST[0] + 3.6 + GAP + 5.6 + 0.15, FOREARM_HEIGHT, JAW_OPENING
-    carriage = box((x, inner, z - 1.6), (x + 1.6, inner + 2.0, z + 1.6), 0.2)
+    carriage = box((x, inner, z - 1.9), (x + 1.8, inner + 2.4, z + 1.9), 0.2)
+    tip, back = x + 6.6, inner + 2.0
     blade = plate(
         "z",
-        [(x + 1.0, inner), (x + 6.4, inner), (x + 6.4, inner + 0.9), (x + 3.0, inner + 1.6), (x + 1.0, inner + 1.6)],
-        z - 1.2,
-        z + 1.2,
+        [(x + 1.0, inner), (tip, inner), (tip, inner + 1.3), (x + 3.4, back), (x + 1.0, back)],
+        z - 1.5,
+        z + 1.5,
     )
     notches = [
-        plate("z", [(x + at - 0.4, inner - 0.1), (x + at + 0.4, inner - 0.1), (x + at, inner + 0.45)], z - 2, z + 2)
-        for at in (2.6, 3.8, 5.0)
+        plate("z", [(x + at - 0.5, inner - 0.1), (x + at + 0.5, inner - 0.1), (x + at, inner + 0.6)], z - 2, z + 2)
+        for at in (2.6, 4.0, 5.4)
     ]
-    grooves = bolts("z", [(x + 0.8, inner + 1.0, z + 1.6)], 0.4, 0.4)
-    jaw = union(without(union(carriage, blade), *notches), grooves)
+    screws = bolts("z", [(x + 0.9, inner + 0.7, z + 1.9), (x + 0.9, inner + 1.7, z + 1.9)], 0.3, 0.35)
+    jaw = union(without(union(carriage, blade), *notches), screws)
     return jaw if side > 0 else jaw.rotate((180.0, 0.0, 0.0)).translate((0.0, 0.0, 2 * z))

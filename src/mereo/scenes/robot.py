@@ -10,7 +10,7 @@ Degrees of freedom, each uniform within its limits, rigid motions composed down 
 
     turn      column about z              -170 to 170 degrees
     lean      upper arm about y            -50 to 75 (forward)
-    fold      elbow about y                -65 to 75 (down)
+    fold      elbow about y                -45 to 75 (down)
     roll      forearm about its length    -180 to 180
     pitch     wrist about the fork's pin  -100 to 100
     spin      hand about its length       -180 to 180
@@ -50,7 +50,7 @@ class Joint(NamedTuple):
 JOINTS = (
     Joint("turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
     Joint("lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
-    Joint("fold", parts.ELBOW, (0.0, 1.0, 0.0), -65.0, 75.0),
+    Joint("fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
     Joint("roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
     Joint("pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
     Joint("spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
@@ -75,9 +75,9 @@ class Bulk(NamedTuple):
 _Z = parts.FOREARM_HEIGHT
 REACHING = (
     Bulk(3, (-5.0, 0.0, _Z), (6.5, 0.0, _Z), 4.4, 5),
-    Bulk(4, (11.5, 0.0, _Z), (22.0, 0.0, _Z), 3.9, 5),
-    Bulk(5, (24.0, 0.0, _Z), (26.5, 0.0, _Z), 3.9, 2),
-    Bulk(6, (30.0, 0.0, _Z), (38.0, 0.0, _Z), 4.5, 5),
+    Bulk(4, (11.0, 0.0, _Z), (19.5, 0.0, _Z), 3.9, 4),
+    Bulk(5, (21.5, 0.0, _Z), (24.0, 0.0, _Z), 3.9, 2),
+    Bulk(6, (27.5, 0.0, _Z), (35.8, 0.0, _Z), 4.9, 5),
 )
 """What may come near the parts it does not hang from; the fingers are in the hand's spheres."""
 
@@ -86,7 +86,7 @@ COLUMN = (
     Bulk(1, (3.5, -7.0, 19.0), (3.5, -2.0, 19.0), 4.2, 3),
     Bulk(1, (-4.3, -2.6, 11.0), (-4.3, -2.6, 14.5), 3.4, 3),
 )
-UPPER_ARM = (Bulk(2, (3.5, 5.4, 19.0), (3.5, 5.4, 39.0), 4.4, 9),)
+UPPER_ARM = (Bulk(2, (3.5, 5.4, 19.0), (3.5, 5.4, 37.0), 4.4, 9),)
 
 FOOT = np.array([[-10.6, -10.0, -50.0], [10.0, 10.0, 10.4]])
 """A box around the base and the turntable."""
@@ -165,5 +165,5 @@ def scene() -> Scene:
         name="robot",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(50.0))),
+        workspace=Workspace(fov_rad=float(np.deg2rad(44.0))),
     )
