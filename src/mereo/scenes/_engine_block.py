@@ -1,5 +1,7 @@
 """The engine's fixed part, cut open: everything above the oil pan is sectioned lengthwise, and the half y < 0 is gone."""
 
+from itertools import pairwise
+
 from manifold3d import Manifold
 
 from mereo.scenes._engine_parts import (
@@ -22,7 +24,7 @@ REAR = 8.0
 DECK = 20.0
 CRANKCASE_TOP = 7.3
 PAN_RIM = -6.6
-CRANKCASE_RADIUS = 6.9
+CRANKCASE_RADIUS = 7.0
 """The rods' big ends sweep 6.6."""
 
 BORE = 4.2
@@ -32,7 +34,7 @@ BULKHEAD = 1.2
 """Half the thickness of the walls that carry the main bearings."""
 
 CHAMBER_ROOF = 21.7
-HEAD_TOP = 28.4
+HEAD_TOP = 26.8
 HEAD_REAR = 7.4
 
 
@@ -44,29 +46,28 @@ def block() -> Manifold:
 def _cylinders() -> Manifold:
     body = box((-END, 0, CRANKCASE_TOP - 0.2), (END, REAR, DECK))
     jacket = box((-END + 1.2, -1, 9.8), (END - 1.2, REAR - 1.1, 18.4))
-    liners = [shaft("z", (x, 0, 6), 16.0, LINER, sides=40) for x in CYLINDERS]
-    bores = [shaft("z", (x, 0, 5), 18.0, BORE, sides=48) for x in CYLINDERS]
+    liners = [shaft("z", (x, 0, 6), 16.0, LINER, sides=28) for x in CYLINDERS]
+    bores = [shaft("z", (x, 0, 5), 18.0, BORE, sides=32) for x in CYLINDERS]
     return without(body, without(jacket, *liners), *bores)
 
 
 def _crankcase() -> Manifold:
     """Rear wall and bulkheads; the bearing caps reach to the open side as well, as the pan below them does."""
     body = box((-END, 0, PAN_RIM), (END, REAR, CRANKCASE_TOP))
-    edges = [-END + 1.2 + BULKHEAD, *MAINS[1:-1], END - 1.2 - BULKHEAD]
     bays = [
         hull(
-            shaft("x", (left + BULKHEAD, 0, 0), right - left - 2 * BULKHEAD, CRANKCASE_RADIUS, sides=48),
+            shaft("x", (left + BULKHEAD, 0, 0), right - left - 2 * BULKHEAD, CRANKCASE_RADIUS, sides=28),
             box((left + BULKHEAD, -7, PAN_RIM - 1), (right - BULKHEAD, CRANKCASE_RADIUS, 0)),
         )
-        for left, right in zip(edges, edges[1:], strict=False)
+        for left, right in pairwise(MAINS)
     ]
     under_caps = box((-END + 1.2, -1, PAN_RIM - 1), (END - 1.2, CRANKCASE_RADIUS, -3.4))
-    openings = [shaft("z", (x, 0, 5), 5.0, BORE, sides=48) for x in CYLINDERS]
+    openings = [shaft("z", (x, 0, 5), 5.0, BORE, sides=32) for x in CYLINDERS]
     caps = union(
         *(box((x - BULKHEAD, -3.6, -3.6), (x + BULKHEAD, 3.6, 0), 0.3) for x in MAINS),
         bolts("z", [(x, y, -3.6) for x in MAINS for y in (-2.8, 2.8)], -0.6, 0.55),
     )
-    line = shaft("x", (-30, 0, 0), 60, MAIN_BORE, sides=40)
+    line = shaft("x", (-30, 0, 0), 60, MAIN_BORE, sides=24)
     return without(union(without(body, *bays, under_caps, *openings), caps), line)
 
 
@@ -102,14 +103,14 @@ def _head() -> Manifold:
     ]
     chambers = [
         hull(
-            shaft("z", (x - 0.9, 0, DECK - 1), CHAMBER_ROOF - DECK + 1, 3.15, sides=32),
-            shaft("z", (x + 1.15, 0, DECK - 1), CHAMBER_ROOF - DECK + 1, 2.85, sides=32),
+            shaft("z", (x - 0.9, 0, DECK - 1), CHAMBER_ROOF - DECK + 1, 3.15, sides=20),
+            shaft("z", (x + 1.15, 0, DECK - 1), CHAMBER_ROOF - DECK + 1, 2.85, sides=20),
         )
         for x in CYLINDERS
     ]
-    guides = [shaft("z", (x, 0, 22), 6.0, STEM_RADIUS + 0.15, sides=16) for x, _ in valves]
-    tappets = [shaft("z", (x, 0, 26.6), 5.0, TAPPET_RADIUS + 0.15, sides=28) for x, _ in valves]
-    water = [box((x - 1.4, -2.0, 21.6), (x + 1.4, 6.0, 27.0), 0.6) for x in MAINS]
+    guides = [shaft("z", (x, 0, 22), 4.0, STEM_RADIUS + 0.15, sides=12) for x, _ in valves]
+    tappets = [shaft("z", (x, 0, 25.0), 5.0, TAPPET_RADIUS + 0.15, sides=20) for x, _ in valves]
+    water = [box((x - 1.4, -2.0, 21.6), (x + 1.4, 6.0, 25.6), 0.6) for x in MAINS]
     return union(
         without(body, *chambers, *(_port(x, radius) for x, radius in valves), *guides, *tappets, *water), _cam_bearings()
     )
@@ -120,29 +121,29 @@ def _port(x: float, radius: float) -> Manifold:
     narrow = radius - 0.4
 
     def ball(y: float, z: float) -> Manifold:
-        return Manifold.sphere(narrow, 16).translate((x, y, z))
+        return Manifold.sphere(narrow, 8).translate((x, y, z))
 
-    throat = shaft("z", (x, 0, CHAMBER_ROOF - 0.1), 0.6, radius - 0.15, radius - 0.35, sides=24)
-    bowl = hull(shaft("z", (x, 0, CHAMBER_ROOF + 0.4), 0.2, radius - 0.35, sides=24), ball(0.0, 23.2))
-    return union(throat, bowl, hull(ball(0.0, 23.2), ball(2.5, 24.4)), hull(ball(2.5, 24.4), ball(9.5, 24.9)))
+    throat = shaft("z", (x, 0, CHAMBER_ROOF - 0.1), 0.6, radius - 0.05, radius - 0.25, sides=16)
+    bowl = hull(shaft("z", (x, 0, CHAMBER_ROOF + 0.4), 0.2, radius - 0.25, sides=14), ball(0.0, 23.0))
+    return union(throat, bowl, hull(ball(0.0, 23.0), ball(3.0, 23.8)), hull(ball(3.0, 23.8), ball(9.5, 24.2)))
 
 
 def _cam_bearings() -> Manifold:
     posts = [
         hull(
             box((x - BULKHEAD, 0, HEAD_TOP - 0.5), (x + BULKHEAD, 3.6, HEAD_TOP + 0.5)),
-            box((x - BULKHEAD, 0, CAM_HEIGHT), (x + BULKHEAD, 2.9, CAM_HEIGHT + 2.2), 0.0),
+            box((x - BULKHEAD, 0, CAM_HEIGHT), (x + BULKHEAD, 3.2, CAM_HEIGHT + 2.5)),
         )
         for x in MAINS
     ]
-    nuts = bolts("z", [(x, 2.1, CAM_HEIGHT + 2.2) for x in MAINS], 0.5, 0.55)
-    return without(union(*posts, nuts), shaft("x", (-30, 0, CAM_HEIGHT), 60, 1.55, sides=32))
+    nuts = bolts("z", [(x, 2.2, CAM_HEIGHT + 2.5) for x in MAINS], 0.5, 0.55)
+    return without(union(*posts, nuts), shaft("x", (-30, 0, CAM_HEIGHT), 60, 1.87, sides=24))
 
 
 def _details() -> Manifold:
     """Head bolts, bolts and ribs of the end faces, the flange towards the gearbox."""
     head_bolts = bolts("z", [(x, 5.4, HEAD_TOP) for x in (*CYLINDERS, -11.0, 0.0, 11.0)], 0.6, 0.7)
-    ends: list[Vector] = [(-END, y, z) for y, z in ((1.2, 9.2), (6.8, 9.2), (1.2, 18.6), (6.8, 18.6), (6.4, 27.2))]
+    ends: list[Vector] = [(-END, y, z) for y, z in ((2.0, 9.2), (6.8, 9.2), (2.0, 18.6), (6.8, 18.6), (6.4, 25.6))]
     front = bolts("x", ends, -0.5, 0.55)
     gearbox = union(
         box((END - 0.5, 0, CRANKCASE_TOP - 2.0), (END + 0.9, REAR + 0.8, CRANKCASE_TOP + 2.6), 0.2),

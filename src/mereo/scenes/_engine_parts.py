@@ -28,16 +28,16 @@ MAINS = (-22.0, -11.0, 0.0, 11.0, 22.0)
 """x of the crankshaft's and of the camshaft's bearings."""
 
 CRANK_RADIUS = 4.0
-ROD_LENGTH = 13.0
+ROD_LENGTH = 12.0
 PISTON_RADIUS = 4.0
-CROWN = 2.8
+CROWN = 3.8
 """From the piston pin up to the crown."""
 
 THROWS = (1.0, -1.0, -1.0, 1.0)
 """At crank angle 0 the crank pins of these cylinders point up (1) or down (-1)."""
 
-CAM_HEIGHT = 32.0
-CAM_BASE_RADIUS = 1.9
+CAM_HEIGHT = 30.6
+CAM_BASE_RADIUS = 2.1
 LIFT = 1.2
 CAM_HALF_ANGLE = float(np.deg2rad(75.0))
 """A lobe acts within this angle, of the camshaft, before and after its nose."""
@@ -50,8 +50,8 @@ EXHAUST_AT, EXHAUST_RADIUS = 2.25, 1.5
 """Place along x from the cylinder's axis, and radius of the valve's head."""
 
 VALVE_FACE = 21.0
-STEM_RADIUS = 0.55
-TAPPET_RADIUS = 1.5
+STEM_RADIUS = 0.75
+TAPPET_RADIUS = 1.6
 
 
 def cam_lift(angle_rad: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -67,9 +67,9 @@ def _lobe_outline(nose_rad: float) -> list[tuple[float, float]]:
     """A lobe in (y, z) with its nose ``nose_rad`` about x from straight down (-z).
 
     A convex shape whose support in direction a is p(a) touches a flat tappet there at distance p; its outline is
-    ``p n + p' t``. So the outline below has exactly the lift law, and is convex as ``p + p'' > 0`` (0.3 at the nose).
+    ``p n + p' t``. So the outline below has exactly the lift law, and is convex as ``p + p'' > 0`` (0.5 at the nose).
     """
-    angle = np.linspace(-np.pi, np.pi, 40, endpoint=False)
+    angle = np.linspace(-np.pi, np.pi, 30, endpoint=False)
     step = 1e-4
     support = CAM_BASE_RADIUS + cam_lift(angle)
     slope = (cam_lift(angle + step) - cam_lift(angle - step)) / (2 * step)
@@ -83,73 +83,71 @@ def _lobe_outline(nose_rad: float) -> list[tuple[float, float]]:
 
 def camshaft(noses_rad: dict[float, float]) -> Manifold:
     """Shaft, bearing collars, one lobe at each x of ``noses_rad`` and the toothed belt wheel with its spokes."""
-    shaft_part = shaft("x", (-26.6, 0, 0), 50.2, 1.1, sides=20)
-    journals = [shaft("x", (x - 1.3, 0, 0), 2.6, 1.4, sides=24) for x in MAINS]
-    lobes = [plate("x", _lobe_outline(nose), x - 0.8, x + 0.8) for x, nose in noses_rad.items()]
-    wheel = toothed("x", (-26.4, 0, 0), 2.0, 4.0, teeth=32, depth=0.4)
-    dish = shaft("x", (-26.5, 0, 0), 0.7, 3.0, sides=24)
-    spokes = [shaft("x", (-28, y, z), 4, 0.75, sides=12) for _, y, z in ring_of("x", (0, 0, 0), 2.2, 5)]
-    hub = union(shaft("x", (-27.0, 0, 0), 2.0, 1.2, sides=16), shaft("x", (-27.5, 0, 0), 1.0, 0.6, sides=6))
+    shaft_part = shaft("x", (-26.6, 0, 0), 50.2, 1.4, sides=16)
+    journals = [shaft("x", (x - 1.3, 0, 0), 2.6, 1.7, sides=18) for x in MAINS]
+    lobes = [plate("x", _lobe_outline(nose), x - 1.0, x + 1.0) for x, nose in noses_rad.items()]
+    wheel = toothed("x", (-26.4, 0, 0), 2.2, 4.0, teeth=28, depth=0.5)
+    dish = shaft("x", (-26.5, 0, 0), 0.7, 3.0, sides=16)
+    spokes = [shaft("x", (-28, y, z), 4, 0.75, sides=8) for _, y, z in ring_of("x", (0, 0, 0), 2.2, 5)]
+    hub = union(shaft("x", (-27.0, 0, 0), 2.0, 1.4, sides=12), shaft("x", (-27.5, 0, 0), 1.0, 0.6, sides=6))
     parts = union(shaft_part, *journals, *lobes, without(wheel, dish, *spokes), hub)
     return parts.translate((0, 0, CAM_HEIGHT))
 
 
 def crankshaft() -> Manifold:
     """Journals, four throws with counterweights, timing wheel and pulley in front, flywheel with its ring gear behind."""
-    core = [shaft("x", (x - 2.5, 0, 0), 5.0, 2.0, sides=28) for x in MAINS]
+    core = [shaft("x", (x - 2.5, 0, 0), 5.0, 2.0, sides=20) for x in MAINS]
     throws = [_throw(x, sign) for x, sign in zip(CYLINDERS, THROWS, strict=True)]
     front = union(
-        shaft("x", (-29.0, 0, 0), 6.0, 1.2, sides=16),
-        toothed("x", (-26.4, 0, 0), 2.0, 2.2, teeth=16, depth=0.4),
+        shaft("x", (-29.0, 0, 0), 6.0, 1.2, sides=12),
+        toothed("x", (-26.4, 0, 0), 2.0, 2.2, teeth=14, depth=0.5),
         turned(
             "x",
             (-28.6, 0, 0),
             [(0, 3.4), (0.4, 3.4), (0.65, 2.9), (0.9, 3.4), (1.1, 3.4), (1.35, 2.9), (1.6, 3.4), (1.9, 3.4)],
-            28,
+            20,
         ),
         shaft("x", (-29.4, 0, 0), 1.0, 0.8, sides=6),
     )
     disc = union(
-        shaft("x", (25.4, 0, 0), 1.6, 9.0, sides=48), toothed("x", (25.7, 0, 0), 1.0, 9.6, teeth=48, depth=0.5)
+        shaft("x", (25.4, 0, 0), 2.2, 7.2, sides=32), toothed("x", (25.8, 0, 0), 1.2, 7.8, teeth=36, depth=0.6)
     )
-    recess = turned("x", (26.4, 0, 0), [(0.0, 6.0), (1.0, 7.4)], 32)
-    holes = [shaft("x", (24, y, z), 5, 0.8, sides=12) for _, y, z in ring_of("x", (0, 0, 0), 4.7, 6)]
+    recess = turned("x", (26.9, 0, 0), [(0.0, 5.0), (1.0, 6.2)], 24)
+    holes = [shaft("x", (24, y, z), 5, 0.8, sides=8) for _, y, z in ring_of("x", (0, 0, 0), 3.9, 6)]
     flange = union(
-        shaft("x", (23.8, 0, 0), 3.4, 2.6, sides=24), bolts("x", ring_of("x", (27.2, 0, 0), 1.8, 6), 0.4, 0.45)
+        shaft("x", (23.8, 0, 0), 3.8, 2.6, sides=16), bolts("x", ring_of("x", (27.6, 0, 0), 1.8, 6), 0.4, 0.45)
     )
     return union(*core, *throws, front, without(disc, recess, *holes), flange)
 
 
 def _throw(x: float, sign: float) -> Manifold:
     """A crank pin between two webs, each with a counterweight on the far side."""
-    pin = shaft("x", (x - 1.7, 0, CRANK_RADIUS), 3.4, 1.5, sides=28)
-    arm = hull(shaft("x", (-0.9, 0, CRANK_RADIUS), 1.8, 2.1), shaft("x", (-0.9, 0, 0), 1.8, 2.7))
-    sector = [(5.8 * np.sin(a), -5.8 * np.cos(a)) for a in np.linspace(-1.05, 1.05, 13)]
-    weight = plate("x", [*sector, (2.6, 0.6), (-2.6, 0.6)], -0.9, 0.9)
+    pin = shaft("x", (x - 1.8, 0, CRANK_RADIUS), 3.6, 1.5, sides=20)
+    arm = hull(shaft("x", (-0.95, 0, CRANK_RADIUS), 1.9, 2.1, sides=16), shaft("x", (-0.95, 0, 0), 1.9, 2.7, sides=16))
+    sector = [(5.8 * np.sin(a), -5.8 * np.cos(a)) for a in np.linspace(-1.05, 1.05, 10)]
+    weight = plate("x", [*sector, (2.6, 0.6), (-2.6, 0.6)], -0.95, 0.95)
     web = union(arm, weight)
-    throw = union(pin, web.translate((x - 2.35, 0, 0)), web.translate((x + 2.35, 0, 0)))
+    throw = union(pin, web.translate((x - 2.6, 0, 0)), web.translate((x + 2.6, 0, 0)))
     return throw if sign > 0 else throw.rotate((180.0, 0.0, 0.0))
 
 
 def connecting_rod(number: int) -> Manifold:
     """Big end with a bolted cap, fluted shank, small end with an oil hole."""
-    big = shaft("x", (-1.2, 0, 0), 2.4, 2.45, sides=32)
-    shoulders = box((-1.2, -2.45, -1.0), (1.2, 2.45, 1.0), 0.25)
-    small_z = ROD_LENGTH
-    small = shaft("x", (-1.1, 0, small_z), 2.2, 1.5, sides=24)
-    shank = plate("x", [(-1.5, 1.6), (1.5, 1.6), (1.0, small_z - 1.0), (-1.0, small_z - 1.0)], -0.85, 0.85)
+    top = ROD_LENGTH
+    big = shaft("x", (-1.45, 0, 0), 2.9, 2.45, sides=22)
+    shoulders = box((-1.45, -2.45, -1.0), (1.45, 2.45, 1.0), 0.25)
+    small = shaft("x", (-1.3, 0, top), 2.6, 1.5, sides=16)
+    shank = plate("x", [(-1.6, 1.6), (1.6, 1.6), (1.15, top - 1.0), (-1.15, top - 1.0)], -1.1, 1.1)
     flutes = [
-        plate("x", [(-0.85, 3.2), (0.85, 3.2), (0.55, small_z - 2.2), (-0.55, small_z - 2.2)], low, low + 0.5)
-        for low in (-0.95, 0.45)
+        plate("x", [(-0.9, 3.2), (0.9, 3.2), (0.65, top - 2.2), (-0.65, top - 2.2)], low, low + 0.5)
+        for low in (-1.2, 0.7)
     ]
-    cap_bolts = [
-        shaft("z", (0, side * 2.0, -1.3), 2.6, 0.38, sides=6) for side in (-1, 1)
-    ]
-    eyes = [shaft("x", (-2, 0, 0), 4, 1.63, sides=32), shaft("x", (-2, 0, small_z), 4, 0.88, sides=24)]
+    cap_bolts = [shaft("z", (0, side * 2.0, -1.3), 2.6, 0.38, sides=6) for side in (-1, 1)]
+    eyes = [shaft("x", (-2, 0, 0), 4, 1.64, sides=22), shaft("x", (-2, 0, top), 4, 0.9, sides=14)]
     # the cap's parting line
     parting = [box((-2, side * 2.1 - 0.6, -0.08), (2, side * 2.1 + 0.6, 0.08)) for side in (-1, 1)]
-    lines = [line ^ union(box((-2, -3, -1), (-1.0, 3, 1)), box((1.0, -3, -1), (2, 3, 1))) for line in parting]
-    oil_hole = shaft("z", (0, 0, small_z + 0.5), 2.0, 0.25, sides=8)
+    lines = [line ^ union(box((-2, -3, -1), (-1.2, 3, 1)), box((1.2, -3, -1), (2, 3, 1))) for line in parting]
+    oil_hole = shaft("z", (0, 0, top + 0.5), 2.0, 0.25, sides=6)
     rod = without(union(big, shoulders, small, shank, *cap_bolts), *flutes, *eyes, *lines, oil_hole)
     return rod.translate((CYLINDERS[number], 0, THROWS[number] * CRANK_RADIUS))
 
@@ -161,21 +159,20 @@ def piston(number: int) -> Manifold:
     for groove in (-1.9, -1.2, -0.5):
         height = top + groove
         profile += [(height - 0.3, r), (height - 0.3, r - 0.35), (height, r - 0.35), (height, r)]
-    body = turned("z", (0, 0, 0), [*profile, (top - 0.15, r), (top, r - 0.15)], 40)
-    hollow = turned("z", (0, 0, 0), [(bottom - 1, 3.35), (0.6, 3.35), (top - 1.1, 2.6)], 32)
+    body = turned("z", (0, 0, 0), [*profile, (top, r)], 26)
+    hollow = turned("z", (0, 0, 0), [(bottom - 1, 3.35), (0.9, 3.35), (top - 1.9, 2.7)], 18)
     pockets = [
-        shaft("z", (at, 0, top - 0.3), 1.0, radius + 0.05, sides=24)
+        shaft("z", (at, 0, top - 0.3), 1.0, radius + 0.05, sides=16)
         for at, radius in ((INTAKE_AT, INTAKE_RADIUS), (EXHAUST_AT, EXHAUST_RADIUS))
     ]
     sides = [box((side * 4.4 - 1.1, -3.0, bottom - 1), (side * 4.4 + 1.1, 3.0, 0.0)) for side in (-1, 1)]
     shell = without(body, hollow, *pockets, *sides)
-    inner = shaft("z", (0, 0, bottom), 4.0, 3.6, sides=32)
+    inner = shaft("z", (0, 0, bottom), 4.0, 3.6, sides=20)
     bosses = [
-        union(shaft("x", (side * 1.35, 0, 0), side * 2.3, 1.35, sides=20), box((min(side * 1.35, side * 3.5), -1.0, 0.0), (max(side * 1.35, side * 3.5), 1.0, 2.0)))
-        ^ inner
-        for side in (-1, 1)
+        union(shaft("x", (side * 1.5, 0, 0), side * 2.2, 1.35, sides=14), box(*block, 0.2)) ^ inner
+        for side, block in ((-1, ((-3.7, -1.0, 0.0), (-1.5, 1.0, 2.2))), (1, ((1.5, -1.0, 0.0), (3.7, 1.0, 2.2))))
     ]
-    pin = shaft("x", (-3.6, 0, 0), 7.2, 0.72, sides=20)
+    pin = shaft("x", (-3.6, 0, 0), 7.2, 0.72, sides=14)
     part = union(shell, *bosses, pin)
     return part.translate((CYLINDERS[number], 0, THROWS[number] * CRANK_RADIUS + ROD_LENGTH))
 
@@ -184,15 +181,12 @@ def valve(radius: float, drop: float) -> Manifold:
     """Head, tulip, stem and bucket tappet, ``drop`` below the closed position; the axis is z."""
     face = VALVE_FACE
     profile = [
-        (face, radius - 0.15),
-        (face + 0.2, radius),
-        (face + 0.4, radius),
-        (face + 0.9, 0.62 * radius),
-        (face + 1.8, STEM_RADIUS),
+        (face, radius),
+        (face + 0.45, radius),
+        (face + 1.0, 0.65 * radius),
+        (face + 1.9, STEM_RADIUS),
         (TAPPET_TOP - 1.9, STEM_RADIUS),
-        (TAPPET_TOP - 1.9, TAPPET_RADIUS - 0.15),
-        (TAPPET_TOP - 1.7, TAPPET_RADIUS),
-        (TAPPET_TOP - 0.15, TAPPET_RADIUS),
-        (TAPPET_TOP, TAPPET_RADIUS - 0.2),
+        (TAPPET_TOP - 1.9, TAPPET_RADIUS),
+        (TAPPET_TOP, TAPPET_RADIUS),
     ]
-    return turned("z", (0, 0, -drop), profile, 20)
+    return turned("z", (0, 0, -drop), profile, 14)

@@ -111,8 +111,12 @@ def hull(*parts: Manifold) -> Manifold:
     return Manifold.batch_hull(list(parts))
 
 
-def segment(name: str, color: Color, part: Manifold) -> Segment:
-    """The finished part as a segment, with no more triangles than its shape needs."""
-    mesh = part.as_original().simplify(SIMPLIFY).to_mesh64()
+def segment(name: str, color: Color, part: Manifold, longest_edge: float = np.inf) -> Segment:
+    """The finished part as a segment, with no more triangles than its shape needs.
+
+    A bounded ``longest_edge`` helps large parts: long slivers have large boxes, which slow down searches among them.
+    """
+    part = part.as_original().simplify(SIMPLIFY)
+    mesh = (part if longest_edge == np.inf else part.refine_to_length(longest_edge)).to_mesh64()
     vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
     return Segment(name, color, vertices, np.array(mesh.tri_verts, dtype=np.int64))

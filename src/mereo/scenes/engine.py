@@ -37,6 +37,9 @@ from mereo.scenes import _engine_parts as parts
 from mereo.scenes._engine_block import block
 from mereo.scenes._machine_parts import segment, union
 
+LONGEST_EDGE = 8.0
+"""Half of the block's length of slivers would double the time to find nearest points on it."""
+
 CYCLE_RAD = 4 * np.pi
 
 FIRING_RAD = tuple(np.deg2rad(angle) for angle in (0.0, 540.0, 180.0, 360.0))
@@ -105,7 +108,7 @@ def rest_mesh() -> SegmentedMesh:
     }
     colors = [PALETTE[7], *(PALETTE[i] for i in (0, 1, 3, 2, 4, 5, 6, 8, 9, 10, 11))]
     return SegmentedMesh(
-        tuple(segment(name, color, part) for (name, part), color in zip(solids.items(), colors, strict=True))
+        tuple(segment(name, color, part, LONGEST_EDGE) for (name, part), color in zip(solids.items(), colors, strict=True))
     )
 
 
