@@ -17,7 +17,7 @@ from mereo.scenes._engine_parts import (
 )
 from mereo.scenes._machine_parts import Vector, bolts, box, hull, shaft, union, without
 
-END = 23.5
+END = 21.3
 """Half of the block's length."""
 
 REAR = 8.0
@@ -28,9 +28,8 @@ CRANKCASE_RADIUS = 7.0
 """The rods' big ends sweep 6.6."""
 
 BORE = 4.2
-LINER = 5.0
 MAIN_BORE = 2.15
-BULKHEAD = 1.2
+BULKHEAD = 1.0
 """Half the thickness of the walls that carry the main bearings."""
 
 CHAMBER_ROOF = 21.7
@@ -45,10 +44,11 @@ def block() -> Manifold:
 
 def _cylinders() -> Manifold:
     body = box((-END, 0, CRANKCASE_TOP - 0.2), (END, REAR, DECK))
-    jacket = box((-END + 1.2, -1, 9.8), (END - 1.2, REAR - 1.1, 18.4))
-    liners = [shaft("z", (x, 0, 6), 16.0, LINER, sides=28) for x in CYLINDERS]
     bores = [shaft("z", (x, 0, 5), 18.0, BORE, sides=32) for x in CYLINDERS]
-    return without(body, without(jacket, *liners), *bores)
+    # the water jacket shows between the bores
+    slots = [box((x - 0.45, -1, 10.0), (x + 0.45, 4.0, 18.0), 0.2) for x in MAINS[1:-1]]
+    jackets = [box((side * 20.3 - 0.5, -1, 9.8), (side * 20.3 + 0.5, 6.5, 18.4)) for side in (-1, 1)]
+    return without(body, *bores, *slots, *jackets)
 
 
 def _crankcase() -> Manifold:
@@ -79,18 +79,18 @@ def _pan() -> Manifold:
             box((-END + 0.6, -6.6, PAN_RIM - 2.6), (END - 0.6, 6.6, PAN_RIM)),
         ),
         hull(
-            box((-END, -REAR, PAN_RIM - 1), (-3, REAR, PAN_RIM)),
-            box((-END + 0.8, -6.2, PAN_RIM - 5.4), (-7, 6.2, PAN_RIM)),
+            box((-END, -REAR, PAN_RIM - 1), (-2, REAR, PAN_RIM)),
+            box((-END + 0.8, -6.2, PAN_RIM - 5.4), (-6, 6.2, PAN_RIM)),
         ),
     )
     flange = box((-END - 0.4, -REAR - 0.8, PAN_RIM - 0.6), (END + 0.4, REAR + 0.8, PAN_RIM))
     inside = union(
         box((-END + 1.2, -REAR + 1.2, PAN_RIM - 1.2), (END - 1.2, REAR - 1.2, PAN_RIM + 1)),
         box((-END + 2.0, -5.8, PAN_RIM - 1.8), (END - 2.0, 5.8, PAN_RIM)),
-        box((-END + 2.0, -5.2, PAN_RIM - 4.4), (-8.2, 5.2, PAN_RIM)),
+        box((-END + 2.0, -5.2, PAN_RIM - 4.4), (-7.2, 5.2, PAN_RIM)),
     )
-    rim = bolts("z", [(-22.0 + 4.4 * k, -REAR - 0.0, PAN_RIM) for k in range(11)], 0.45, 0.5)
-    plug = shaft("y", (-14.0, -6.0, PAN_RIM - 4.2), -1.4, 0.8, sides=6)
+    rim = bolts("z", [(-20.0 + 5.0 * k, -REAR, PAN_RIM) for k in range(9)], 0.45, 0.5)
+    plug = shaft("y", (-13.0, -6.0, PAN_RIM - 4.2), -1.4, 0.8, sides=6)
     return union(without(union(tub, flange), inside), rim, plug)
 
 
@@ -110,7 +110,7 @@ def _head() -> Manifold:
     ]
     guides = [shaft("z", (x, 0, 22), 4.0, STEM_RADIUS + 0.15, sides=12) for x, _ in valves]
     tappets = [shaft("z", (x, 0, 25.0), 5.0, TAPPET_RADIUS + 0.15, sides=20) for x, _ in valves]
-    water = [box((x - 1.4, -2.0, 21.6), (x + 1.4, 6.0, 25.6), 0.6) for x in MAINS]
+    water = [box((x - 1.0, -2.0, 21.6), (x + 1.0, 6.0, 25.6), 0.4) for x in MAINS[1:-1]]
     return union(
         without(body, *chambers, *(_port(x, radius) for x, radius in valves), *guides, *tappets, *water), _cam_bearings()
     )
@@ -125,7 +125,7 @@ def _port(x: float, radius: float) -> Manifold:
 
     throat = shaft("z", (x, 0, CHAMBER_ROOF - 0.1), 0.6, radius - 0.05, radius - 0.25, sides=16)
     bowl = hull(shaft("z", (x, 0, CHAMBER_ROOF + 0.4), 0.2, radius - 0.25, sides=14), ball(0.0, 23.0))
-    return union(throat, bowl, hull(ball(0.0, 23.0), ball(3.0, 23.8)), hull(ball(3.0, 23.8), ball(9.5, 24.2)))
+    return union(throat, bowl, hull(ball(0.0, 23.0), ball(9.5, 24.2)))
 
 
 def _cam_bearings() -> Manifold:
@@ -142,7 +142,7 @@ def _cam_bearings() -> Manifold:
 
 def _details() -> Manifold:
     """Head bolts, bolts and ribs of the end faces, the flange towards the gearbox."""
-    head_bolts = bolts("z", [(x, 5.4, HEAD_TOP) for x in (*CYLINDERS, -11.0, 0.0, 11.0)], 0.6, 0.7)
+    head_bolts = bolts("z", [(x, 5.4, HEAD_TOP) for x in (*CYLINDERS, *MAINS[1:-1])], 0.6, 0.7)
     ends: list[Vector] = [(-END, y, z) for y, z in ((2.0, 9.2), (6.8, 9.2), (2.0, 18.6), (6.8, 18.6), (6.4, 25.6))]
     front = bolts("x", ends, -0.5, 0.55)
     gearbox = union(

@@ -21,10 +21,10 @@ from mereo.scenes._machine_parts import (
     without,
 )
 
-CYLINDERS = (-16.5, -5.5, 5.5, 16.5)
+CYLINDERS = (-15.0, -5.0, 5.0, 15.0)
 """x of the cylinders' axes."""
 
-MAINS = (-22.0, -11.0, 0.0, 11.0, 22.0)
+MAINS = (-20.0, -10.0, 0.0, 10.0, 20.0)
 """x of the crankshaft's and of the camshaft's bearings."""
 
 CRANK_RADIUS = 4.0
@@ -83,13 +83,13 @@ def _lobe_outline(nose_rad: float) -> list[tuple[float, float]]:
 
 def camshaft(noses_rad: dict[float, float]) -> Manifold:
     """Shaft, bearing collars, one lobe at each x of ``noses_rad`` and the toothed belt wheel with its spokes."""
-    shaft_part = shaft("x", (-26.6, 0, 0), 50.2, 1.4, sides=16)
-    journals = [shaft("x", (x - 1.3, 0, 0), 2.6, 1.7, sides=18) for x in MAINS]
+    shaft_part = shaft("x", (-24.2, 0, 0), 45.5, 1.4, sides=16)
+    journals = [shaft("x", (x - 1.2, 0, 0), 2.4, 1.7, sides=18) for x in MAINS]
     lobes = [plate("x", _lobe_outline(nose), x - 1.0, x + 1.0) for x, nose in noses_rad.items()]
-    wheel = toothed("x", (-26.4, 0, 0), 2.2, 4.0, teeth=28, depth=0.5)
-    dish = shaft("x", (-26.5, 0, 0), 0.7, 3.0, sides=16)
-    spokes = [shaft("x", (-28, y, z), 4, 0.75, sides=8) for _, y, z in ring_of("x", (0, 0, 0), 2.2, 5)]
-    hub = union(shaft("x", (-27.0, 0, 0), 2.0, 1.4, sides=12), shaft("x", (-27.5, 0, 0), 1.0, 0.6, sides=6))
+    wheel = toothed("x", (-24.0, 0, 0), 2.2, 4.0, teeth=28, depth=0.5)
+    dish = shaft("x", (-24.1, 0, 0), 0.7, 3.0, sides=16)
+    spokes = [shaft("x", (-26, y, z), 4.5, 0.75, sides=8) for _, y, z in ring_of("x", (0, 0, 0), 2.2, 5)]
+    hub = union(shaft("x", (-24.5, 0, 0), 2.0, 1.4, sides=12), shaft("x", (-25.0, 0, 0), 1.0, 0.6, sides=6))
     parts = union(shaft_part, *journals, *lobes, without(wheel, dish, *spokes), hub)
     return parts.translate((0, 0, CAM_HEIGHT))
 
@@ -99,23 +99,23 @@ def crankshaft() -> Manifold:
     core = [shaft("x", (x - 2.5, 0, 0), 5.0, 2.0, sides=20) for x in MAINS]
     throws = [_throw(x, sign) for x, sign in zip(CYLINDERS, THROWS, strict=True)]
     front = union(
-        shaft("x", (-29.0, 0, 0), 6.0, 1.2, sides=12),
-        toothed("x", (-26.4, 0, 0), 2.0, 2.2, teeth=14, depth=0.5),
+        shaft("x", (-26.0, 0, 0), 5.0, 1.2, sides=12),
+        toothed("x", (-24.0, 0, 0), 2.2, 2.2, teeth=14, depth=0.5),
         turned(
             "x",
-            (-28.6, 0, 0),
-            [(0, 3.4), (0.4, 3.4), (0.65, 2.9), (0.9, 3.4), (1.1, 3.4), (1.35, 2.9), (1.6, 3.4), (1.9, 3.4)],
+            (-26.1, 0, 0),
+            [(0, 3.4), (0.3, 3.4), (0.6, 2.8), (0.9, 3.4), (1.2, 2.8), (1.5, 3.4), (1.8, 3.4)],
             20,
         ),
-        shaft("x", (-29.4, 0, 0), 1.0, 0.8, sides=6),
+        shaft("x", (-26.7, 0, 0), 1.0, 0.8, sides=6),
     )
     disc = union(
-        shaft("x", (25.4, 0, 0), 2.2, 7.2, sides=32), toothed("x", (25.8, 0, 0), 1.2, 7.8, teeth=36, depth=0.6)
+        shaft("x", (22.6, 0, 0), 2.2, 7.2, sides=32), toothed("x", (23.0, 0, 0), 1.2, 7.8, teeth=36, depth=0.6)
     )
-    recess = turned("x", (26.9, 0, 0), [(0.0, 5.0), (1.0, 6.2)], 24)
-    holes = [shaft("x", (24, y, z), 5, 0.8, sides=8) for _, y, z in ring_of("x", (0, 0, 0), 3.9, 6)]
+    recess = turned("x", (24.1, 0, 0), [(0.0, 5.0), (1.0, 6.2)], 24)
+    holes = [shaft("x", (22, y, z), 5, 0.8, sides=8) for _, y, z in ring_of("x", (0, 0, 0), 3.9, 6)]
     flange = union(
-        shaft("x", (23.8, 0, 0), 3.8, 2.6, sides=16), bolts("x", ring_of("x", (27.6, 0, 0), 1.8, 6), 0.4, 0.45)
+        shaft("x", (21.6, 0, 0), 3.2, 2.6, sides=16), bolts("x", ring_of("x", (24.8, 0, 0), 1.8, 6), 0.4, 0.45)
     )
     return union(*core, *throws, front, without(disc, recess, *holes), flange)
 
@@ -159,10 +159,10 @@ def piston(number: int) -> Manifold:
     for groove in (-1.9, -1.2, -0.5):
         height = top + groove
         profile += [(height - 0.3, r), (height - 0.3, r - 0.35), (height, r - 0.35), (height, r)]
-    body = turned("z", (0, 0, 0), [*profile, (top, r)], 26)
-    hollow = turned("z", (0, 0, 0), [(bottom - 1, 3.35), (0.9, 3.35), (top - 1.9, 2.7)], 18)
+    body = turned("z", (0, 0, 0), [*profile, (top, r)], 22)
+    hollow = turned("z", (0, 0, 0), [(bottom - 1, 3.35), (0.9, 3.35), (top - 1.9, 2.7)], 14)
     pockets = [
-        shaft("z", (at, 0, top - 0.3), 1.0, radius + 0.05, sides=16)
+        shaft("z", (at, 0, top - 0.3), 1.0, radius + 0.05, sides=12)
         for at, radius in ((INTAKE_AT, INTAKE_RADIUS), (EXHAUST_AT, EXHAUST_RADIUS))
     ]
     sides = [box((side * 4.4 - 1.1, -3.0, bottom - 1), (side * 4.4 + 1.1, 3.0, 0.0)) for side in (-1, 1)]
