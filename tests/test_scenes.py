@@ -15,6 +15,8 @@ from mereo.scene import SCENES, Scene, Workspace, load_scene, look_at
 from mereo.solid import Solids, check_overlap, label_grid
 
 STATES = 12
+RIGID_PARTS = ("robot", "engine")
+"""Scenes whose parts slide or turn upon each other, a small clearance apart."""
 
 
 @pytest.fixture(scope="module", params=SCENES)
@@ -84,7 +86,7 @@ def test_touching_segments_keep_touching(scene: Scene) -> None:
             shared += len(i)
             moved = state.mesh.segments[a].vertices[i] - state.mesh.segments[b].vertices[j]
             assert np.abs(moved).max(initial=0.0) < 0.05
-    assert shared > 50
+    assert shared > 50 or scene.name in RIGID_PARTS  # these share no vertex, as none of their parts touch
 
 
 def test_the_whole_object_is_in_view_of_every_camera(scene: Scene) -> None:
@@ -142,5 +144,5 @@ def test_look_at_straight_along_up_is_still_a_rotation() -> None:
 
 
 def test_unknown_scene_is_named() -> None:
-    with pytest.raises(ValueError, match="scene 'hare' is unknown; it must be one of bunny, rope"):
+    with pytest.raises(ValueError, match=f"scene 'hare' is unknown; it must be one of {', '.join(SCENES)}"):
         load_scene("hare")

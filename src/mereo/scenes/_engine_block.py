@@ -1,4 +1,4 @@
-"""The engine's fixed part, cut open: everything above the oil pan is sectioned lengthwise, and the half y < 0 is gone."""
+"""The engine's fixed part, cut open: above the oil pan it is sectioned lengthwise, and the half y < 0 is gone."""
 
 from itertools import pairwise
 
@@ -44,7 +44,7 @@ def block() -> Manifold:
 
 def _cylinders() -> Manifold:
     body = box((-END, 0, CRANKCASE_TOP - 0.2), (END, REAR, DECK))
-    bores = [shaft("z", (x, 0, 5), 18.0, BORE, sides=32) for x in CYLINDERS]
+    bores = [shaft("z", (x, 0, 5), 18.0, BORE, sides=24) for x in CYLINDERS]
     # the water jacket shows between the bores
     slots = [box((x - 0.45, -1, 10.0), (x + 0.45, 4.0, 18.0), 0.2) for x in MAINS[1:-1]]
     jackets = [box((side * 20.3 - 0.5, -1, 9.8), (side * 20.3 + 0.5, 6.5, 18.4)) for side in (-1, 1)]
@@ -56,18 +56,18 @@ def _crankcase() -> Manifold:
     body = box((-END, 0, PAN_RIM), (END, REAR, CRANKCASE_TOP))
     bays = [
         hull(
-            shaft("x", (left + BULKHEAD, 0, 0), right - left - 2 * BULKHEAD, CRANKCASE_RADIUS, sides=28),
+            shaft("x", (left + BULKHEAD, 0, 0), right - left - 2 * BULKHEAD, CRANKCASE_RADIUS, sides=24),
             box((left + BULKHEAD, -7, PAN_RIM - 1), (right - BULKHEAD, CRANKCASE_RADIUS, 0)),
         )
         for left, right in pairwise(MAINS)
     ]
     under_caps = box((-END + 1.2, -1, PAN_RIM - 1), (END - 1.2, CRANKCASE_RADIUS, -3.4))
-    openings = [shaft("z", (x, 0, 5), 5.0, BORE, sides=32) for x in CYLINDERS]
+    openings = [shaft("z", (x, 0, 5), 5.0, BORE, sides=24) for x in CYLINDERS]
     caps = union(
         *(box((x - BULKHEAD, -3.6, -3.6), (x + BULKHEAD, 3.6, 0), 0.3) for x in MAINS),
         bolts("z", [(x, y, -3.6) for x in MAINS for y in (-2.8, 2.8)], -0.6, 0.55),
     )
-    line = shaft("x", (-30, 0, 0), 60, MAIN_BORE, sides=24)
+    line = shaft("x", (-30, 0, 0), 60, MAIN_BORE, sides=20)
     return without(union(without(body, *bays, under_caps, *openings), caps), line)
 
 
@@ -97,22 +97,21 @@ def _pan() -> Manifold:
 def _head() -> Manifold:
     body = box((-END, 0, DECK), (END, HEAD_REAR, HEAD_TOP))
     valves = [
-        (x + at, radius)
-        for x in CYLINDERS
-        for at, radius in ((INTAKE_AT, INTAKE_RADIUS), (EXHAUST_AT, EXHAUST_RADIUS))
+        (x + at, radius) for x in CYLINDERS for at, radius in ((INTAKE_AT, INTAKE_RADIUS), (EXHAUST_AT, EXHAUST_RADIUS))
     ]
     chambers = [
         hull(
-            shaft("z", (x - 0.9, 0, DECK - 1), CHAMBER_ROOF - DECK + 1, 3.15, sides=20),
-            shaft("z", (x + 1.15, 0, DECK - 1), CHAMBER_ROOF - DECK + 1, 2.85, sides=20),
+            shaft("z", (x - 0.9, 0, DECK - 1), CHAMBER_ROOF - DECK + 1, 3.15, sides=16),
+            shaft("z", (x + 1.15, 0, DECK - 1), CHAMBER_ROOF - DECK + 1, 2.85, sides=16),
         )
         for x in CYLINDERS
     ]
-    guides = [shaft("z", (x, 0, 22), 4.0, STEM_RADIUS + 0.15, sides=12) for x, _ in valves]
-    tappets = [shaft("z", (x, 0, 25.0), 5.0, TAPPET_RADIUS + 0.15, sides=20) for x, _ in valves]
+    guides = [shaft("z", (x, 0, 22), 4.0, STEM_RADIUS + 0.2, sides=10) for x, _ in valves]
+    tappets = [shaft("z", (x, 0, 25.0), 5.0, TAPPET_RADIUS + 0.17, sides=16) for x, _ in valves]
     water = [box((x - 1.0, -2.0, 21.6), (x + 1.0, 6.0, 25.6), 0.4) for x in MAINS[1:-1]]
     return union(
-        without(body, *chambers, *(_port(x, radius) for x, radius in valves), *guides, *tappets, *water), _cam_bearings()
+        without(body, *chambers, *(_port(x, radius) for x, radius in valves), *guides, *tappets, *water),
+        _cam_bearings(),
     )
 
 
@@ -137,7 +136,7 @@ def _cam_bearings() -> Manifold:
         for x in MAINS
     ]
     nuts = bolts("z", [(x, 2.2, CAM_HEIGHT + 2.5) for x in MAINS], 0.5, 0.55)
-    return without(union(*posts, nuts), shaft("x", (-30, 0, CAM_HEIGHT), 60, 1.87, sides=24))
+    return without(union(*posts, nuts), shaft("x", (-30, 0, CAM_HEIGHT), 60, 1.87, sides=20))
 
 
 def _details() -> Manifold:

@@ -1,7 +1,7 @@
 """Measures and moving parts of the engine, each as it stands at crank angle 0.
 
-The crankshaft lies along x through the origin, cylinders stand along +z, the open side looks to -y. Cylinder 1 is at the
-timing end (-x), the flywheel at +x. At crank angle 0, pistons 1 and 4 are at the top and cylinder 1 fires.
+The crankshaft lies along x through the origin, cylinders stand along +z, the open side looks to -y. Cylinder 1 is at
+the timing end (-x), the flywheel at +x. At crank angle 0, pistons 1 and 4 are at the top and cylinder 1 fires.
 """
 
 import numpy as np
@@ -69,7 +69,7 @@ def _lobe_outline(nose_rad: float) -> list[tuple[float, float]]:
     A convex shape whose support in direction a is p(a) touches a flat tappet there at distance p; its outline is
     ``p n + p' t``. So the outline below has exactly the lift law, and is convex as ``p + p'' > 0`` (0.5 at the nose).
     """
-    angle = np.linspace(-np.pi, np.pi, 30, endpoint=False)
+    angle = np.linspace(-np.pi, np.pi, 24, endpoint=False)
     step = 1e-4
     support = CAM_BASE_RADIUS + cam_lift(angle)
     slope = (cam_lift(angle + step) - cam_lift(angle - step)) / (2 * step)
@@ -95,7 +95,7 @@ def camshaft(noses_rad: dict[float, float]) -> Manifold:
 
 
 def crankshaft() -> Manifold:
-    """Journals, four throws with counterweights, timing wheel and pulley in front, flywheel with its ring gear behind."""
+    """Journals, four throws with counterweights, in front the belt wheel and a pulley, behind the toothed flywheel."""
     core = [shaft("x", (x - 2.5, 0, 0), 5.0, 2.0, sides=20) for x in MAINS]
     throws = [_throw(x, sign) for x, sign in zip(CYLINDERS, THROWS, strict=True)]
     front = union(
@@ -134,7 +134,7 @@ def _throw(x: float, sign: float) -> Manifold:
 def connecting_rod(number: int) -> Manifold:
     """Big end with a bolted cap, fluted shank, small end with an oil hole."""
     top = ROD_LENGTH
-    big = shaft("x", (-1.45, 0, 0), 2.9, 2.45, sides=22)
+    big = shaft("x", (-1.45, 0, 0), 2.9, 2.45, sides=18)
     shoulders = box((-1.45, -2.45, -1.0), (1.45, 2.45, 1.0), 0.25)
     small = shaft("x", (-1.3, 0, top), 2.6, 1.5, sides=16)
     shank = plate("x", [(-1.6, 1.6), (1.6, 1.6), (1.15, top - 1.0), (-1.15, top - 1.0)], -1.1, 1.1)
@@ -143,7 +143,7 @@ def connecting_rod(number: int) -> Manifold:
         for low in (-1.2, 0.7)
     ]
     cap_bolts = [shaft("z", (0, side * 2.0, -1.3), 2.6, 0.38, sides=6) for side in (-1, 1)]
-    eyes = [shaft("x", (-2, 0, 0), 4, 1.64, sides=22), shaft("x", (-2, 0, top), 4, 0.9, sides=14)]
+    eyes = [shaft("x", (-2, 0, 0), 4, 1.65, sides=18), shaft("x", (-2, 0, top), 4, 0.9, sides=12)]
     # the cap's parting line
     parting = [box((-2, side * 2.1 - 0.6, -0.08), (2, side * 2.1 + 0.6, 0.08)) for side in (-1, 1)]
     lines = [line ^ union(box((-2, -3, -1), (-1.2, 3, 1)), box((1.2, -3, -1), (2, 3, 1))) for line in parting]
@@ -189,4 +189,4 @@ def valve(radius: float, drop: float) -> Manifold:
         (TAPPET_TOP - 1.9, TAPPET_RADIUS),
         (TAPPET_TOP, TAPPET_RADIUS),
     ]
-    return turned("z", (0, 0, -drop), profile, 14)
+    return turned("z", (0, 0, -drop), profile, 12)

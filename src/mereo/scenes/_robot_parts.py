@@ -56,9 +56,7 @@ def column() -> Manifold:
     web_pocket = box((4.5, -1.6, 10.6), (12.0, 1.6, 13.6), 0.6)
     casting = without(casting, web_pocket)
     ring = bolts("z", ring_of("z", (0, 0, 9.6), 6.3, 12, 0.2), 0.45, 0.5)
-    first = union(
-        box((-6.5, -4.8, 9.6), (-2.0, -0.4, 15.4), 0.5), shaft("z", (-4.3, -2.6, 15.0), 1.4, 1.7, sides=16)
-    )
+    first = union(box((-6.5, -4.8, 9.6), (-2.0, -0.4, 15.4), 0.5), shaft("z", (-4.3, -2.6, 15.0), 1.4, 1.7, sides=16))
     fins = [shaft("y", (x, -5.0 - 0.9 * k, z), -0.45, 3.2, sides=20) for k in range(5)]
     second = union(
         shaft("y", (x, -4.0, z), -5.2, 2.6, sides=20), *fins, box((x - 1, -8.2, z + 2), (x + 1, -5.4, z + 3.9), 0.3)

@@ -1,27 +1,28 @@
 """Engine: four cylinders in line, cut open lengthwise, turned by one crank angle; modelled here, needs no download.
 
-Source: modelled in mereo's own code (`_engine_parts`, `_engine_block`), MIT licence; no particular product.
-At rest it is 57 x 19 x 48 units: 44 units from first to last main bearing, bore 8.4, stroke 8, rods 13 long.
+Source: modelled in mereo's own code (`_engine_parts`, `_engine_block`), MIT licence; no particular product. It is 52 x
+18 x 47 units: cylinders 10 apart, bore 8.4, stroke 8, rods 12 long.
 
 Segments, twelve: `block` (cylinders, crankcase, pan and head in one), `crankshaft` with flywheel and pulley, `camshaft`
-with belt wheel, `valves` (all eight, with their bucket tappets), `rod_1` .. `rod_4`, `piston_1` .. `piston_4`. Rods and
-pistons look the same, so each is a segment of its own: which one it is, is the question. The valves are one segment
-because each is a pixel or two thick; their common map moves each by its own lift.
+with its belt wheel, `valves` (all eight, with their bucket tappets), `rod_1` .. `rod_4`, `piston_1` .. `piston_4` with
+their pins. Rods and pistons look alike, and which one is seen is the question, so each is a segment of its own. The
+valves are one segment because each is only a pixel or two thick; one map moves each by its own lift.
 
 Degrees of freedom: one, the crank angle, uniform over the two turns of the four-stroke cycle. It drives everything:
 
     crankshaft  turns about x
-    rods        slider-crank: tilted by asin(4 sin(angle) / 13), at most 17.9 degrees
-    pistons     4 cos(angle) + sqrt(13^2 - (4 sin(angle))^2) above the crankshaft
+    rods        slider-crank: tilted by asin(4 sin(angle) / 12), at most 19.5 degrees
+    pistons     their pins are 4 cos(angle) + sqrt(12^2 - (4 sin(angle))^2) above the crankshaft
     camshaft    turns half as fast
     valves      lift up to 1.2 by the flat-tappet law of the very lobes that are modelled (`cam_lift`): open for 300
                 degrees of the crank, most 110 degrees before (exhaust) and after (intake) the top of the gas exchange
 
-Cylinders fire in the order 1-3-4-2, cylinder 1 at angle 0. Parts that slide or turn upon each other are 0.1 to 0.2 apart.
+Cylinders fire in the order 1-3-4-2, cylinder 1 at angle 0. Parts that slide or turn upon each other are 0.1 to 0.2
+apart at every angle: lobes and tappets, for example, always 0.12.
 
 What makes it hard: pistons 1 and 4 move alike, as do 2 and 3, and the same crank position occurs twice in a cycle with
-other valves open; walls of 0.8 and stems of 1.1 are at the size of a pixel; rods, pins and cranks hide each other. On
-the other hand, one number decides everything, so what is hidden follows from what is seen.
+other valves open; stems of 1.5 and walls of 1.6 are at the size of a pixel; rods, pins and cranks hide each other. On
+the other hand one number decides everything, so what is hidden follows from what is seen.
 """
 
 from dataclasses import dataclass
@@ -108,7 +109,9 @@ def rest_mesh() -> SegmentedMesh:
     }
     colors = [PALETTE[7], *(PALETTE[i] for i in (0, 1, 3, 2, 4, 5, 6, 8, 9, 10, 11))]
     return SegmentedMesh(
-        tuple(segment(name, color, part, LONGEST_EDGE) for (name, part), color in zip(solids.items(), colors, strict=True))
+        tuple(
+            segment(name, color, part, LONGEST_EDGE) for (name, part), color in zip(solids.items(), colors, strict=True)
+        )
     )
 
 
@@ -129,7 +132,9 @@ def deformations_at(crank_rad: float) -> tuple[Deformation, ...]:
     cam = Rigid(np.array([crank_rad / 2, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, parts.CAM_HEIGHT]))
     widest = np.maximum(radius, parts.TAPPET_RADIUS)
     gaps = np.stack([x[:-1] + widest[:-1], x[1:] - widest[1:]])
-    valves = StepwiseShift(gaps.mean(axis=0), valve_lifts(0.0) - valve_lifts(crank_rad), float(np.diff(gaps, axis=0).min()))
+    valves = StepwiseShift(
+        gaps.mean(axis=0), valve_lifts(0.0) - valve_lifts(crank_rad), float(np.diff(gaps, axis=0).min())
+    )
     pairs = {throw: rod_and_piston(crank_rad, throw) for throw in set(parts.THROWS)}
     rods, pistons = zip(*(pairs[throw] for throw in parts.THROWS), strict=True)
     return (Identity(), crank, cam, valves, *rods, *pistons)
@@ -146,5 +151,5 @@ def scene() -> Scene:
         name="engine",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(axis=(0.0, -0.94, 0.34), fov_rad=float(np.deg2rad(44.0))),
+        workspace=Workspace(axis=(0.0, -0.94, 0.34), fov_rad=float(np.deg2rad(40.0))),
     )

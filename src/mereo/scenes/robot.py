@@ -1,7 +1,8 @@
 """Robot: an industrial arm with six revolute joints and a two-finger gripper; modelled here, needs no download.
 
 Source: modelled in mereo's own code (`_robot_parts`), MIT licence; no particular product. Proportions are those of an
-arm of 0.7 m reach: one unit is about 16 mm. At rest it is 52 x 20 x 46 units: upper arm upright, forearm level.
+arm of 0.7 m reach, with a large gripper: one unit is about 16 mm. At rest, with the upper arm upright and the forearm
+level, it is 48 x 20 x 44 units.
 
 Segments: one for each link, `base`, `column`, `upper_arm`, `elbow`, `forearm`, `wrist`, `hand`, and the jaws
 `finger_left` and `finger_right`. Motors, covers, ribs and bolts belong to the link that carries them.
@@ -16,10 +17,10 @@ Degrees of freedom, each uniform within its limits, rigid motions composed down 
     spin      hand about its length       -180 to 180
     opening   of each finger from the middle, 0.15 to 2.0 units
 
-Neighbours cannot meet within these limits, by construction; poses in which other parts would (the hand and the base, the
-column, the upper arm or the floor) are drawn again. The base stays.
+Neighbours cannot meet within these limits, by construction; poses in which other parts would (the hand and the base,
+the column, the upper arm or the floor) are drawn again, about one in four. The base stays.
 
-What makes it hard: the chain reaches 65 units from a fixed base, so a small error in one angle moves everything after
+What makes it hard: the chain reaches 58 units from a fixed base, so a small error in one angle moves everything after
 it; the forearm and the hand look almost the same after half a turn; the fingers differ by their place alone, are two
 pixels thick and often hidden; the camera may stand behind the arm, where the column hides the hand.
 """
@@ -60,16 +61,16 @@ OPENING = (0.15, 2.0)
 
 
 class Bulk(NamedTuple):
-    """Spheres of one radius around ``count`` points from ``start`` to ``end``, which enclose a part at rest."""
+    """``spheres`` of one radius with centres from ``start`` to ``end``, which enclose a part at rest."""
 
     link: int
     start: Vector
     end: Vector
     radius: float
-    count: int
+    spheres: int
 
     def centers(self) -> Float[np.ndarray, "n 3"]:
-        return np.linspace(self.start, self.end, self.count)
+        return np.linspace(self.start, self.end, self.spheres)
 
 
 _Z = parts.FOREARM_HEIGHT
@@ -153,9 +154,7 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
         turns = chain(sample_angles(rng))
     links = [Compose(turns[:count][::-1]) for count in range(1, len(turns) + 1)]
     slide = np.array([0.0, rng.uniform(*OPENING) - parts.JAW_OPENING, 0.0])
-    fingers = [
-        Compose((Rigid(np.zeros(3), side * slide, np.zeros(3)), *turns[::-1])) for side in (1, -1)
-    ]
+    fingers = [Compose((Rigid(np.zeros(3), side * slide, np.zeros(3)), *turns[::-1])) for side in (1, -1)]
     return (Identity(), *links, *fingers)
 
 
