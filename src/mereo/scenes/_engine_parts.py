@@ -160,7 +160,7 @@ def piston(number: int) -> Manifold:
         height = top + groove
         profile += [(height - 0.3, r), (height - 0.3, r - 0.35), (height, r - 0.35), (height, r)]
     body = turned("z", (0, 0, 0), [*profile, (top, r)], 22)
-    hollow = turned("z", (0, 0, 0), [(bottom - 1, 3.35), (0.9, 3.35), (top - 1.9, 2.7)], 14)
+    hollow = turned("z", (0, 0, 0), [(bottom - 1, 3.2), (0.9, 3.2), (top - 1.9, 2.6)], 14)
     pockets = [
         shaft("z", (at, 0, top - 0.3), 1.0, radius + 0.05, sides=12)
         for at, radius in ((INTAKE_AT, INTAKE_RADIUS), (EXHAUST_AT, EXHAUST_RADIUS))
