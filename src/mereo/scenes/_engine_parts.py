@@ -84,9 +84,9 @@ def _lobe_outline(nose_rad: float) -> list[tuple[float, float]]:
 def camshaft(noses_rad: dict[float, float]) -> Manifold:
     """Shaft, bearing collars, one lobe at each x of ``noses_rad`` and the toothed belt wheel with its spokes."""
     shaft_part = shaft("x", (-24.2, 0, 0), 45.5, 1.4, sides=16)
-    journals = [shaft("x", (x - 1.2, 0, 0), 2.4, 1.7, sides=18) for x in MAINS]
+    journals = [shaft("x", (x - 1.2, 0, 0), 2.4, 1.7, sides=16) for x in MAINS]
     lobes = [plate("x", _lobe_outline(nose), x - 1.0, x + 1.0) for x, nose in noses_rad.items()]
-    wheel = toothed("x", (-24.0, 0, 0), 2.2, 4.0, teeth=28, depth=0.5)
+    wheel = toothed("x", (-24.0, 0, 0), 2.2, 4.0, teeth=20, depth=0.5)
     dish = shaft("x", (-24.1, 0, 0), 0.7, 3.0, sides=16)
     spokes = [shaft("x", (-26, y, z), 4.5, 0.75, sides=8) for _, y, z in ring_of("x", (0, 0, 0), 2.2, 5)]
     hub = union(shaft("x", (-24.5, 0, 0), 2.0, 1.4, sides=12), shaft("x", (-25.0, 0, 0), 1.0, 0.6, sides=6))
@@ -96,21 +96,21 @@ def camshaft(noses_rad: dict[float, float]) -> Manifold:
 
 def crankshaft() -> Manifold:
     """Journals, four throws with counterweights, in front the belt wheel and a pulley, behind the toothed flywheel."""
-    core = [shaft("x", (x - 2.5, 0, 0), 5.0, 2.0, sides=20) for x in MAINS]
+    core = [shaft("x", (x - 2.5, 0, 0), 5.0, 2.0, sides=16) for x in MAINS]
     throws = [_throw(x, sign) for x, sign in zip(CYLINDERS, THROWS, strict=True)]
     front = union(
         shaft("x", (-26.0, 0, 0), 5.0, 1.2, sides=12),
-        toothed("x", (-24.0, 0, 0), 2.2, 2.2, teeth=14, depth=0.5),
+        toothed("x", (-24.0, 0, 0), 2.2, 2.2, teeth=10, depth=0.5),
         turned(
             "x",
             (-26.1, 0, 0),
             [(0, 3.4), (0.3, 3.4), (0.6, 2.8), (0.9, 3.4), (1.2, 2.8), (1.5, 3.4), (1.8, 3.4)],
-            20,
+            16,
         ),
         shaft("x", (-26.7, 0, 0), 1.0, 0.8, sides=6),
     )
     disc = union(
-        shaft("x", (22.6, 0, 0), 2.2, 7.2, sides=32), toothed("x", (23.0, 0, 0), 1.2, 7.8, teeth=36, depth=0.6)
+        shaft("x", (22.6, 0, 0), 2.2, 7.2, sides=24), toothed("x", (23.0, 0, 0), 1.2, 7.8, teeth=30, depth=0.6)
     )
     recess = turned("x", (24.1, 0, 0), [(0.0, 5.0), (1.0, 6.2)], 24)
     holes = [shaft("x", (22, y, z), 5, 0.8, sides=8) for _, y, z in ring_of("x", (0, 0, 0), 3.9, 6)]
@@ -122,7 +122,7 @@ def crankshaft() -> Manifold:
 
 def _throw(x: float, sign: float) -> Manifold:
     """A crank pin between two webs, each with a counterweight on the far side."""
-    pin = shaft("x", (x - 1.8, 0, CRANK_RADIUS), 3.6, 1.5, sides=20)
+    pin = shaft("x", (x - 1.8, 0, CRANK_RADIUS), 3.6, 1.5, sides=16)
     arm = hull(shaft("x", (-0.95, 0, CRANK_RADIUS), 1.9, 2.1, sides=16), shaft("x", (-0.95, 0, 0), 1.9, 2.7, sides=16))
     sector = [(5.8 * np.sin(a), -5.8 * np.cos(a)) for a in np.linspace(-1.05, 1.05, 10)]
     weight = plate("x", [*sector, (2.6, 0.6), (-2.6, 0.6)], -0.95, 0.95)
@@ -134,7 +134,7 @@ def _throw(x: float, sign: float) -> Manifold:
 def connecting_rod(number: int) -> Manifold:
     """Big end with a bolted cap, fluted shank, small end with an oil hole."""
     top = ROD_LENGTH
-    big = shaft("x", (-1.45, 0, 0), 2.9, 2.45, sides=18)
+    big = shaft("x", (-1.45, 0, 0), 2.9, 2.45, sides=16)
     shoulders = box((-1.45, -2.45, -1.0), (1.45, 2.45, 1.0), 0.25)
     small = shaft("x", (-1.3, 0, top), 2.6, 1.5, sides=16)
     shank = plate("x", [(-1.6, 1.6), (1.6, 1.6), (1.15, top - 1.0), (-1.15, top - 1.0)], -1.1, 1.1)
@@ -143,7 +143,7 @@ def connecting_rod(number: int) -> Manifold:
         for low in (-1.2, 0.7)
     ]
     cap_bolts = [shaft("z", (0, side * 2.0, -1.3), 2.6, 0.38, sides=6) for side in (-1, 1)]
-    eyes = [shaft("x", (-2, 0, 0), 4, 1.65, sides=18), shaft("x", (-2, 0, top), 4, 0.9, sides=12)]
+    eyes = [shaft("x", (-2, 0, 0), 4, 1.65, sides=16), shaft("x", (-2, 0, top), 4, 0.9, sides=12)]
     # the cap's parting line
     parting = [box((-2, side * 2.1 - 0.6, -0.08), (2, side * 2.1 + 0.6, 0.08)) for side in (-1, 1)]
     lines = [line ^ union(box((-2, -3, -1), (-1.2, 3, 1)), box((1.2, -3, -1), (2, 3, 1))) for line in parting]
@@ -159,20 +159,20 @@ def piston(number: int) -> Manifold:
     for groove in (-1.9, -1.2, -0.5):
         height = top + groove
         profile += [(height - 0.3, r), (height - 0.3, r - 0.35), (height, r - 0.35), (height, r)]
-    body = turned("z", (0, 0, 0), [*profile, (top, r)], 22)
-    hollow = turned("z", (0, 0, 0), [(bottom - 1, 3.2), (0.9, 3.2), (top - 1.9, 2.6)], 14)
+    body = turned("z", (0, 0, 0), [*profile, (top, r)], 18)
+    hollow = turned("z", (0, 0, 0), [(bottom - 1, 3.2), (0.9, 3.2), (top - 1.9, 2.6)], 12)
     pockets = [
-        shaft("z", (at, 0, top - 0.3), 1.0, radius + 0.05, sides=12)
+        shaft("z", (at, 0, top - 0.3), 1.0, radius + 0.05, sides=10)
         for at, radius in ((INTAKE_AT, INTAKE_RADIUS), (EXHAUST_AT, EXHAUST_RADIUS))
     ]
     sides = [box((side * 4.4 - 1.1, -3.0, bottom - 1), (side * 4.4 + 1.1, 3.0, 0.0)) for side in (-1, 1)]
     shell = without(body, hollow, *pockets, *sides)
-    inner = shaft("z", (0, 0, bottom), 4.0, 3.6, sides=20)
+    inner = shaft("z", (0, 0, bottom), 4.0, 3.6, sides=16)
     bosses = [
-        union(shaft("x", (side * 1.5, 0, 0), side * 2.2, 1.35, sides=14), box(*block, 0.2)) ^ inner
+        union(shaft("x", (side * 1.5, 0, 0), side * 2.2, 1.35, sides=10), box(*block, 0.2)) ^ inner
         for side, block in ((-1, ((-3.7, -1.0, 0.0), (-1.5, 1.0, 2.2))), (1, ((1.5, -1.0, 0.0), (3.7, 1.0, 2.2))))
     ]
-    pin = shaft("x", (-3.6, 0, 0), 7.2, 0.72, sides=14)
+    pin = shaft("x", (-3.6, 0, 0), 7.2, 0.72, sides=12)
     part = union(shell, *bosses, pin)
     return part.translate((CYLINDERS[number], 0, THROWS[number] * CRANK_RADIUS + ROD_LENGTH))
 

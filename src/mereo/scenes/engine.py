@@ -38,8 +38,8 @@ from mereo.scenes import _engine_parts as parts
 from mereo.scenes._engine_block import block
 from mereo.scenes._machine_parts import segment, union
 
-LONGEST_EDGE = 8.0
-"""Half of the block's length of slivers would double the time to find nearest points on it."""
+LONGEST_EDGE = 10.0
+"""Longer edges are split: the block's slivers would nearly double the time to find nearest points on it."""
 
 CYCLE_RAD = 4 * np.pi
 
