@@ -16,6 +16,7 @@ import pytest
 import mereo.__main__ as command_line
 from mereo import commands
 from mereo.config import PRESETS, GenerateConfig, SamplingConfig
+from mereo.scene import SCENES
 
 WITHOUT_NETWORK = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
 
@@ -176,7 +177,7 @@ def test_wrong_usage_exits_with_2(text: str, capsys: pytest.CaptureFixture[str])
 
 def test_library_errors_are_one_line() -> None:
     assert_one_line_error(mereo("assets", "get", "nothing"), "no asset 'nothing'", "mereo assets list")
-    assert_one_line_error(mereo("scene", "check", "cube"), "'cube' is unknown", "bunny, rope")
+    assert_one_line_error(mereo("scene", "check", "cube"), "'cube' is unknown", ", ".join(SCENES))
 
 
 def test_missing_network_is_one_line_at_once(tmp_path: Path) -> None:
@@ -254,7 +255,7 @@ def test_assets_list_shows_licence_and_place(tmp_path: Path) -> None:
 
 
 def test_scene_list() -> None:
-    assert mereo("scene", "list").stdout.split() == ["bunny", "rope", "skull", "liver", "tumor"]
+    assert mereo("scene", "list").stdout.split() == list(SCENES)
 
 
 def test_doctor_exits_with_0() -> None:

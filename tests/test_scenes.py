@@ -15,6 +15,8 @@ from mereo.scene import SCENES, Scene, Workspace, load_scene, look_at
 from mereo.solid import Solids, check_overlap, label_grid
 
 STATES = 12
+RIGID_PARTS = ("robot", "engine")
+"""Scenes whose parts slide or turn upon each other, a small clearance apart."""
 
 
 _LIVER = ("liver/lapgym_liver_visual.stl", "liver/lapgym_gallbladder_visual.stl")
@@ -94,7 +96,7 @@ def test_touching_segments_keep_touching(scene: Scene) -> None:
             shared += len(i)
             moved = state.mesh.segments[a].vertices[i] - state.mesh.segments[b].vertices[j]
             assert np.abs(moved).max(initial=0.0) < 0.05
-    assert shared > 50
+    assert shared > 50 or scene.name in RIGID_PARTS  # these share no vertex, as none of their parts touch
 
 
 def test_the_whole_object_is_in_view_of_every_camera(scene: Scene) -> None:
