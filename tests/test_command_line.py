@@ -176,7 +176,7 @@ def test_wrong_usage_exits_with_2(text: str, capsys: pytest.CaptureFixture[str])
 
 def test_library_errors_are_one_line() -> None:
     assert_one_line_error(mereo("assets", "get", "nothing"), "no asset 'nothing'", "mereo assets list")
-    assert_one_line_error(mereo("scene", "check", "cube"), "'cube' is unknown", "bunny, rope")
+    assert_one_line_error(mereo("scene", "check", "cube"), "'cube' is unknown", "bunny, ")
 
 
 def test_missing_network_is_one_line_at_once(tmp_path: Path) -> None:

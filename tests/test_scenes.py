@@ -16,6 +16,9 @@ from mereo.solid import Solids, check_overlap, label_grid
 
 STATES = 12
 
+LOOSE = ("lizard", "shapes")
+"""Scenes of separate pieces, with air between hinged links or solids that move by themselves: nothing is shared."""
+
 
 @pytest.fixture(scope="module", params=SCENES)
 def scene(request: pytest.FixtureRequest, require_asset: Callable[[str], Path]) -> Scene:
@@ -84,7 +87,7 @@ def test_touching_segments_keep_touching(scene: Scene) -> None:
             shared += len(i)
             moved = state.mesh.segments[a].vertices[i] - state.mesh.segments[b].vertices[j]
             assert np.abs(moved).max(initial=0.0) < 0.05
-    assert shared > 50
+    assert (shared == 0) if scene.name in LOOSE else (shared > 50)
 
 
 def test_the_whole_object_is_in_view_of_every_camera(scene: Scene) -> None:
@@ -142,5 +145,5 @@ def test_look_at_straight_along_up_is_still_a_rotation() -> None:
 
 
 def test_unknown_scene_is_named() -> None:
-    with pytest.raises(ValueError, match="scene 'hare' is unknown; it must be one of bunny, rope"):
+    with pytest.raises(ValueError, match=f"scene 'hare' is unknown; it must be one of {', '.join(SCENES)}"):
         load_scene("hare")
