@@ -70,8 +70,8 @@ class LegPlan:
     toes: tuple[float, ...]
 
 
-FRONT_LEG = LegPlan((17.6, 4.5), (-1.9, 4.3), (1.6, 7.3), 0.85, (1.9, 1.6, 1.2), (2.0, 2.8, 3.2, 2.9, 2.0))
-REAR_LEG = LegPlan((37.6, 4.2), (3.4, 3.9), (-0.9, 7.6), 1.75, (2.1, 1.75, 1.3), (1.9, 2.7, 3.5, 3.9, 2.3))
+FRONT_LEG = LegPlan((18.0, 4.5), (-1.6, 4.4), (1.6, 7.3), 0.85, (1.9, 1.6, 1.2), (2.0, 2.8, 3.2, 2.9, 2.0))
+REAR_LEG = LegPlan((38.3, 4.2), (2.4, 4.5), (-1.6, 7.9), 1.75, (2.0, 1.7, 1.3), (1.9, 2.7, 3.5, 3.9, 2.3))
 
 
 @dataclass(frozen=True)
@@ -231,20 +231,23 @@ def _head() -> Manifold:
 
 @cache
 def spine_links() -> tuple[Manifold, ...]:
-    """Head, four to hold the trunk together, hip, and seven of the tail: one solid for each link, with air between."""
+    """Head, five of the trunk and seven of the tail: one solid for each link, with air between."""
     body = _on_the_ground(union([_trunk_and_tail(), _head(), *_scales()]))
+    carried = {SHOULDER_LINK: FRONT_LEG, HIP_LINK: REAR_LEG}
     links = []
     for number in range(len(SPINE) + 1):
-        link = body
+        roots = [leg(carried[number], side).root for side in (1, -1)] if number in carried else []
+        link = union([body, *(_boss(root) for root in roots)])
         if number > 0:
             link ^= SPINE[number - 1].knob_side()
         if number < len(SPINE):
             link -= SPINE[number].knob_room()
-        for plan, owner in ((FRONT_LEG, SHOULDER_LINK), (REAR_LEG, HIP_LINK)):
-            if owner == number:
-                for side in (1, -1):
-                    root = leg(plan, side).root
-                    boss = Manifold.cylinder(3.5, 2.3, 2.1, 16).translate((root.pivot[0], root.pivot[1], 0.0))
-                    link = (link + boss) - root.knob_room()
+        for root in roots:
+            link -= root.knob_room()
         links.append(_largest(link))
     return tuple(links)
+
+
+def _boss(root: Knuckle) -> Manifold:
+    """What surrounds a leg's socket."""
+    return Manifold.cylinder(3.5, root.radius + 1.0, root.radius + 0.8, 16).translate((*root.pivot[:2], 0.0))

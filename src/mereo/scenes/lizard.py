@@ -2,7 +2,7 @@
 
 The paper's model (by Javi Rodríguez, Creative Commons) is not used; this one is our own. Its 21 rigid links are head,
 five of the trunk, seven of the tail, and an upper part and a foot for each leg; knobs sit in sockets, with V-shaped
-openings to turn in. It is 72 units long from the snout to the tip of the tail, 37 wide across the feet and 7.5 high.
+openings to turn in. It is 72 units long from the snout to the tip of the tail, 38 wide across the feet and 7.5 high.
 
 Segments: `head`; `body_front` (shoulders and the next two links); `body_rear` (one link and the hips); `tail_base`
 (four links) and `tail_tip` (three); `leg_front_left`, `leg_front_right`, `leg_rear_left`, `leg_rear_right` (with their
