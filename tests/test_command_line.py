@@ -254,7 +254,7 @@ def test_assets_list_shows_licence_and_place(tmp_path: Path) -> None:
 
 
 def test_scene_list() -> None:
-    assert mereo("scene", "list").stdout.split() == ["bunny", "rope", "sheet"]
+    assert mereo("scene", "list").stdout.split() == ["bunny", "human", "rope", "sheet"]
 
 
 def test_doctor_exits_with_0() -> None:

@@ -17,10 +17,20 @@ from mereo.solid import Solids, check_overlap, label_grid
 STATES = 12
 
 
+NEEDED_ASSETS = {
+    "bunny": ("bunny/bunny.off",),
+    "human": (
+        "human/makehuman_base.obj",
+        "human/makehuman_default.mhskel",
+        "human/makehuman_default_weights.mhw",
+    ),
+}
+
+
 @pytest.fixture(scope="module", params=SCENES)
 def scene(request: pytest.FixtureRequest, require_asset: Callable[[str], Path]) -> Scene:
-    if request.param == "bunny":
-        require_asset("bunny/bunny.off")
+    for name in NEEDED_ASSETS.get(request.param, ()):
+        require_asset(name)
     return load_scene(request.param)
 
 
@@ -144,5 +154,5 @@ def test_look_at_straight_along_up_is_still_a_rotation() -> None:
 
 
 def test_unknown_scene_is_named() -> None:
-    with pytest.raises(ValueError, match="scene 'hare' is unknown; it must be one of bunny, rope, sheet"):
+    with pytest.raises(ValueError, match="scene 'hare' is unknown; it must be one of bunny, human, rope, sheet"):
         load_scene("hare")

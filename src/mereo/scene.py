@@ -11,7 +11,7 @@ from mereo.deformation import Deformation
 from mereo.frame import rigid
 from mereo.mesh import SegmentedMesh
 
-SCENES = ("bunny", "rope", "sheet")
+SCENES = ("bunny", "human", "rope", "sheet")
 """Built-in scenes, one module each in ``mereo.scenes``."""
 
 PAPER_APERTURE_RAD = float(np.deg2rad(140.0))

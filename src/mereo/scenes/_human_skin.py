@@ -1,0 +1,289 @@
+"""The body's joints, and its skin weights as smooth functions of space, which move interior points too.
+
+MakeHuman gives the share of each bone at the skin. Inside the body a share is at first that of the nearest skin and
+then diffuses within the body, not across the air to another limb, until it changes slowly enough for its joint: a turn
+by an angle about a joint has the Jacobian ``1 + angle * grad w . (axis x (point - joint))``.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import csr_matrix, diags, identity
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mereo.deformation import turn
+from mereo.scenes._human_parts import base, joints, rest_mesh, skin_weights, to_scene
+from mereo.solid import label_grid
+
+Turns = tuple[tuple[str, float, float], ...]
+"""Axis, lower and upper limit in degrees from the rest pose. An axis is x, y, z, `bone` (along the bone, a twist), or
+`hinge` (across upper arm and forearm; a positive angle bends them further)."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """What turns about one point.
+
+    Attributes:
+        name: of the part it moves.
+        parent: the part it hangs from.
+        bone, tip: MakeHuman's bone whose head is the joint, and the joint to which the part reaches.
+        skin: how the names of the bones begin whose skin moves with the part, and how they end.
+        softness: by how much its share is diffused, standard deviation in scene units.
+        turns: its degrees of freedom, applied the last one first.
+    """
+
+    name: str
+    parent: str
+    bone: str
+    tip: str
+    skin: tuple[tuple[str, ...], str]
+    softness: float
+    turns: Turns
+
+    @property
+    def head(self) -> Float[np.ndarray, "3"]:
+        """The joint's place."""
+        return joints()[f"{self.bone}____head"]
+
+    @property
+    def direction(self) -> Float[np.ndarray, "3"]:
+        """Of the part, a unit vector."""
+        along = joints()[self.tip] - self.head
+        unit: Float[np.ndarray, "3"] = along / np.linalg.norm(along)
+        return unit
+
+
+FACE = ("head", "jaw", "eye", "tongue", "levator", "oculi", "orbicularis", "oris", "risorius", "special")
+
+
+def _trunk() -> Iterator[Joint]:
+    bend: Turns = (("y", -15, 15), ("z", -12, 12), ("x", -10, 22))
+    yield Joint("waist", "", "spine04", "spine02____head", (("spine04", "spine03"), ""), 2.5, bend)
+    chest = ("spine02", "spine01", "clavicle", "breast", "shoulder01")
+    yield Joint("chest", "waist", "spine02", "neck01____head", (chest, ""), 2.5, bend)
+    turns: Turns = (("y", -25, 25), ("z", -10, 10), ("x", -12, 15))
+    yield Joint("neck", "chest", "neck01", "head____head", (("neck",), ""), 1.6, turns)
+    yield Joint("head", "neck", "head", "head____tail", (FACE, ""), 2.0, turns)
+
+
+def _limbs(side: str) -> Iterator[Joint]:
+    """Of one side, `L` or `R`; the limits are those of the left side and mirrored for the right one."""
+
+    def limb(
+        name: str, parent: str, bone: str, tip: str, skin: tuple[str, ...], softness: float, turns: Turns
+    ) -> Joint:
+        above = parent if parent in ("chest", "") else f"{parent}.{side}"
+        return Joint(
+            f"{name}.{side}", above, f"{bone}.{side}", f"{tip}.{side}____head", (skin, f".{side}"), softness, turns
+        )
+
+    shoulder: Turns = (("z", -22, 60), ("x", -65, 25), ("bone", -25, 25))
+    yield limb("upper_arm", "chest", "upperarm01", "lowerarm01", ("upperarm",), 2.6, shoulder)
+    yield limb("forearm", "upper_arm", "lowerarm01", "wrist", ("lowerarm",), 2.5, (("hinge", -40, 58),))
+    hand = ("wrist", "metacarpal", "finger")
+    yield limb("hand", "forearm", "wrist", "finger3-1", hand, 1.0, (("hinge", -35, 35), ("bone", -30, 30)))
+    hip: Turns = (("z", -6, 25), ("x", -62, 15), ("bone", -12, 12))
+    yield limb("thigh", "", "upperleg01", "lowerleg01", ("upperleg",), 3.2, hip)
+    yield limb("shin", "thigh", "lowerleg01", "foot", ("lowerleg",), 2.7, (("x", 0, 95),))
+    yield limb("foot", "shin", "foot", "toe3-1", ("foot", "toe"), 1.1, (("z", -10, 10), ("x", -15, 30)))
+
+
+JOINTS = (*_trunk(), *_limbs("L"), *_limbs("R"))
+"""Parents before their children; `waist` and thighs hang from the pelvis, which stays."""
+
+NAMES = tuple(joint.name for joint in JOINTS)
+PARENTS = tuple(NAMES.index(joint.parent) if joint.parent else -1 for joint in JOINTS)
+
+
+@cache
+def turn_axes() -> tuple[Float[np.ndarray, "k 3"], ...]:
+    """For each joint its axes in the rest pose, in the order of its turns."""
+    return tuple(np.stack([_axis(joint, name) for name, _, _ in joint.turns]) for joint in JOINTS)
+
+
+def _axis(joint: Joint, name: str) -> Float[np.ndarray, "3"]:
+    right = joint.name.endswith("R")
+    if name == "bone":  # a turn about a mirrored bone is mirrored by turning the other way
+        return joint.direction * (-1.0 if right else 1.0)
+    if name == "hinge":
+        side = joint.name[-1]
+        upper, fore = (JOINTS[NAMES.index(f"{part}.{side}")].direction for part in ("upper_arm", "forearm"))
+        across = np.cross(upper, fore)
+        unit: Float[np.ndarray, "3"] = across / np.linalg.norm(across)
+        return unit
+    axis = np.eye(3)["xyz".index(name)]
+    return axis * np.array([1.0, -1.0, -1.0]) if right else axis
+
+
+SPACING = 0.7
+SHELL = 3.0
+"""Nodes up to this many spacings outside the body have shares of their own."""
+
+STEPS = 3
+"""Implicit steps of diffusion: with three the kernel is nearly a normal distribution."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShareField:
+    """How much of every joint's turn a point takes part in: trilinear between the nodes of a grid.
+
+    Attributes:
+        origin: of the grid.
+        row: for each node a row of ``table``; nodes that have none of their own use that of the nearest one.
+        table: for each node in and near the body its share in each joint, from 0 to 1, that of the children included.
+    """
+
+    origin: Float[np.ndarray, "3"]
+    row: Int[np.ndarray, "x y z"]
+    table: Float[np.ndarray, "r j"]
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n j"]:
+        at = np.clip((points - self.origin) / SPACING, 0.0, np.array(self.row.shape) - 1.001)
+        cell = at.astype(np.int64)
+        part = at - cell
+        rows = self.row.ravel()
+        shape = self.row.shape
+        first = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
+        shares = np.zeros((len(points), self.table.shape[1]))
+        for corner in np.ndindex(2, 2, 2):
+            weight = np.prod(np.where(corner, part, 1.0 - part), axis=1)
+            step = (corner[0] * shape[1] + corner[1]) * shape[2] + corner[2]
+            shares += weight[:, None] * self.table[rows[first + step]]
+        return shares
+
+
+@cache
+def share_field() -> ShareField:
+    """Of the body at rest."""
+    rest = rest_mesh()
+    low, high = rest.bounds
+    margin = (SHELL + 1) * SPACING
+    axes = [np.arange(a - margin, b + margin, SPACING) for a, b in zip(low, high, strict=True)]
+    inside = label_grid(rest, *axes) > 0
+    away = distance_transform_edt(~inside)
+    near = away <= SHELL
+    number = np.full(inside.shape, -1)
+    # the body's nodes come first, then those of a shell around it
+    number[inside] = np.arange(inside.sum())
+    number[near & ~inside] = inside.sum() + np.arange(near.sum() - inside.sum())
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)[inside]
+    table = _extended(_diffused(_nearest_skin(nodes), number), number)
+    nearest = distance_transform_edt(~near, return_distances=False, return_indices=True)
+    return ShareField(np.array([axis[0] for axis in axes]), number[tuple(nearest)], table)
+
+
+def _nearest_skin(nodes: Float[np.ndarray, "r 3"]) -> Float[np.ndarray, "r j"]:
+    """Each joint's share at the nearest eight skin vertices, by inverse squared distance; children's included."""
+    vertices = base().vertices
+    own = np.zeros((len(vertices), len(JOINTS)))
+    for bone, (rows, shares) in skin_weights().items():
+        for column, joint in enumerate(JOINTS):
+            starts, end = joint.skin
+            if bone.startswith(starts) and bone.endswith(end):
+                own[rows, column] += shares
+    for column in reversed(range(len(JOINTS))):
+        if PARENTS[column] >= 0:
+            own[:, PARENTS[column]] += own[:, column]
+    skin = np.unique(base().faces)
+    distance, row = cKDTree(to_scene(vertices[skin])).query(nodes, k=8)
+    weight = 1.0 / np.maximum(distance, 1e-3) ** 2
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.einsum("rk,rkj->rj", weight, np.clip(own[skin[row]], 0.0, 1.0))
+
+
+def _flow(number: Int[np.ndarray, "x y z"]) -> csr_matrix:
+    """Laplacian of the graph of neighbouring nodes that have a number."""
+    pairs = []
+    for axis in range(3):
+        here, there = np.moveaxis(number, axis, 0)[:-1].ravel(), np.moveaxis(number, axis, 0)[1:].ravel()
+        both = (here >= 0) & (there >= 0)
+        pairs.append(np.stack([here[both], there[both]]))
+    i, j = np.concatenate(pairs, axis=1)
+    size = number.max() + 1
+    links = csr_matrix((np.ones(2 * len(i)), (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(size, size))
+    return csr_matrix(diags(np.asarray(links.sum(axis=1)).ravel()) - links)
+
+
+def _diffused(shares: Float[np.ndarray, "r j"], number: Int[np.ndarray, "x y z"]) -> Float[np.ndarray, "r j"]:
+    """Heat flow between the body's nodes, for each joint's own time; nothing leaves the body."""
+    size = len(shares)
+    flow = _flow(np.where(number < size, number, -1))
+    result = shares.copy()
+    for softness in {joint.softness for joint in JOINTS}:
+        columns = [k for k, joint in enumerate(JOINTS) if joint.softness == softness]
+        solver = splu((identity(size) + softness**2 / (2 * STEPS * SPACING**2) * flow).tocsc())
+        for _ in range(STEPS):
+            result[:, columns] = solver.solve(result[:, columns])
+    return result
+
+
+def _extended(shares: Float[np.ndarray, "r j"], number: Int[np.ndarray, "x y z"]) -> Float[np.ndarray, "n j"]:
+    """Harmonic in the shell: steady heat between the body's nodes, which keep theirs, and an insulated outside."""
+    size, flow = len(shares), _flow(number)
+    shell = splu(flow[size:, size:].tocsc()).solve(-(flow[size:, :size] @ shares))
+    return np.concatenate([shares, shell])
+
+
+@dataclass(frozen=True, eq=False)
+class PosedBody:
+    """The body's shape, then its pose: every joint turns each point by the point's share of the joint's angle.
+
+    Angles are blended, not matrices, so limbs do not collapse (see ``skeleton``). Joints turn from the leaves to the
+    root, in rest coordinates.
+
+    Attributes:
+        rotations: of each joint, axis times radians.
+        girth: of each part, by how much it is wider than at rest, as a fraction.
+        stretch: along the height; the width changes by its inverse square root, so that the volume is kept.
+    """
+
+    rotations: Float[np.ndarray, "j 3"]
+    girth: Float[np.ndarray, " j"]
+    stretch: float
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        shares = share_field()(points)
+        moved = self._shaped(points, shares)
+        heads = self.heads()
+        for index in reversed(range(len(JOINTS))):
+            angle = float(np.linalg.norm(self.rotations[index]))
+            taking = np.flatnonzero(shares[:, index] > 1e-7) if angle > 0 else np.zeros(0, dtype=np.int64)
+            if len(taking):
+                axis = self.rotations[index] / angle
+                moved[taking] = turn(moved[taking], heads[index], axis, angle * shares[taking, index])
+        return moved
+
+    def heads(self) -> Float[np.ndarray, "j 3"]:
+        """The joints of the shaped body, before it is posed; girth leaves a part's axis where it is."""
+        return np.stack([joint.head for joint in JOINTS]) * self._scale()
+
+    def _scale(self) -> Float[np.ndarray, "3"]:
+        return np.array([self.stretch**-0.5, self.stretch, self.stretch**-0.5])
+
+    def _shaped(self, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, "n j"]) -> Float[np.ndarray, "n 3"]:
+        growth = np.zeros_like(points)
+        for index, joint in enumerate(JOINTS):
+            if self.girth[index] == 0.0:
+                continue
+            own = shares[:, index] - shares[:, [k for k, above in enumerate(PARENTS) if above == index]].sum(axis=1)
+            rows = np.flatnonzero(np.abs(own) > 1e-7)
+            local = points[rows] - joint.head
+            across = local - np.outer(local @ joint.direction, joint.direction)
+            growth[rows] += self.girth[index] * own[rows, None] * across
+        return (points + growth) * self._scale()
+
+
+def rotation(joint: int, angles_rad: Float[np.ndarray, " k"]) -> Float[np.ndarray, "3"]:
+    """Axis times angle of a joint whose turns have these angles."""
+    total = Rotation.identity()
+    for axis, angle in zip(turn_axes()[joint], angles_rad, strict=True):
+        total = total * Rotation.from_rotvec(angle * axis)
+    vector: Float[np.ndarray, "3"] = total.as_rotvec()
+    return vector
