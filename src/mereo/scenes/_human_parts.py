@@ -21,10 +21,10 @@ from mereo.mesh import PALETTE, Segment, SegmentedMesh
 SCALE = 4.0
 """Scene units per decimetre: the body is 17 units deep, 40 wide and 67 tall."""
 
-FACES = 6500
+FACES = 5000
 """To which the body's 26,756 triangles are simplified before it is cut."""
 
-LONGEST_EDGE = 3.0
+LONGEST_EDGE = 3.6
 """Longer edges are split, so that the flat cut faces bend with the rest."""
 
 MOUTH = ((-0.37, 6.23, 0.5), (0.37, 7.0, 1.44))

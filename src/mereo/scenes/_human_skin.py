@@ -17,7 +17,6 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mereo.deformation import turn
 from mereo.scenes._human_parts import base, joints, rest_mesh, skin_weights, to_scene
 from mereo.solid import label_grid
 
@@ -103,9 +102,22 @@ PARENTS = tuple(NAMES.index(joint.parent) if joint.parent else -1 for joint in J
 
 
 @cache
-def turn_axes() -> tuple[Float[np.ndarray, "k 3"], ...]:
-    """For each joint its axes in the rest pose, in the order of its turns."""
-    return tuple(np.stack([_axis(joint, name) for name, _, _ in joint.turns]) for joint in JOINTS)
+def turn_axes() -> Float[np.ndarray, "j 3 3"]:
+    """For each joint its axes in the rest pose, in the order of its turns; zero where it has fewer than three."""
+    axes = np.zeros((len(JOINTS), 3, 3))
+    for index, joint in enumerate(JOINTS):
+        for place, (name, _, _) in enumerate(joint.turns):
+            axes[index, place] = _axis(joint, name)
+    return axes
+
+
+@cache
+def turn_limits() -> Float[np.ndarray, "2 j 3"]:
+    """Lower and upper limit of each turn in radians; zero where there is none."""
+    limits = np.zeros((2, len(JOINTS), 3))
+    for index, joint in enumerate(JOINTS):
+        limits[:, index, : len(joint.turns)] = np.deg2rad([turn[1:] for turn in joint.turns]).T
+    return limits
 
 
 def _axis(joint: Joint, name: str) -> Float[np.ndarray, "3"]:
@@ -122,10 +134,11 @@ def _axis(joint: Joint, name: str) -> Float[np.ndarray, "3"]:
     return axis * np.array([1.0, -1.0, -1.0]) if right else axis
 
 
-SPACING = 0.7
+SPACING = 0.6
 SHELL = 3.0
 """Nodes up to this many spacings outside the body have shares of their own."""
 
+TAIL = 0.005
 STEPS = 3
 """Implicit steps of diffusion: with three the kernel is nearly a normal distribution."""
 
@@ -147,15 +160,16 @@ class ShareField:
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n j"]:
         at = np.clip((points - self.origin) / SPACING, 0.0, np.array(self.row.shape) - 1.001)
         cell = at.astype(np.int64)
-        part = at - cell
-        rows = self.row.ravel()
-        shape = self.row.shape
-        first = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
-        shares = np.zeros((len(points), self.table.shape[1]))
-        for corner in np.ndindex(2, 2, 2):
-            weight = np.prod(np.where(corner, part, 1.0 - part), axis=1)
-            step = (corner[0] * shape[1] + corner[1]) * shape[2] + corner[2]
-            shares += weight[:, None] * self.table[rows[first + step]]
+        strides = np.array([self.row.shape[1] * self.row.shape[2], self.row.shape[2], 1])
+        corners = np.array(list(np.ndindex(2, 2, 2)))
+        rows = self.row.ravel()[(cell @ strides)[:, None] + corners @ strides]
+        x, y, z = np.stack([1.0 - (at - cell), at - cell], axis=2).transpose(1, 0, 2)
+        weights = (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).ravel()
+        # one sparse product instead of eight gathers
+        ends = 8 * np.arange(len(points) + 1)
+        shares: Float[np.ndarray, "n j"] = csr_matrix((weights, rows.ravel(), ends), (len(points), len(self.table))) @ (
+            self.table
+        )
         return shares
 
 
@@ -164,8 +178,9 @@ def share_field() -> ShareField:
     """Of the body at rest."""
     rest = rest_mesh()
     low, high = rest.bounds
-    margin = (SHELL + 1) * SPACING
-    axes = [np.arange(a - margin, b + margin, SPACING) for a, b in zip(low, high, strict=True)]
+    first, last = np.floor(low / SPACING - SHELL), np.ceil(high / SPACING + SHELL)
+    # whole multiples of the spacing, so that left and right are treated alike
+    axes = [SPACING * np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
     inside = label_grid(rest, *axes) > 0
     away = distance_transform_edt(~inside)
     near = away <= SHELL
@@ -174,7 +189,9 @@ def share_field() -> ShareField:
     number[inside] = np.arange(inside.sum())
     number[near & ~inside] = inside.sum() + np.arange(near.sum() - inside.sum())
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)[inside]
-    table = _extended(_diffused(_nearest_skin(nodes), number), number)
+    shares = _extended(_diffused(_nearest_skin(nodes), number), number)
+    # without the tails: most points then take part in few joints, wholly or not at all
+    table = np.clip((shares - TAIL) / (1.0 - 2 * TAIL), 0.0, 1.0)
     nearest = distance_transform_edt(~near, return_distances=False, return_indices=True)
     return ShareField(np.array([axis[0] for axis in axes]), number[tuple(nearest)], table)
 
@@ -251,39 +268,54 @@ class PosedBody:
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         shares = share_field()(points)
         moved = self._shaped(points, shares)
-        heads = self.heads()
+        heads, angles = self.heads(), np.linalg.norm(self.rotations, axis=1)
+        # rows a x e_k: Rodrigues' formula for a fixed axis is two products with these and their squares
+        quarter = np.cross((self.rotations / np.maximum(angles, 1e-12)[:, None])[:, None], np.eye(3))
+        half = quarter @ quarter
         for index in reversed(range(len(JOINTS))):
-            angle = float(np.linalg.norm(self.rotations[index]))
-            taking = np.flatnonzero(shares[:, index] > 1e-7) if angle > 0 else np.zeros(0, dtype=np.int64)
-            if len(taking):
-                axis = self.rotations[index] / angle
-                moved[taking] = turn(moved[taking], heads[index], axis, angle * shares[taking, index])
+            rows = np.flatnonzero(shares[:, index] > 1e-9)
+            local, angle = moved[rows] - heads[index], (angles[index] * shares[rows, index])[:, None]
+            moved[rows] += np.sin(angle) * (local @ quarter[index]) + (1.0 - np.cos(angle)) * (local @ half[index])
         return moved
 
     def heads(self) -> Float[np.ndarray, "j 3"]:
         """The joints of the shaped body, before it is posed; girth leaves a part's axis where it is."""
-        return np.stack([joint.head for joint in JOINTS]) * self._scale()
+        return part_axes()[1] * self._scale()
 
     def _scale(self) -> Float[np.ndarray, "3"]:
         return np.array([self.stretch**-0.5, self.stretch, self.stretch**-0.5])
 
     def _shaped(self, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, "n j"]) -> Float[np.ndarray, "n 3"]:
-        growth = np.zeros_like(points)
-        for index, joint in enumerate(JOINTS):
-            if self.girth[index] == 0.0:
-                continue
-            own = shares[:, index] - shares[:, [k for k, above in enumerate(PARENTS) if above == index]].sum(axis=1)
-            rows = np.flatnonzero(np.abs(own) > 1e-7)
-            local = points[rows] - joint.head
-            across = local - np.outer(local @ joint.direction, joint.direction)
-            growth[rows] += self.girth[index] * own[rows, None] * across
+        """Every part grows away from its axis, each point by its shares in the parts."""
+        across, heads = part_axes()
+        grown = (_own_shares() * self.girth) @ across.reshape(-1, 9)
+        shift = (_own_shares() * self.girth) @ np.einsum("jab,jb->ja", across, heads)
+        growth = np.einsum("nab,nb->na", (shares @ grown).reshape(-1, 3, 3), points) - shares @ shift
         return (points + growth) * self._scale()
 
 
-def rotation(joint: int, angles_rad: Float[np.ndarray, " k"]) -> Float[np.ndarray, "3"]:
-    """Axis times angle of a joint whose turns have these angles."""
-    total = Rotation.identity()
-    for axis, angle in zip(turn_axes()[joint], angles_rad, strict=True):
-        total = total * Rotation.from_rotvec(angle * axis)
-    vector: Float[np.ndarray, "3"] = total.as_rotvec()
-    return vector
+@cache
+def _own_shares() -> Float[np.ndarray, "j j"]:
+    """``shares @ this`` are the shares of the parts alone, without what hangs from them."""
+    own = np.eye(len(JOINTS))
+    for child, parent in enumerate(PARENTS):
+        if parent >= 0:
+            own[child, parent] = -1.0
+    return own
+
+
+@cache
+def part_axes() -> tuple[Float[np.ndarray, "j 3 3"], Float[np.ndarray, "j 3"]]:
+    """For each part the projection across its axis, and the joint at which it begins."""
+    directions = np.stack([joint.direction for joint in JOINTS])
+    projections = np.eye(3) - directions[:, :, None] * directions[:, None]
+    return projections, np.stack([joint.head for joint in JOINTS])
+
+
+def rotations(angles_rad: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3"]:
+    """Axis times angle of every joint whose turns have these angles."""
+    first, second, third = (
+        Rotation.from_rotvec(angles_rad[:, place, None] * turn_axes()[:, place]) for place in range(3)
+    )
+    vectors: Float[np.ndarray, "j 3"] = (first * second * third).as_rotvec()
+    return vectors

@@ -1,7 +1,7 @@
 """Human: the MakeHuman body in ten parts, moved by its skeleton and skin weights, thin or stout, short or tall.
 
 Source: MakeHuman's base mesh, default skeleton and default skin weights (MakeHuman community, CC0 1.0), through the
-asset registry. The mouth is filled and eyeballs are put in, the body is simplified to 6,500 triangles, scaled to
+asset registry. The mouth is filled and eyeballs are put in, the body is simplified to 5,000 triangles, scaled to
 40 x 67 x 17 units and cut by planes.
 
 Segments: `torso` (with the neck's lower half), `head`, and of each side `upper_arm_left`, `forearm_left` (with the
@@ -19,7 +19,7 @@ elbows bent by 50 degrees):
 - smooth waves of all space (gradient up to 0.1).
 
 A point takes part in a joint's turn by MakeHuman's skin weights, continued into the body (``_human_skin``). Poses in
-which parts come through each other, or in which a joint would press space below a tenth, are drawn again.
+which parts come through each other, or in which joints together press space below an eighth, are drawn again.
 
 The camera stands in front of the body, as above a patient who lies on the back: head or feet may point anywhere.
 
@@ -38,7 +38,7 @@ from scipy.spatial.distance import cdist
 from mereo.deformation import Compose, Deformation, jacobian_determinant
 from mereo.scene import Scene, Workspace
 from mereo.scenes._human_parts import base, rest_mesh, to_scene
-from mereo.scenes._human_skin import JOINTS, NAMES, PosedBody, rotation
+from mereo.scenes._human_skin import JOINTS, NAMES, PosedBody, part_axes, rotations, share_field, turn_limits
 from mereo.solid import label_grid
 from mereo.warps import SmoothField
 
@@ -51,7 +51,8 @@ LEAST_GAP = 0.5
 """That watched balls must keep: what lies between them and the skin is at most half of this deep."""
 
 SMALLEST_BALL = 0.45
-LEAST_DETERMINANT = 0.1
+CRITICAL = 200
+LEAST_DETERMINANT = 0.12
 
 GIRTH_GROUPS = (
     ("waist", "chest"),
@@ -93,27 +94,31 @@ def is_clear(posed: Deformation) -> bool:
 
 
 @cache
-def _check_points() -> Float[np.ndarray, "n 3"]:
-    """Every eighth vertex: joints press space most at the skin."""
-    return np.concatenate([segment.vertices for segment in rest_mesh().segments])[::8]
+def critical_points() -> Float[np.ndarray, "n 3"]:
+    """The vertices at which the joints can press space most: largest angle, slope of the share and lever multiply."""
+    vertices = np.concatenate([segment.vertices for segment in rest_mesh().segments])
+    field, step = share_field(), 0.05 * np.eye(3)
+    slope = np.stack([field(vertices + along) - field(vertices - along) for along in step], axis=2) / 0.1
+    lever = np.linalg.norm(vertices[:, None] - part_axes()[1], axis=2)
+    largest = np.abs(turn_limits()).max(axis=(0, 2))
+    pressed = (np.linalg.norm(slope, axis=2) * lever * largest).max(axis=1)
+    return vertices[np.argsort(-pressed, kind="stable")[:CRITICAL]]
 
 
 def sample_body(rng: np.random.Generator) -> PosedBody:
     """A random shape in a random pose within the limits of each joint."""
-    angles = [rng.uniform(*np.deg2rad([turn[1:] for turn in joint.turns]).T) for joint in JOINTS]
     girth = np.zeros(len(JOINTS))
     common = rng.uniform(-0.1, 0.14)
     for group in GIRTH_GROUPS:
         girth[[NAMES.index(name) for name in group]] = common + rng.uniform(-0.04, 0.04)
-    rotations = np.stack([rotation(index, turns) for index, turns in enumerate(angles)])
-    return PosedBody(rotations, girth, float(np.exp(rng.uniform(-0.05, 0.05))))
+    return PosedBody(rotations(rng.uniform(*turn_limits())), girth, float(np.exp(rng.uniform(-0.05, 0.05))))
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """One map moves all segments."""
     for _ in range(ATTEMPTS):
         body = sample_body(rng)
-        if is_clear(body) and jacobian_determinant(body, _check_points()).min() > LEAST_DETERMINANT:
+        if is_clear(body) and jacobian_determinant(body, critical_points()).min() > LEAST_DETERMINANT:
             waves = SmoothField.sample(rng, rng.uniform(0.0, 0.1), (25.0, 60.0))
             return (Compose((body, waves)),) * len(rest_mesh().segments)
     raise ValueError(f"no pose in {ATTEMPTS} draws keeps the body's parts apart: narrow the joints' limits")
