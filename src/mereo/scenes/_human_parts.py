@@ -156,7 +156,8 @@ def _body() -> manifold3d.Manifold:
     outer = max(solid.decompose(), key=lambda part: part.volume())  # the others are voids behind the lips
     vertices, faces = _arrays(outer)
     collapsed = igl.qslim(to_scene(vertices), faces, FACES)
-    return _manifold(collapsed[0], collapsed[1])
+    # libigl's faces are C's long long, which numpy tells apart
+    return _manifold(collapsed[0], collapsed[1].astype(np.int64))
 
 
 def _manifold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> manifold3d.Manifold:

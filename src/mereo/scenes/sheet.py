@@ -14,7 +14,7 @@ Degrees of freedom, in this order:
 - a twist of up to 0.5 radians end to end, smooth waves of all space (gradient up to 0.18), a tilt of up to 0.3 radians.
 
 Bends and sweep keep lengths in the middle surface. A state whose layers would touch is drawn again, and so is one in
-which the sweep would stretch or press by more than half a corner that is already bent.
+which the sweep would press or stretch a corner that is already bent by more than 0.7, or two corners meet.
 
 What makes it hard: layers hide each other and their undersides look the same; turned by half a turn the mat is the
 same but for the tab and for holes that become studs.
@@ -43,6 +43,9 @@ ROLL_PITCH = 3.9
 CLEARANCE = 3.4
 """Least distance of middle points that are not neighbours. They are at most 1.9 apart in the sheet, so that layers
 whose points keep this distance are 3.1 apart: more than the thickest places of two layers, 1.5 and 1.25, need."""
+
+MOST_PRESSED = 0.7
+"""Largest curvature of the sweep times distance from the middle surface: by so much space is pressed or stretched."""
 
 NEIGHBOURS = 7.0
 """Points within this distance at rest may come closer: half of the tightest fold's circumference is 7.5."""
@@ -130,6 +133,17 @@ def _middle() -> Float[np.ndarray, "k 3"]:
     return middle_points()
 
 
+def _do_not_meet(corners: list[Bend]) -> bool:
+    """Whether each bend moves only what none before it has moved, which lies flat."""
+    moved = _middle()
+    for bend in corners:
+        taken = (moved - bend.origin) @ bend.axis > -LARGEST_OFFSET
+        if (np.abs(moved[taken] - _middle()[taken]) > 1e-9).any():
+            return False
+        moved = bend(moved)
+    return True
+
+
 def sample_deformation(rng: np.random.Generator) -> Deformation | None:
     """One state's map, or None where it is not to be used."""
     corners = [sample_corner(rng, int(k)) for k in rng.permutation(4)[: rng.choice(3, p=[0.4, 0.4, 0.2])]]
@@ -137,8 +151,9 @@ def sample_deformation(rng: np.random.Generator) -> Deformation | None:
     before = Compose((*corners, _turned(-heading)))
     flat, lifted = _turned(-heading)(_middle()), before(_middle())
     profile = sample_profile(rng, float(flat[:, 0].min()), float(flat[:, 0].max()))
-    offset = np.interp(lifted[:, 0], NODES, profile.curvature) * lifted[:, 2]
-    if np.abs(offset).max() > 0.5 and corners:
+    curvature = np.abs(np.interp(lifted[:, 0], NODES, profile.curvature))
+    pressed = curvature * (np.abs(lifted[:, 2]) + LARGEST_OFFSET)
+    if pressed.max() > MOST_PRESSED or not _do_not_meet(corners):
         return None
     sweep = CurveSweep.through(NODES, curve(profile), np.array([0.0, 1.0, 0.0]), LARGEST_OFFSET)
     twist = Twist(np.array([-35.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 70.0, rng.uniform(-0.5, 0.5))
@@ -170,5 +185,5 @@ def scene() -> Scene:
         name="sheet",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(43.0))),
+        workspace=Workspace(fov_rad=float(np.deg2rad(42.0))),
     )
