@@ -12,7 +12,7 @@ elbows bent by 50 degrees):
 
 - shape: height by up to 5 %, the width opposite so that the volume is kept; girth of the whole body by -10 to 14 %, and
   of trunk, arms and legs by 4 % more or less;
-- pose: 16 joints at MakeHuman's places with 36 angles, uniform within their limits (``_human_skin.JOINTS``): waist and
+- pose: 16 joints at MakeHuman's places with 36 angles, uniform within their limits (``_human_joints``): waist and
   chest bend by 22 degrees forward, 10 back, 12 sideways, and twist by 15; neck and head nod and turn by 25; shoulders
   lift by 60 sideways and 65 forward; elbows bend by -40 to 58 and knees by 0 to 95, one way; hips flex by 62, extend by
   15, spread by 25; wrists bend by 35 and turn by 30, ankles bend by 30;
@@ -37,8 +37,9 @@ from scipy.spatial.distance import cdist
 
 from mereo.deformation import Compose, Deformation, jacobian_determinant
 from mereo.scene import Scene, Workspace
+from mereo.scenes._human_joints import JOINTS, NAMES, part_axes, rotations, turn_limits
 from mereo.scenes._human_parts import base, rest_mesh, to_scene
-from mereo.scenes._human_skin import JOINTS, NAMES, PosedBody, part_axes, rotations, share_field, turn_limits
+from mereo.scenes._human_skin import PosedBody, share_field
 from mereo.solid import label_grid
 from mereo.warps import SmoothField
 
