@@ -11,7 +11,7 @@ from mereo.deformation import Deformation
 from mereo.frame import rigid
 from mereo.mesh import SegmentedMesh
 
-SCENES = ("robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "tumor")
+SCENES = ("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet", "tumor")
 """Built-in scenes, one module each in ``mereo.scenes``."""
 
 PAPER_APERTURE_RAD = float(np.deg2rad(140.0))
