@@ -235,28 +235,34 @@ def _sort(
 def _nearest_rows(shape: Shape, index: int, points: Float[np.ndarray, "n d"], keep: int) -> np.ndarray:
     """Rows of the ``keep`` points nearest to segment ``index``'s surface, in the order given; exact.
 
-    Distances dominate data generation, so most are avoided: a distance grows by at most the way travelled, so a point
-    ``gap`` away from one of known distance is no nearer than that distance minus ``gap``. Points are measured in the
-    order of that bound until the bound exceeds the distance of the keep-th nearest.
+    Distances dominate data generation, so most are avoided: a point is no nearer to the surface than to its box, and a
+    distance grows by at most the way travelled, so a point ``gap`` away from one of known distance is no nearer than
+    that distance minus ``gap``. The points nearest to the box are measured first and the others in the order of their
+    bound, until it exceeds the distance of the keep-th nearest.
     """
     if len(points) <= keep:
         return np.arange(len(points))
+    low, high = shape.boxes()[index]
+    to_box = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
+    known = np.argsort(to_box, kind="stable")[: 2 * keep]
     distance = np.full(len(points), np.inf)
-    known = slice(0, 2 * keep)
     distance[known] = shape.segment_distance(index, points[known])
-    rest = np.arange(2 * keep, len(points))
+    rest = np.flatnonzero(np.isinf(distance) & (to_box <= _keep_th(distance, keep)))
     if len(rest):
         gap, pivot = cKDTree(points[known]).query(points[rest])
-        bound = distance[known][pivot] - gap
+        bound = np.maximum(distance[known][pivot] - gap, to_box[rest])
         rest, bound = rest[np.argsort(bound)], np.sort(bound)
     while len(rest):
-        worst = np.partition(distance, keep - 1)[keep - 1]
-        chunk = rest[: min(keep, int(np.searchsorted(bound, worst)))]
+        chunk = rest[: min(keep, int(np.searchsorted(bound, _keep_th(distance, keep))))]
         if len(chunk) == 0:
             break
         distance[chunk] = shape.segment_distance(index, points[chunk])
         rest, bound = rest[len(chunk) :], bound[len(chunk) :]
     return np.sort(np.argpartition(distance, keep - 1)[:keep])
+
+
+def _keep_th(distance: Float[np.ndarray, " n"], keep: int) -> float:
+    return float(np.partition(distance, keep - 1)[keep - 1])
 
 
 def _join(sides: list[tuple[np.ndarray, np.ndarray]]) -> Samples:

@@ -20,6 +20,9 @@ Degrees of freedom: one, the crank angle, uniform over the two turns of the four
 Cylinders fire in the order 1-3-4-2, cylinder 1 at angle 0. Parts that slide or turn upon each other are 0.1 to 0.2
 apart at every angle: lobes and tappets, for example, always 0.12.
 
+It makes fewer examples a second than the other scenes, about 4 per core: twelve segments have 3,533 query points, 2.4
+times the bunny's, and its thin, nested parts need 87,000 draws to find them, eight times the bunny's.
+
 What makes it hard: pistons 1 and 4 move alike, as do 2 and 3, and the same crank position occurs twice in a cycle with
 other valves open; stems of 1.5 and walls of 1.6 are at the size of a pixel; rods, pins and cranks hide each other. On
 the other hand one number decides everything, so what is hidden follows from what is seen.
