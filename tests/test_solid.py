@@ -120,17 +120,6 @@ def test_the_first_segment_owns_an_overlap() -> None:
     assert label_grid(mesh, points[:, 0], points[:1, 1], points[:1, 2]).ravel().tolist() == [1, 1, 2, 0]
 
 
-def test_rays_along_the_axes_and_from_within_find_the_box() -> None:
-    """Closed forms for the rays that a slab test divides by zero for."""
-    solids = Solids(one(box((-1, -2, -3), (1, 2, 3))))
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    assert np.allclose(solids.first_hit(np.zeros(3), axes), [1, 2, 3, 1, 2, 3])
-    assert np.allclose(solids.first_hit(np.array([-5.0, 0.5, 0.5]), axes), [4, *[np.inf] * 5])
-    beside = np.array([-5.0, 2.0 + 1e-2, 0.5])
-    assert np.isinf(solids.first_hit(beside, axes)).all()
-    assert np.isclose(solids.first_hit(beside, np.array([[1.0, -0.01, 0.0]]))[0], 4.0)
-
-
 def test_no_points_no_labels() -> None:
     solids = Solids(one(ball((0, 0, 0), 1.0)))
     assert solids.label(np.empty((0, 3))).shape == (0,) and solids.inside(0, np.empty((0, 3))).shape == (0,)

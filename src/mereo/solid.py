@@ -82,27 +82,10 @@ class _Solid:
         self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, " n"]:
         """Ray parameter of the nearest hit, infinite where there is none."""
-        parameter = np.full(len(directions), np.inf)
-        rows = np.flatnonzero(self._meet_box(origin, directions))
-        if len(rows) == 0:
-            return parameter
-        single = directions[rows].astype(np.float32)
+        single = np.ascontiguousarray(directions, dtype=np.float32)
         origins = np.broadcast_to((origin - self.center).astype(np.float32), single.shape).copy()
         hits = self.rays.run(origins, single, output=True)
-        parameter[rows] = np.where(hits["primID"] >= 0, hits["tfar"], np.inf)
-        return parameter
-
-    def _meet_box(self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Whether rays meet the box, made a little larger (slab test); a small part of a picture fills few pixels."""
-        slack = 1e-4 * (self.high - self.low)
-        enters, leaves = np.zeros(len(directions)), np.full(len(directions), np.inf)
-        for axis in range(3):
-            # a ray along a slab's sides has a quotient of 0 / 0: fmin and fmax then take the other side's
-            with np.errstate(divide="ignore", invalid="ignore"):
-                one = (self.low[axis] - slack[axis] - origin[axis]) / directions[:, axis]
-                other = (self.high[axis] + slack[axis] - origin[axis]) / directions[:, axis]
-            enters, leaves = np.maximum(enters, np.fmin(one, other)), np.minimum(leaves, np.fmax(one, other))
-        return enters <= leaves
+        return np.where(hits["primID"] >= 0, hits["tfar"], np.inf).astype(np.float64)
 
     def closest(
         self, points: Float[np.ndarray, "n 3"]
