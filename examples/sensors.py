@@ -3,7 +3,8 @@
     python examples/sensors.py --scene lizard --output sensors.png
 
 Colour is depth, bright is near. Red pixels show something else than the object: background or occluder that the mask
-lets in. Grey is a tool or hand that the mask leaves out. The same seed shows the same state from the same place under every sensor.
+lets in. Grey is a tool or hand that the mask leaves out. The same seed shows the same state from the same place under
+every sensor.
 """
 
 import argparse
@@ -50,7 +51,7 @@ def draw(seen: Observation, limits: tuple[float, float], width: int) -> Picture:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Draw one view under each error of a depth camera.")
-    parser.add_argument("--scene", default="shapes")
+    parser.add_argument("--scene", default="robot")
     parser.add_argument("--output", type=Path, default=Path("sensors.png"), help="the PNG to write")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()

@@ -225,6 +225,9 @@ class Evaluate:
         if self.scans:
             from mereo.weights import load_model
 
+            if self.terms.on:
+                raise ValueError("--scans are real and need no simulated errors: leave out --sensor, or --scans")
+
             print(markdown_table(evaluate_scans(load_model(self.weights), self.output)))
             return
         settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)

@@ -99,7 +99,8 @@ def observe(
     depth = mix_edges(depth, camera.focal_x_px, sensor.flying, streams["flying"])
     depth = add_axial_noise(depth, angle_rad, sensor, streams["axial"])
     depth = add_depth_noise(DepthImage(depth, camera), noise_std, rng).depth
-    depth = quantize(depth * sensor.metres_per_unit, sensor.quantization) / sensor.metres_per_unit
+    if sensor.quantization > 0:
+        depth = quantize(depth * sensor.metres_per_unit, sensor.quantization) / sensor.metres_per_unit
     missing = streams["dropout"].random(shape) < dropout_probability(angle_rad, sensor.dropout)
     missing |= sample_holes(depth, seen, camera.focal_x_px, sensor, streams["holes"])
     return Observation(DepthImage(np.where(missing, 0.0, depth), camera), sample_mask(seen, sensor, streams), source)
@@ -197,8 +198,6 @@ def quantize(z_m: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray,
     by Khoshelham and Elberink ("Accuracy and resolution of Kinect depth data", Sensors 2012). Their noise before
     rounding is left to the axial noise.
     """
-    if strength == 0:
-        return z_m
     disparity = KINECT_DISPARITY_M / strength
     steps = np.maximum(np.rint(disparity / np.where(z_m > 0, z_m, 1.0)), 1.0)
     return np.where(z_m > 0, disparity / steps, 0.0)

@@ -173,18 +173,19 @@ _FINGERS = ((-0.030, 0.90), (-0.010, 1.0), (0.010, 0.93), (0.030, 0.75))
 
 
 def sample_hand(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
-    """A left or right hand with forearm, as capsules; fingers bend away from the camera by random angles.
+    """A left or right hand with forearm, as capsules, that reaches up to 7 cm past the point it is sent to.
 
     Hands of simple solids are known from tracking (Oikonomidis et al., "Efficient model-based 3D tracking of hand
-    articulations using Kinect", BMVC 2011). An adult's: about 18 cm long, 8 cm wide, with 10 % of variation.
+    articulations using Kinect", BMVC 2011). An adult's: about 18 cm long, 8 cm wide, with 10 % of variation. Fingers
+    bend away from the camera by random angles.
     """
     tip, out = _approach(seen, reach, unit, rng)
     size, mirror = unit * rng.uniform(0.9, 1.1), rng.choice([-1.0, 1.0])
-    frame = _hand_frame(tip, out, rng)
+    frame, reach_m = _hand_frame(tip, out, rng), 0.18 - rng.uniform(0, 0.07)
 
     def part(start: Vector, end: Vector, radius: float) -> Capsule:
         """From (across, along, away) in metres, seen from the wrist."""
-        places = [tip + size * ((place - [0, 0.18, 0]) * [mirror, 1, 1]) @ frame for place in (start, end)]
+        places = [tip + size * ((place - [0, reach_m, 0]) * [mirror, 1, 1]) @ frame for place in (start, end)]
         return Capsule(places[0], places[1], size * radius)
 
     def bone(start: Vector, length: float, bend_rad: float) -> Vector:

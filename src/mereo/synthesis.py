@@ -126,6 +126,7 @@ def _sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generato
     raise ValueError(
         f"scene {scene.name!r} showed fewer than {MIN_POINTS} points in {ATTEMPTS} random views; "
         "its camera workspace must see the object: check its distance and field of view"
+        + (", or weaken the sensor's errors" if settings.sensor.on else "")
     )
 
 
