@@ -1,7 +1,7 @@
 """Where rays from the camera first meet a surface, by Embree.
 
-Notation: rays are ``t * direction``, t > 0, from the origin of the camera frame, with n directions of z = 1 (their t is
-the depth) or any other z > 0.
+Notation: n rays are ``t * direction``, t > 0, from the origin of the camera frame. Directions have z = 1, so that t is
+the depth and a direction's x and y are its slopes.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ class Hits(NamedTuple):
     """Where rays first meet a surface.
 
     Attributes:
-        distance: the ray parameter t; infinite where nothing is hit.
+        distance: t; infinite where nothing is hit.
         normal: of the surface there, of any length, on either side; zero where nothing is hit.
     """
 
@@ -67,9 +67,9 @@ def toward(
 
     A segment covers a small part of an image, and a ray that misses costs as much as one that hits.
     """
-    if low[2] <= 0 or (directions[:, 2] <= 0).any():
+    if low[2] <= 0:
         return np.arange(len(directions))
-    x, y = directions[:, 0] / directions[:, 2], directions[:, 1] / directions[:, 2]
+    x, y = directions[:, 0], directions[:, 1]
     least, most = (np.stack([corner[:2] / low[2], corner[:2] / high[2]]) for corner in (low, high))
     (x0, y0), (x1, y1) = least.min(axis=0) - _MARGIN, most.max(axis=0) + _MARGIN
     return np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))

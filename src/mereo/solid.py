@@ -164,7 +164,7 @@ class Solids:
         return Nearest(np.sqrt(squared), place, face, owner)
 
     def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> Hits:
-        """Where rays ``t * direction`` from the origin first meet any surface, t > 0."""
+        """Where rays ``t * direction`` from the origin first meet any surface, t > 0; directions have z = 1."""
         hits = Hits.none(len(directions))
         for solid in self._solids:
             hits.nearer(*solid.first_hit(directions))
