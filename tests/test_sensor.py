@@ -257,6 +257,18 @@ def test_a_term_does_not_change_what_others_draw() -> None:
     assert np.array_equal(look(wall(150.0), axial=1.0, background=1.0, tool=0.0).whole.depth, noise)
 
 
+@pytest.mark.parametrize("name", [name for name in SENSOR_TERMS if name != "quantization"])
+def test_every_term_is_random_and_reproducible(name: str) -> None:
+    near, far = box((-15, -20, 120), (0, 20, 125), "near"), ball((5, 0, 160), 25.0, "far", 1)
+    solids = Solids(SegmentedMesh((near, far)))
+    pictures = []
+    for seed in (1, 1, 2, 3, 4):
+        seen = look(solids, seed, **{name: 1.0})
+        pictures.append(np.stack([seen.whole.depth, seen.image.depth]))
+    assert np.array_equal(pictures[0], pictures[1])
+    assert not all(np.array_equal(pictures[0], picture) for picture in pictures[2:])
+
+
 @pytest.mark.parametrize("name", SENSOR_TERMS)
 @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
 def test_strengths_must_be_finite_and_not_negative(name: str, value: float) -> None:

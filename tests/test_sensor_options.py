@@ -122,5 +122,5 @@ def test_evaluation_looks_through_the_sensor_and_says_so(tmp_path: Path, monkeyp
 
 def test_real_scans_take_no_simulated_errors() -> None:
     arguments = ["evaluate", "bunny", "--output", "out", "--scans", "--sensor", "time-of-flight"]
-    with pytest.raises(ValueError, match="--scans are real and need no simulated errors: leave out --sensor, or"):
+    with pytest.raises(ValueError, match="--scans are real and take no simulated errors: leave out --sensor and"):
         command_line.parse(arguments).run()

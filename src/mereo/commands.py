@@ -222,15 +222,15 @@ class Evaluate:
     def run(self) -> None:
         from mereo.evaluation import evaluate_scans, evaluate_weights, markdown_table
 
+        settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)
         if self.scans:
             from mereo.weights import load_model
 
-            if self.terms.on:
-                raise ValueError("--scans are real and need no simulated errors: leave out --sensor, or --scans")
+            if settings != GenerateConfig():
+                raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
 
             print(markdown_table(evaluate_scans(load_model(self.weights), self.output)))
             return
-        settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)
         evaluate_weights(
             self.weights, self.output, examples=self.examples, seed=self.seed, scene=self.scene, settings=settings
         )
