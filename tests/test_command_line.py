@@ -93,7 +93,7 @@ def test_generate_options_reach_the_settings() -> None:
         "--noise-std 0.2 --points 512 --sampler nested-sort-sample --oversample 2"
     )
     command = command_line.parse(text.split())
-    assert command == commands.Generate(
+    expected = commands.Generate(
         scene="rope",
         examples=7,
         output=Path("out"),
@@ -106,6 +106,7 @@ def test_generate_options_reach_the_settings() -> None:
             noise_std=0.2, points=512, sampling=SamplingConfig(sampler="nested-sort-sample", oversample=2)
         ),
     )
+    assert isinstance(command, commands.Generate) and vars(command) == vars(expected)
     assert command_line.parse(["generate", "rope", "--examples", "7", "--output", "out"]).settings == GenerateConfig()  # type: ignore[union-attr]
 
 

@@ -8,7 +8,12 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-EXPECTED = {"query_points.py": "to the nearest surface", "reconstruct_cloud.py": "report.html", "sampling_2d.py": ""}
+EXPECTED = {
+    "query_points.py": "to the nearest surface",
+    "reconstruct_cloud.py": "report.html",
+    "sampling_2d.py": "",
+    "sensors.py": "wrote",
+}
 
 
 def test_every_example_is_run() -> None:

@@ -3,15 +3,18 @@
 import importlib.metadata
 import os
 import sys
+from collections.abc import Mapping
 from dataclasses import field, make_dataclass
 from itertools import pairwise
-from typing import Annotated, Any, Protocol, Union, runtime_checkable
+from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 
 import tyro
-from tyro.conf import arg, subcommand
+from tyro.conf import subcommand
 
 from mereo import commands
-from mereo.config import PRESETS, TrainConfig
+from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
+
+Choice = TypeVar("Choice")
 
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 USER_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
@@ -73,7 +76,7 @@ def _stop(message: str, code: int) -> int:
 def parse(arguments: list[str]) -> Command:
     """The command that these arguments mean; exits with 2 after a message when they mean none."""
     command: Command = tyro.cli(
-        _syntax(_chosen_preset(arguments)),
+        _syntax(_chosen(arguments, "--preset", PRESETS, "base"), _chosen(arguments, "--sensor", SENSORS, "paper")),
         args=arguments or ["--help"],
         prog="mereo",
         description="Reconstruct deformable objects with all their segments from one depth image or point cloud. "
@@ -83,8 +86,8 @@ def parse(arguments: list[str]) -> Command:
     return command
 
 
-def _syntax(preset: str) -> Any:
-    """All commands as a type that tyro reads; the defaults of ``train`` are those of the preset."""
+def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
+    """All commands as a type that tyro reads; ``train`` starts from this recipe, what renders from this sensor."""
     scene = (commands.SceneList, "list"), (commands.SceneCheck, "check"), (commands.ScenePreview, "preview")
     assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")
     return (
@@ -92,18 +95,18 @@ def _syntax(preset: str) -> Any:
         | Annotated[commands.Doctor, subcommand("doctor")]
         | Annotated[_group(scene), subcommand("scene", description="List, check or draw the built-in scenes.")]
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
-        | Annotated[commands.Generate, subcommand("generate")]
-        | Annotated[_train_from(preset), subcommand("train")]
-        | Annotated[commands.Evaluate, subcommand("evaluate")]
+        | Annotated[_starting(commands.Generate, settings=GenerateConfig(sensor=sensor)), subcommand("generate")]
+        | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
+        | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
     )
 
 
-def _train_from(preset: str) -> type[commands.Train]:
-    """``Train`` whose options default to the preset's values."""
-    recipe = ("config", Annotated[TrainConfig, arg(name="")], field(default=PRESETS[preset]))
+def _starting(command: type, **defaults: Any) -> type:
+    """The command with other defaults for these options."""
+    changed = [(name, command.__annotations__[name], field(default=value)) for name, value in defaults.items()]
     return make_dataclass(
-        "Train", [recipe], bases=(commands.Train,), frozen=True, namespace={"__doc__": commands.Train.__doc__}
+        command.__name__, changed, bases=(command,), frozen=True, namespace={"__doc__": command.__doc__}
     )
 
 
@@ -111,11 +114,11 @@ def _group(members: tuple[tuple[type, str], ...]) -> Any:
     return Union[*(Annotated[member, subcommand(name)] for member, name in members)]
 
 
-def _chosen_preset(arguments: list[str]) -> str:
-    """The value of --preset, which must be known before parsing because the other defaults depend on it."""
-    values = [a.partition("=")[2] for a in arguments if a.startswith("--preset=")]
-    values += [after for option, after in pairwise(arguments) if option == "--preset"]
-    return values[-1] if values and values[-1] in PRESETS else "base"
+def _chosen(arguments: list[str], option: str, choices: Mapping[Any, Choice], otherwise: str) -> Choice:
+    """What an option chooses, which must be known before parsing because the other defaults depend on it."""
+    values = [a.partition("=")[2] for a in arguments if a.startswith(f"{option}=")]
+    values += [after for before, after in pairwise(arguments) if before == option]
+    return choices[values[-1] if values and values[-1] in choices else otherwise]
 
 
 if __name__ == "__main__":

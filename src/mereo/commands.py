@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import Positional, arg
 
-from mereo.config import GenerateConfig, TrainConfig
+from mereo.config import GenerateConfig, Sensor, SensorConfig, TrainConfig
 
 Preset = Literal["paper", "base", "large", "tiny"]
 
@@ -140,6 +140,7 @@ class Generate:
         shard: make only part i of n, as i/n from 0/n to (n-1)/n, for example on several machines.
         resume: go on with a run that was stopped.
         test: allow a test seed.
+        sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
         settings: how one example is made.
     """
 
@@ -151,7 +152,8 @@ class Generate:
     shard: str = "0/1"
     resume: bool = False
     test: bool = False
-    settings: OmitArgPrefixes[GenerateConfig] = field(default_factory=GenerateConfig)
+    sensor: Sensor = "paper"
+    settings: Annotated[GenerateConfig, arg(name="")] = field(default_factory=GenerateConfig)
 
     def run(self) -> None:
         from mereo.generation import generate
@@ -202,6 +204,9 @@ class Evaluate:
         seed: test seeds start at 1,000,000.
         scene: the scene, where it is not the one that the weights were trained on.
         scans: score the four real range scans of the bunny, whose poses are known, instead of rendered views.
+        sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
+        noise_std: Gaussian noise on the depth, standard deviation in scene units.
+        terms: what else is wrong with the depth image.
     """
 
     weights: Positional[str]
@@ -210,16 +215,25 @@ class Evaluate:
     seed: int = 1_000_000
     scene: str | None = None
     scans: bool = False
+    sensor: Sensor = "paper"
+    noise_std: float = 0.1
+    terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
 
     def run(self) -> None:
         from mereo.evaluation import evaluate_scans, evaluate_weights, markdown_table
 
+        settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)
         if self.scans:
             from mereo.weights import load_model
 
+            if settings != GenerateConfig():
+                raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
+
             print(markdown_table(evaluate_scans(load_model(self.weights), self.output)))
             return
-        evaluate_weights(self.weights, self.output, examples=self.examples, seed=self.seed, scene=self.scene)
+        evaluate_weights(
+            self.weights, self.output, examples=self.examples, seed=self.seed, scene=self.scene, settings=settings
+        )
 
 
 @dataclass(frozen=True)

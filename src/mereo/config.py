@@ -6,6 +6,12 @@ Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) u
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypedDict
 
+from tyro.conf import OmitArgPrefixes
+
+from mereo.sensor_config import SENSORS as SENSORS
+from mereo.sensor_config import Sensor as Sensor
+from mereo.sensor_config import SensorConfig as SensorConfig
+
 TEST_SEED_START = 1_000_000
 """Seeds from here up are for testing; generation for training refuses them."""
 
@@ -50,12 +56,15 @@ class GenerateConfig:
         noise_std: Gaussian noise on the depth, standard deviation in scene units.
         points: the observed cloud is kept in farthest-point order, at most this many points.
         sampling: where queries are drawn.
+        sensor: what else is wrong with the depth image; nothing in the paper.
     """
 
     image_size: int = 96
     noise_std: float = 0.1
     points: int = 1024
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    # the marker keeps --sampler short on the command line, where --sensor.axial keeps its prefix
+    sampling: OmitArgPrefixes[SamplingConfig] = field(default_factory=SamplingConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ IoU and mIoU come from it, and the mean over single examples is reported beside 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -122,6 +122,7 @@ def evaluate(
     seed: int = TEST_SEED_START,
     cells: int = CELLS,
     progress: bool = False,
+    settings: GenerateConfig | None = None,
 ) -> Evaluation:
     """Scores on synthetic views of a scene, seen as in training: through a noisy depth image.
 
@@ -132,6 +133,7 @@ def evaluate(
         seed: at least ``config.TEST_SEED_START``: smaller ones are for training.
         cells: of the grid along each axis.
         progress: show a bar with the time left.
+        settings: the camera (image size, noise, sensor); by default the paper's.
 
     Raises ``ValueError`` for a training seed, no examples, or another object than the model's.
     """
@@ -142,7 +144,9 @@ def evaluate(
     if scene is None or isinstance(scene, str):
         scene = load_scene(scene or trained_scene(model))
     check_names(model, scene.rest.names)
-    return score_cases(model, partial(_scene_case, scene, seed, cells), examples, progress)
+    return score_cases(
+        model, partial(_scene_case, scene, settings or GenerateConfig(), seed, cells), examples, progress
+    )
 
 
 def trained_scene(model: Model) -> str:
@@ -153,8 +157,8 @@ def trained_scene(model: Model) -> str:
     return scene
 
 
-def _scene_case(scene: Scene, seed: int, cells: int, index: int) -> TestCase:
-    view = sample_view(scene, GenerateConfig(), example_rng(seed, index))
+def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, index: int) -> TestCase:
+    view = sample_view(scene, settings, example_rng(seed, index))
     return TestCase(f"{scene.name} {index}", view.depth.to_points(), truth_grid(view.mesh, cells))
 
 
@@ -218,15 +222,19 @@ def evaluate_weights(
     seed: int = TEST_SEED_START,
     scene: str | None = None,
     cells: int = CELLS,
+    settings: GenerateConfig | None = None,
 ) -> Evaluation:
     """``mereo evaluate``: write metrics.json, table.md and errors.png into a new directory, and print the table."""
     with new_directory(output) as directory:
         model = load_model(weights)
-        evaluation = evaluate(model, scene, examples=examples, seed=seed, cells=cells, progress=True)
+        settings = settings or GenerateConfig()
+        evaluation = evaluate(model, scene, examples=examples, seed=seed, cells=cells, progress=True, settings=settings)
         facts = {
             "weights": str(weights),
             "scene": scene or trained_scene(model),
             "seed": seed,
+            "noise_std": settings.noise_std,
+            "sensor": asdict(settings.sensor),
             "trained": model.provenance,
         }
         _write(directory, evaluation, facts)

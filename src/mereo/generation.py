@@ -36,6 +36,7 @@ from mereo.parallel import in_processes
 from mereo.query_sampling import check_settings
 from mereo.rest_pose import rest_distances
 from mereo.scene import Scene, load_scene
+from mereo.sensor import check_sensor
 from mereo.synthesis import Example, example_rng, synthesize
 
 SHARD_SIZE = 64
@@ -111,6 +112,7 @@ def generate(
     """
     _check_request(examples, seed, workers, shard, test)
     check_settings(settings.sampling)
+    check_sensor(settings.sensor)
     loaded = load_scene(scene) if isinstance(scene, str) else scene
     manifest = make_manifest(loaded, settings, examples, seed)
     shards = [
@@ -214,9 +216,9 @@ def _check_same(path: Path, manifest: dict[str, Any]) -> None:
         before = None
     if not isinstance(before, dict):
         raise ValueError(f"{path} is not a manifest; it cannot be resumed: choose another --output")
-    before = _flat(before)
+    # a manifest of an older version may not state everything; settings it lacks were as their defaults are
+    before = _flat({"settings": asdict(GenerateConfig())}) | _flat(before)
     for key, now in _flat(manifest).items():
-        # a manifest of an older version may not state everything
         if before.get(key, now) != now:
             raise ValueError(
                 f"{path.parent} was made with {key} = {before[key]!r}, not {now!r}; resuming needs equal settings: "

@@ -15,8 +15,7 @@ def render_depth(mesh: SegmentedMesh | Solids, camera: Camera) -> DepthImage:
     mesh's ``Solids`` where they are needed anyway: their search structures are used.
     """
     solids = mesh if isinstance(mesh, Solids) else Solids(mesh)
-    # the directions have z = 1, so the ray parameter is the depth
-    depth = solids.first_hit(np.zeros(3), camera.directions().reshape(-1, 3))
+    depth = solids.first_hit(camera.directions().reshape(-1, 3)).distance
     return DepthImage(np.where(np.isfinite(depth), depth, 0.0).reshape(camera.height, camera.width), camera)
 
 

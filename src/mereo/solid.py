@@ -11,25 +11,15 @@ from typing import NamedTuple
 
 import igl
 import numpy as np
-from embreex import rtcore
-from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.mesh import Segment, SegmentedMesh
+from mereo.rays import Hits, first_hits, ray_scene, toward
 from mereo.winding import winding_grid
 
 _DIRECTIONS = np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32)
 """Two generic directions: not along any axis, face diagonal or each other."""
-
-_DEVICE = rtcore.EmbreeDevice()
-
-
-def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> EmbreeScene:
-    """An Embree scene of one triangle mesh. It works in single precision: keep coordinates near the origin."""
-    scene = EmbreeScene(_DEVICE)
-    TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
-    return scene
 
 
 class _Solid:
@@ -78,14 +68,11 @@ class _Solid:
         behind = np.stack([normal @ direction for normal, direction in zip(normals, _DIRECTIONS, strict=True)]) > 0
         return behind & (hits["primID"].reshape(2, -1) >= 0)
 
-    def first_hit(
-        self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
-    ) -> Float[np.ndarray, " n"]:
-        """Ray parameter of the nearest hit, infinite where there is none."""
-        single = np.ascontiguousarray(directions, dtype=np.float32)
-        origins = np.broadcast_to((origin - self.center).astype(np.float32), single.shape).copy()
-        hits = self.rays.run(origins, single, output=True)
-        return np.where(hits["primID"] >= 0, hits["tfar"], np.inf).astype(np.float64)
+    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+        """Which rays from the origin hit the segment, and where each of them does first."""
+        rows = toward(directions, self.low, self.high)
+        hit, found = first_hits(self.rays, self.center, directions[rows])
+        return rows[hit], found
 
     def closest(
         self, points: Float[np.ndarray, "n 3"]
@@ -176,11 +163,12 @@ class Solids:
                 face[kept] = first_faces[index] + faces[nearer]
         return Nearest(np.sqrt(squared), place, face, owner)
 
-    def first_hit(
-        self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
-    ) -> Float[np.ndarray, " n"]:
-        """For rays ``origin + t * direction`` the smallest t > 0 on any surface; infinite where nothing is hit."""
-        return np.minimum.reduce([solid.first_hit(origin, directions) for solid in self._solids])
+    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> Hits:
+        """Where rays ``t * direction`` from the origin first meet any surface, t > 0; directions have z = 1."""
+        hits = Hits.none(len(directions))
+        for solid in self._solids:
+            hits.nearer(*solid.first_hit(directions))
+        return hits
 
     def face_normals(self, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Unit normals of faces of ``mesh.merged()``."""

@@ -20,9 +20,9 @@ from mereo.frame import Normalizer, inverse_rigid, transform_points
 from mereo.mesh import SegmentedMesh
 from mereo.ordering import farthest_point_order
 from mereo.query_sampling import Samples, sample_queries
-from mereo.rendering import add_depth_noise, render_depth
 from mereo.rest_pose import rest_frame
 from mereo.scene import Scene
+from mereo.sensor import observe
 from mereo.solid import Nearest, Solids, signed_distance_and_direction
 
 ATTEMPTS = 100
@@ -35,7 +35,7 @@ class View:
 
     Attributes:
         mesh: the deformed segments in the CAMERA frame, in scene units.
-        depth: the noisy depth image, with the camera it was taken with.
+        depth: the noisy depth image, cut out by the mask, with the camera it was taken with.
         T_world_camera: the camera's pose in the scene's frame.
         deformations: for each segment the map from rest to the scene's frame.
     """
@@ -104,7 +104,8 @@ def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator)
 
 
 def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> View:
-    """A random state seen by a random camera; both are drawn again while fewer than ``MIN_POINTS`` points are seen.
+    """A random state seen by a random camera; both are drawn again while fewer than ``MIN_POINTS`` points of the object
+    are seen.
 
     Raises ``ValueError`` naming the scene after ``ATTEMPTS`` such views.
     """
@@ -119,12 +120,13 @@ def _sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generato
         T_world_camera = scene.workspace.sample(rng, state.mesh.bounds.mean(axis=0))
         mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
         solids = Solids(mesh)
-        depth = add_depth_noise(render_depth(solids, camera), settings.noise_std, rng)
-        if depth.valid.sum() >= MIN_POINTS:
-            return View(mesh, depth, T_world_camera, state.deformations), solids
+        seen = observe(solids, camera, settings.noise_std, settings.sensor, rng)
+        if seen.object_points >= MIN_POINTS:
+            return View(mesh, seen.image, T_world_camera, state.deformations), solids
     raise ValueError(
         f"scene {scene.name!r} showed fewer than {MIN_POINTS} points in {ATTEMPTS} random views; "
         "its camera workspace must see the object: check its distance and field of view"
+        + (", or weaken the sensor's errors" if settings.sensor.on else "")
     )
 
 

@@ -1,0 +1,284 @@
+"""Statistics of the simulated sensors: each term's deviation, probability or reach is what its formula says."""
+
+from dataclasses import replace
+from statistics import NormalDist
+
+import numpy as np
+import pytest
+from shapes import ball, box, one
+
+from mereo.camera import Camera
+from mereo.config import SENSORS, SensorConfig
+from mereo.mesh import SegmentedMesh
+from mereo.rendering import add_depth_noise, render_depth
+from mereo.sensor import (
+    Observation,
+    axial_std_m,
+    check_sensor,
+    dropout_probability,
+    lateral_std,
+    mix_edges,
+    observe,
+    quantize,
+    sample_mask,
+    smooth_field,
+)
+from mereo.sensor_config import SENSOR_TERMS, SensorModel
+from mereo.solid import Solids
+
+CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
+RAYS = CAMERA.directions()
+OFF = SensorConfig()
+UNIT_M = OFF.metres_per_unit
+MODELS: tuple[SensorModel, ...] = ("structured-light", "time-of-flight")
+
+
+def wall(z: float, tilt_deg: float = 0.0) -> Solids:
+    """A plane through (0, 0, z), turned about the y axis; it fills the image."""
+    part = box((-9000, -9000, 0), (9000, 9000, 5))
+    cosine, sine = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
+    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    return Solids(one(replace(part, vertices=part.vertices @ turn.T + [0, 0, z])))
+
+
+def slant(tilt_deg: float) -> np.ndarray:
+    """Angle between each ray and that wall's normal."""
+    normal = np.array([np.sin(np.deg2rad(tilt_deg)), 0, np.cos(np.deg2rad(tilt_deg))])
+    return np.arccos(np.abs(RAYS @ normal) / np.linalg.norm(RAYS, axis=-1))
+
+
+def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object) -> Observation:
+    return observe(solids, CAMERA, noise_std, replace(OFF, **terms), np.random.default_rng(seed))  # type: ignore[arg-type]
+
+
+# --- noise in depth and across ----------------------------------------------------------------------------------------
+
+
+def test_published_values() -> None:
+    """By hand from the papers' formulas: Kinect at 1 m and at 0.4 m and 45 degrees, Kinect v2 at 2 m; pixels."""
+    z, flat = np.array([1.0]), np.zeros(1)
+    assert axial_std_m(z, flat) == pytest.approx(0.001884)
+    assert axial_std_m(np.array([0.4]), np.array([np.pi / 4])) == pytest.approx(0.0012 + 0.0001 / np.sqrt(0.4))
+    assert axial_std_m(np.array([2.0]), flat, "time-of-flight") == pytest.approx(0.0017)
+    assert lateral_std(z, flat) * 585 == pytest.approx(0.8)
+    assert lateral_std(z, np.array([np.pi / 4])) * 585 == pytest.approx(0.835)
+    assert lateral_std(np.array([2.0]), flat, "time-of-flight") == pytest.approx(0.0008)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("z, tilt_deg", [(100.0, 0.0), (200.0, 0.0), (400.0, 0.0), (150.0, 60.0), (150.0, 70.0)])
+def test_axial_noise_has_the_published_deviation(model: SensorModel, z: float, tilt_deg: float) -> None:
+    clean = look(wall(z, tilt_deg)).whole.depth
+    noisy = look(wall(z, tilt_deg), model=model, axial=1.0).whole.depth
+    score = (noisy - clean) * UNIT_M / axial_std_m(clean * UNIT_M, slant(tilt_deg), model)
+    assert abs(score.mean()) < 5 / np.sqrt(score.size)
+    assert abs(score.std() - 1) < 5 / np.sqrt(2 * score.size)
+    twice = look(wall(z, tilt_deg), model=model, axial=2.0).whole.depth
+    assert np.allclose(twice - clean, 2 * (noisy - clean), atol=1e-9)
+
+
+def test_axial_noise_grows_with_distance_and_slant() -> None:
+    z, angle = np.linspace(0.5, 4, 50), np.linspace(0, np.pi / 2, 91)
+    for model in MODELS:
+        assert (np.diff(axial_std_m(np.linspace(1, 4, 50), np.zeros(50), model)) > 0).all()
+        assert (np.diff(axial_std_m(np.ones(91), angle, model)) >= 0).all()
+    assert np.isfinite(axial_std_m(z, np.full(50, np.pi / 2))).all()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_lateral_noise_reads_depth_beside_the_pixel(model: SensorModel) -> None:
+    """On a slanted wall z = c / (n x), so the depth is off by dz/dx = -z^2 nx / c times where the pixel looks."""
+    tilt, z = np.deg2rad(50.0), 150.0
+    clean = look(wall(z, 50.0)).whole.depth
+    off = look(wall(z, 50.0), model=model, lateral=1.0).whole.depth - clean
+    slope = clean**2 * np.sin(tilt) / (z * np.cos(tilt))
+    score = off / (slope * lateral_std(clean * UNIT_M, slant(50.0), model))
+    assert abs(score.mean()) < 0.1 and abs(score.std() - 1) < 0.05
+    # a wall that faces the camera has the same depth beside the pixel
+    facing = look(wall(z), model=model, lateral=1.0).whole.depth
+    assert np.allclose(facing, z, rtol=1e-6)
+
+
+def test_lateral_noise_frays_outlines_only() -> None:
+    disk = Solids(one(ball((0, 0, 150), 25.0, level=5)))
+    clean, frayed = look(disk).mask, look(disk, lateral=1.0).mask
+    radius = np.linalg.norm(RAYS[..., :2], axis=-1)
+    changed = radius[clean != frayed]
+    assert 5 < len(changed) < 150 and np.ptp(changed) < 8 * 0.8 / 585
+    assert 0.2 < (frayed & ~clean).sum() / len(changed) < 0.8
+
+
+# --- depth steps ------------------------------------------------------------------------------------------------------
+
+
+def test_depth_has_the_steps_of_whole_disparities() -> None:
+    z_m = np.random.default_rng(0).uniform(0.4, 5.0, size=5000)
+    steps = quantize(z_m, 1.0)
+    disparity = 351.3 / steps
+    assert np.allclose(disparity, np.rint(disparity))
+    assert (np.abs(steps - z_m) <= 0.5001 * np.maximum(steps, z_m) ** 2 / 351.3).all()
+    assert np.array_equal(quantize(steps, 1.0), steps)
+    assert np.array_equal(quantize(np.zeros(3), 1.0), np.zeros(3))
+    # Khoshelham and Elberink: 2.85e-5 / cm, so 7 cm at 5 m
+    assert np.isclose(np.diff(np.unique(quantize(np.linspace(4.9, 5.1, 10_000), 1.0))).mean(), 0.071, atol=0.001)
+
+
+def test_the_steps_are_in_the_image_after_all_noise() -> None:
+    image = look(wall(150.0, 30.0), noise_std=0.1, axial=1.0, quantization=2.0).image
+    disparity = 351.3 / 2 / (image.depth * UNIT_M)
+    assert np.allclose(disparity, np.rint(disparity), atol=1e-6) and len(np.unique(disparity.round())) > 20
+
+
+# --- flying pixels ----------------------------------------------------------------------------------------------------
+
+
+def two_walls() -> Solids:
+    near, far = box((-400, -400, 120), (0.5, 400, 125), "near"), box((0.5, -400, 160), (400, 400, 165), "far", 1)
+    return Solids(SegmentedMesh((near, far)))
+
+
+def test_flying_pixels_lie_between_the_two_depths_at_the_edge() -> None:
+    clean, flown = look(two_walls()).whole.depth, look(two_walls(), flying=1.0).whole.depth
+    moved = flown != clean
+    edge = np.flatnonzero(np.abs(np.diff(clean[0])) > 10)[0]
+    assert moved[:, edge : edge + 2].all() and moved.sum() == 2 * 96
+    assert (flown[moved] > 120).all() and (flown[moved] < 160).all()
+    share = (flown[moved] - 120) / 40
+    assert abs(share.mean() - 0.5) < 5 / np.sqrt(12 * share.size) and share.min() < 0.1 and share.max() > 0.9
+    some = (look(two_walls(), flying=0.3).whole.depth != clean).sum() / moved.sum()
+    assert abs(some - 0.3) < 5 * np.sqrt(0.21 / moved.sum())
+
+
+def test_nothing_flies_on_steep_walls_or_before_nothing() -> None:
+    for solids in (wall(150.0, 60.0), Solids(one(box((-20, -20, 140), (20, 20, 150))))):
+        assert np.array_equal(look(solids, flying=1.0).whole.depth, look(solids).whole.depth)
+    depth = np.zeros((5, 5))
+    depth[2, 2] = 100.0
+    assert np.array_equal(mix_edges(depth, 150.0, 1.0, np.random.default_rng(0)), depth)
+
+
+# --- missing pixels ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tilt_deg", [40.0, 65.0, 72.0])
+def test_pixels_drop_out_as_probably_as_their_slant_says(tilt_deg: float) -> None:
+    kept = look(wall(150.0, tilt_deg), dropout=0.9).image.valid
+    expected = dropout_probability(slant(tilt_deg), 0.9)
+    lost = kept.size - kept.sum()
+    assert abs(lost - expected.sum()) <= 5 * np.sqrt((expected * (1 - expected)).sum())
+    assert kept[expected == 0].all()
+
+
+def test_dropout_rises_with_the_angle() -> None:
+    angle = np.linspace(0, np.pi / 2, 91)
+    probability = dropout_probability(angle, 0.7)
+    assert (probability[:61] < 1e-9).all() and (np.diff(probability[60:]) > 0).all()
+    assert probability[-1] == pytest.approx(0.7)
+
+
+def test_holes_take_the_expected_area() -> None:
+    """Independent radii: pi r^2 each, on a wall where few reach over the border or overlap."""
+    views = [look(wall(150.0), seed, holes=2.0, hole_radius_m=0.02).image.valid for seed in range(150)]
+    pixel = 150.0 * UNIT_M / CAMERA.focal_x_px
+    expected = 2 * np.pi * (0.02 / pixel) ** 2
+    lost = np.array([(~valid).sum() for valid in views])
+    assert 0.8 < lost.mean() / expected < 1.0
+    assert abs((lost == 0).mean() - np.exp(-2)) < 5 * np.sqrt(np.exp(-2) / len(views))
+
+
+# --- the mask ---------------------------------------------------------------------------------------------------------
+
+
+def masks(seen: np.ndarray, count: int = 300, **terms: float) -> np.ndarray:
+    return np.stack(
+        [
+            sample_mask(
+                seen, replace(OFF, **terms), dict(zip(SENSOR_TERMS, np.random.default_rng(i).spawn(11), strict=True))
+            )
+            for i in range(count)
+        ]
+    )
+
+
+def test_the_edge_of_the_mask_is_off_as_probably_as_asked() -> None:
+    """Pixels beside a straight edge are half a pixel away from it, the next ones one and a half."""
+    seen = np.zeros((60, 60), dtype=bool)
+    seen[:, :30] = True
+    drawn = masks(seen, mask_offset_px=0.8)
+    for column, distance in ((30, 0.5), (31, 1.5)):
+        expected = 1 - NormalDist().cdf(distance / 0.8)
+        assert abs(drawn[:, :, column].mean() - expected) < 0.03  # let in
+        assert abs((~drawn[:, :, 59 - column]).mean() - expected) < 0.03  # lost
+    # the error is smooth: neighbours along the edge mostly agree
+    assert (drawn[:, 1:, 30] == drawn[:, :-1, 30]).mean() > 0.9
+    assert np.array_equal(masks(seen, 2)[1], seen)
+
+
+def test_the_mask_shifts_as_far_as_asked() -> None:
+    v, u = np.mgrid[:61, :61] - 30
+    centers = np.array([[u[m].mean(), v[m].mean()] for m in masks(u**2 + v**2 < 200, mask_shift_px=2.0)])
+    assert np.allclose(centers.mean(axis=0), 0, atol=0.5) and np.allclose(centers.std(axis=0), 2.0, atol=0.35)
+
+
+def test_the_random_field_has_unit_variance_everywhere() -> None:
+    fields = np.stack([smooth_field(40, 70, np.random.default_rng(i)) for i in range(2000)])
+    assert np.abs(fields.std(axis=0) - 1).max() < 0.1 and np.abs(fields.mean(axis=0)).max() < 0.12
+
+
+# --- together ---------------------------------------------------------------------------------------------------------
+
+
+def test_off_is_the_paper_bit_for_bit() -> None:
+    solids = Solids(one(ball((0, 0, 150), 25.0)))
+    rng, same = np.random.default_rng(3), np.random.default_rng(3)
+    assert np.array_equal(
+        observe(solids, CAMERA, 0.1, OFF, rng).image.depth,
+        add_depth_noise(render_depth(solids, CAMERA), 0.1, same).depth,
+    )
+    assert rng.bit_generator.state == same.bit_generator.state
+
+
+@pytest.mark.parametrize("name", [name for name in SENSORS if name != "paper"])
+def test_any_sensor_leaves_later_draws_as_they_were(name: str) -> None:
+    solids = Solids(one(ball((0, 0, 150), 25.0)))
+    draws = []
+    for sensor in (OFF, SENSORS[name]):  # type: ignore[index]
+        rng = np.random.default_rng(3)
+        observe(solids, CAMERA, 0.1, sensor, rng)
+        draws.append(rng.random(5))
+    assert np.array_equal(*draws)
+
+
+def test_a_term_does_not_change_what_others_draw() -> None:
+    """The same pixels drop out, the same noise is drawn, with and without the rest."""
+    alone = look(wall(150.0, 70.0), dropout=0.9).image.valid
+    assert np.array_equal(look(wall(150.0, 70.0), dropout=0.9, axial=1.0, flying=0.5).image.valid, alone)
+    noise = look(wall(150.0), axial=1.0).whole.depth
+    assert np.array_equal(look(wall(150.0), axial=1.0, background=1.0, tool=0.0).whole.depth, noise)
+
+
+@pytest.mark.parametrize("name", [name for name in SENSOR_TERMS if name != "quantization"])
+def test_every_term_is_random_and_reproducible(name: str) -> None:
+    near, far = box((-15, -20, 120), (0, 20, 125), "near"), ball((5, 0, 160), 25.0, "far", 1)
+    solids = Solids(SegmentedMesh((near, far)))
+    pictures = []
+    for seed in (1, 1, 2, 3, 4):
+        seen = look(solids, seed, **{name: 1.0})
+        pictures.append(np.stack([seen.whole.depth, seen.image.depth]))
+    assert np.array_equal(pictures[0], pictures[1])
+    assert not all(np.array_equal(pictures[0], picture) for picture in pictures[2:])
+
+
+@pytest.mark.parametrize("name", SENSOR_TERMS)
+@pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
+def test_strengths_must_be_finite_and_not_negative(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=rf"^sensor.{name} is {value}; it .*: pass "):
+        check_sensor(replace(OFF, **{name: value}))
+
+
+def test_probabilities_and_lengths_have_their_ranges() -> None:
+    with pytest.raises(ValueError, match="sensor.tool is 1.5; it is a probability: pass a number from 0 to 1"):
+        look(wall(150.0), tool=1.5)
+    for name in ("metres_per_unit", "hole_radius_m"):
+        with pytest.raises(ValueError, match=f"sensor.{name} is 0.0; it is a length: pass a positive number"):
+            check_sensor(replace(OFF, **{name: 0.0}))  # type: ignore[arg-type]

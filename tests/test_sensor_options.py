@@ -1,0 +1,126 @@
+"""Sensors from the command line to the files: presets, datasets that state them, evaluation with them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from toy_scene import toy_scene
+
+import mereo.__main__ as command_line
+from mereo import commands, evaluation
+from mereo.config import SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
+from mereo.evaluation import evaluate_weights
+from mereo.generation import generate
+from mereo.sensor import check_sensor
+from mereo.sensor_config import SENSOR_TERMS
+
+SMALL = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
+BASICS = "generate rope --examples 7 --output out"
+
+
+def generate_options(text: str) -> GenerateConfig:
+    command = command_line.parse(f"{BASICS} {text}".split())
+    assert isinstance(command, commands.Generate)
+    return command.settings
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("form", ["--sensor {}", "--sensor={}"])
+def test_one_option_chooses_a_sensor(name: Sensor, form: str) -> None:
+    assert generate_options(form.format(name)) == GenerateConfig(sensor=SENSORS[name])
+    command = command_line.parse(f"evaluate rope --output out {form.format(name)}".split())
+    assert isinstance(command, commands.Evaluate) and command.terms == SENSORS[name]
+    check_sensor(SENSORS[name])
+    assert SENSORS[name].on == (name != "paper")
+
+
+def test_terms_are_added_to_a_sensor() -> None:
+    chosen = generate_options("--sensor structured-light --sensor.tool 0.3 --sensor.holes 0 --sampler label-uniform")
+    assert chosen.sensor == replace(SENSORS["structured-light"], tool=0.3, holes=0.0)
+    assert chosen.sampling.sampler == "label-uniform"
+    assert generate_options("--sensor.axial 1").sensor == SensorConfig(axial=1.0)
+
+
+def test_every_term_is_off_by_default_and_switches_the_sensor_on() -> None:
+    lengths = {"metres_per_unit", "model", "hole_radius_m"}
+    assert set(SENSOR_TERMS) | lengths == set(SensorConfig.__dataclass_fields__)
+    assert not SensorConfig().on and set(get_args(Sensor)) == set(SENSORS)
+    assert all(replace(SensorConfig(), **{name: 0.1}).on for name in SENSOR_TERMS)
+
+
+def test_an_unknown_sensor_is_answered_with_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        command_line.parse(f"{BASICS} --sensor lidar".split())
+    assert "time-of-flight" in "".join(capsys.readouterr())
+
+
+def test_a_bad_strength_is_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "data"
+    arguments = ["generate", "rope", "--examples", "1", "--output", str(output), "--sensor.flying", "2"]
+    assert command_line.main(arguments) == 2 and not output.exists()
+    assert (
+        capsys.readouterr().err
+        == "mereo: error: sensor.flying is 2.0; it is a probability: pass a number from 0 to 1\n"
+    )
+
+
+# --- datasets ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_manifest_states_the_sensor_and_resuming_needs_the_same(tmp_path: Path) -> None:
+    spoiled = replace(SMALL, sensor=SENSORS["time-of-flight"])
+    generate(toy_scene(), tmp_path / "data", spoiled, examples=2, seed=3)
+    manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
+    assert SensorConfig(**manifest["settings"]["sensor"]) == SENSORS["time-of-flight"]
+    generate(toy_scene(), tmp_path / "data", spoiled, examples=2, seed=3, resume=True)
+    with pytest.raises(ValueError, match="was made with settings.sensor.model = 'time-of-flight', not 'structured-lig"):
+        generate(toy_scene(), tmp_path / "data", SMALL, examples=2, seed=3, resume=True)
+
+
+def test_a_dataset_from_before_there_were_sensors_goes_on_without_one(tmp_path: Path) -> None:
+    generate(toy_scene(), tmp_path / "data", SMALL, examples=2, seed=3)
+    path = tmp_path / "data" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["settings"]["sensor"]
+    path.write_text(json.dumps(manifest))
+    generate(toy_scene(), tmp_path / "data", SMALL, examples=2, seed=3, resume=True)
+    with pytest.raises(ValueError, match="was made with settings.sensor.axial = 0.0, not 1.0; resuming needs equal"):
+        generate(
+            toy_scene(),
+            tmp_path / "data",
+            replace(SMALL, sensor=SensorConfig(axial=1.0)),
+            examples=2,
+            seed=3,
+            resume=True,
+        )
+
+
+# --- evaluation -------------------------------------------------------------------------------------------------------
+
+
+def test_evaluation_looks_through_the_sensor_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clouds = []
+
+    def watch(*arguments: object) -> object:
+        clouds.append(arguments[1])
+        return predict(*arguments)
+
+    predict = evaluation.predict_grid
+    monkeypatch.setattr(evaluation, "predict_grid", watch)
+    for number, settings in enumerate((None, GenerateConfig(noise_std=0.5, sensor=SENSORS["structured-light"]))):
+        evaluate_weights("rope", tmp_path / str(number), examples=1, cells=12, settings=settings)
+    facts = [json.loads((tmp_path / str(number) / "metrics.json").read_text()) for number in range(2)]
+    assert [fact["noise_std"] for fact in facts] == [0.1, 0.5]
+    assert [SensorConfig(**fact["sensor"]) for fact in facts] == [SENSORS["paper"], SENSORS["structured-light"]]
+    assert len(clouds) == 2 and not np.array_equal(clouds[0].points[:20], clouds[1].points[:20])  # type: ignore[attr-defined]
+
+
+def test_real_scans_take_no_simulated_errors() -> None:
+    arguments = ["evaluate", "bunny", "--output", "out", "--scans", "--sensor", "time-of-flight"]
+    with pytest.raises(ValueError, match="--scans are real and take no simulated errors: leave out --sensor and"):
+        command_line.parse(arguments).run()

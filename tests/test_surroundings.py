@@ -1,0 +1,193 @@
+"""Tools, hands and backgrounds: where they are, what they hide, and what of them a wrong mask lets into the cloud."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from shapes import ball, box, one, segment
+from toy_scene import toy_scene
+
+from mereo.camera import Camera
+from mereo.config import MIN_POINTS, SENSORS, GenerateConfig, SamplingConfig, SensorConfig
+from mereo.mesh import Segment, SegmentedMesh
+from mereo.rays import first_hits
+from mereo.sensor import Observation, observe
+from mereo.solid import Solids
+from mereo.surroundings import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
+from mereo.synthesis import example_rng, sample_view, synthesize
+
+CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
+RAYS = CAMERA.directions().reshape(-1, 3)
+OFF = SensorConfig()
+SCENE = toy_scene()
+PAIR = Solids(SegmentedMesh((ball((-5, 0, 150), 15.0), box((12, -15, 140), (30, 15, 165), color=1))))
+
+
+def look(seed: int, solids: Solids = PAIR, **terms: float) -> Observation:
+    return observe(solids, CAMERA, 0.0, replace(OFF, **terms), np.random.default_rng(seed))
+
+
+def settings(**terms: float) -> GenerateConfig:
+    return GenerateConfig(sampling=SamplingConfig(per_segment=16), sensor=replace(OFF, **terms))
+
+
+# --- rays -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rays_hit_a_capsule_where_they_hit_its_triangles(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    low, high = (-30, -30, 100), (30, 30, 160)
+    start, end, radius = rng.uniform(low, high), rng.uniform(low, high), rng.uniform(3, 10)
+    rows, hits = Capsule(start, end, radius).first_hit(RAYS)
+    length = float(np.linalg.norm(end - start))
+    mesh = trimesh.creation.capsule(length, radius, count=[128, 128], transform=np.eye(4))
+    mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
+    mesh.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], (end - start) / length))
+    mesh.apply_translation((start + end) / 2)
+    expected = Solids(one(segment(mesh))).first_hit(RAYS)
+    distance = np.full(len(RAYS), np.inf)
+    distance[rows] = hits.distance
+    both = np.isfinite(distance) & np.isfinite(expected.distance)
+    assert both.sum() > 100 and (np.isfinite(distance) != np.isfinite(expected.distance)).sum() < 0.03 * both.sum()
+    assert np.median(np.abs(distance[both] - expected.distance[both])) < 0.01
+    normal = hits.normal / np.linalg.norm(hits.normal, axis=1, keepdims=True)
+    assert np.allclose(np.linalg.norm(hits.normal, axis=1), radius)
+    assert (np.einsum("ij,ij->i", normal, RAYS[rows]) < 1e-9).all()
+
+
+def test_a_capsule_without_length_is_a_ball_and_behind_the_camera_nothing() -> None:
+    center = np.array([3.0, -4.0, 120.0])
+    rows, hits = Capsule(center, center, 10.0).first_hit(RAYS)
+    places = RAYS[rows] * hits.distance[:, None]
+    assert len(rows) > 100 and np.allclose(np.linalg.norm(places - center, axis=1), 10.0)
+    assert len(Capsule(-center, np.array([40.0, 0, -100]), 10.0).first_hit(RAYS)[0]) == 0
+
+
+BOXES = [
+    box(low, low + np.array([20, 12, 15]))
+    for low in np.random.default_rng(0).uniform((-40, -40, 90), (20, 20, 190), (8, 3))
+]
+
+
+@pytest.mark.parametrize("part", [ball((-38, 30, 130), 14.0), ball((0, 0, 10), 14.0), *BOXES])
+def test_rays_that_are_left_out_would_have_missed(part: Segment) -> None:
+    """The same bits as with all rays, for segments in any part of the image, at its border and around the camera."""
+    solid = Solids(one(part))._solids[0]
+    rows, found = first_hits(solid.rays, solid.center, RAYS)
+    culled_rows, culled = solid.first_hit(RAYS)
+    assert len(rows) > 50
+    assert np.array_equal(rows, culled_rows) and np.array_equal(found.distance, culled.distance)
+
+
+# --- in front and behind ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("term", ["tool", "hand"])
+def test_occluders_are_in_front_hide_the_object_and_come_from_outside(term: str) -> None:
+    clear = look(0)
+    depth, hidden, borders = clear.whole.depth, [], 0
+    for seed in range(40):
+        seen = look(seed, **{term: 1.0})
+        occluder = seen.source == OCCLUDER
+        over = occluder & (clear.source == OBJECT)
+        assert (seen.whole.depth[over] < depth[over]).all() and not seen.mask[occluder].any()
+        assert np.array_equal(seen.image.depth, np.where(occluder, 0, depth))
+        hidden.append(over.sum())
+        edge = np.concatenate([occluder[0], occluder[-1], occluder[:, 0], occluder[:, -1]])
+        borders += bool(edge.any())
+    assert np.mean(np.array(hidden) > 0) > 0.9 and np.mean(hidden) > 10 and borders >= 38
+
+
+def test_a_hand_has_the_size_of_a_hand() -> None:
+    """Seen side on it is 7 to 12 cm wide, forearm included never wider than 25."""
+    for seed in range(20):
+        seen = look(seed, hand=1.0)
+        points = seen.whole.depth[..., None] * CAMERA.directions()
+        hand = points[seen.source == OCCLUDER] * OFF.metres_per_unit
+        widths = np.sort(np.sqrt(np.linalg.eigvalsh(np.cov(hand.T))))
+        assert 0.012 < widths[1] < 0.06
+
+
+def test_occluders_appear_as_often_as_asked() -> None:
+    appeared = [(look(seed, tool=0.3).source == OCCLUDER).any() for seed in range(120)]
+    assert abs(np.mean(appeared) - 0.3) < 5 * np.sqrt(0.21 / 120)
+
+
+def test_a_background_is_behind_everything_and_outside_a_true_mask() -> None:
+    vertices = PAIR.mesh.merged()[0]
+    clear = look(0)
+    for seed in range(10):
+        seen = look(seed, background=1.0)
+        assert (seen.source != NOTHING).all() and np.array_equal(seen.image.depth, clear.image.depth)
+        plane = seen.source == BACKGROUND
+        points = (seen.whole.depth[..., None] * CAMERA.directions())[plane]
+        center = points.mean(axis=0)
+        normal = np.linalg.svd(points - center, full_matrices=False)[2][2]
+        normal *= np.sign(normal[2])
+        assert normal[2] > np.cos(np.pi / 4) - 1e-9
+        gap = (center - vertices) @ normal
+        assert gap.min() > -1e-6 and gap.min() < 0.05 / OFF.metres_per_unit + 1e-6
+
+
+def test_a_wrong_mask_lets_the_background_in_and_loses_the_object() -> None:
+    """As many pixels on both sides of the outline, on average; without a background only losses remain."""
+    truth = (look(0).source == OBJECT).sum()
+    leaked, lost = [], []
+    for seed in range(60):
+        seen = look(seed, background=1.0, mask_offset_px=1.0)
+        leaked.append((seen.image.valid & (seen.source == BACKGROUND)).sum())
+        lost.append(truth - seen.object_points)
+    outline = 2 * np.pi * 15 + 96
+    assert 0.5 < np.mean(leaked) / np.mean(lost) < 2
+    assert 0.1 * outline < np.mean(leaked) < outline
+    alone = look(0, mask_offset_px=1.0)
+    assert alone.image.valid.sum() == alone.object_points
+
+
+def test_a_wrong_mask_lets_a_tool_in() -> None:
+    stray = [look(seed, tool=1.0, mask_offset_px=1.5) for seed in range(20)]
+    assert sum(bool((seen.image.valid & (seen.source == OCCLUDER)).any()) for seen in stray) > 10
+
+
+# --- in examples ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_examples_can_be_made_again_and_their_queries_are_exact(name: str) -> None:
+    """The cloud is what the sensor spoils: state, camera and labelled queries are those of the paper's sensor."""
+    config = replace(settings(), sensor=SENSORS[name])  # type: ignore[index]
+    first, again = (synthesize(SCENE, config, example_rng(5, 7)) for _ in range(2))
+    assert np.array_equal(first.cloud, again.cloud)
+    assert np.array_equal(first.queries.positions, again.queries.positions)
+    clean = synthesize(SCENE, settings(), example_rng(5, 7))
+    assert np.array_equal(first.queries.labels, clean.queries.labels)
+    assert np.allclose(
+        first.normalizer.invert(first.queries.positions), clean.normalizer.invert(clean.queries.positions), atol=1e-9
+    )
+    assert name == "paper" or not np.array_equal(first.cloud[:50], clean.cloud[:50])
+
+
+def test_the_paper_makes_the_examples_it_always_made() -> None:
+    """Values from before there were other sensors."""
+    config = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
+    example, view = (make(SCENE, config, example_rng(3, 5)) for make in (synthesize, sample_view))
+    assert view.depth.valid.sum() == 243 and view.depth.depth.sum() == pytest.approx(31193.81641960286, rel=1e-12)
+    assert example.normalizer.scale == pytest.approx(0.04896887255792319, rel=1e-12)
+    assert np.allclose(example.cloud[1], [-0.9883676, -0.23809237, 0.19280505], atol=1e-8)
+    assert np.allclose(example.queries.positions[0], [-0.70238803, 0.09261255, 0.62152631], atol=1e-8)
+
+
+def test_every_view_shows_enough_of_the_object() -> None:
+    """With most of it hidden in most views, strays do not count."""
+    config = settings(holes=3.0, hole_radius_m=0.06, hand=1.0, background=1.0, mask_offset_px=1.5)
+    for index in range(8):
+        view = sample_view(SCENE, config, example_rng(6, index))
+        near = Solids(view.mesh).nearest(view.depth.to_points().points).distance < 1.0
+        assert near.sum() >= MIN_POINTS
+
+
+def test_a_sensor_that_sees_nothing_is_named() -> None:
+    with pytest.raises(ValueError, match="'toy' showed fewer than 32 .*, or weaken the sensor's errors"):
+        sample_view(SCENE, settings(holes=50.0, hole_radius_m=1.0), example_rng(0, 0))
