@@ -154,7 +154,7 @@ def trained_scene(model: Model) -> str:
 
 
 def _scene_case(scene: Scene, seed: int, cells: int, index: int) -> TestCase:
-    view = sample_view(scene, GenerateConfig(), example_rng(seed, index))
+    view = sample_view(scene.for_seed(seed), GenerateConfig(), example_rng(seed, index))
     return TestCase(f"{scene.name} {index}", view.depth.to_points(), truth_grid(view.mesh, cells))
 
 
