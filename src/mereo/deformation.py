@@ -36,7 +36,7 @@ class Deformation(Protocol):
 class Invertible(Protocol):
     """A deformation that can undo itself better than Newton's method: exactly, or where finite differences mislead."""
 
-    def inverse(
+    def rest_points(
         self, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
         """Rest points whose image is ``points``, and which of them were found; arguments as for ``invert``."""
@@ -182,7 +182,7 @@ def invert(
         Where it does not, the best position found.
     """
     if isinstance(deformation, Invertible):
-        return deformation.inverse(points, guess)
+        return deformation.rest_points(points, guess)
     return newton(deformation, points, guess)
 
 

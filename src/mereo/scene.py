@@ -12,8 +12,11 @@ from mereo.deformation import Deformation
 from mereo.frame import rigid
 from mereo.mesh import SegmentedMesh
 
-SCENES = ("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet", "tumor")
-"""Built-in scenes, one module each in ``mereo.scenes``."""
+SCENES = (
+    *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
+    *("tumor", "liver-simulated"),
+)
+"""Built-in scenes, one module each in ``mereo.scenes``: the paper's ten, then ours."""
 
 PAPER_APERTURE_RAD = float(np.deg2rad(140.0))
 WHOLE_SPHERE_RAD = float(np.deg2rad(360.0))
@@ -115,7 +118,7 @@ class Scene:
             )
 
     def for_seed(self, seed: int) -> "Scene":
-        """What a seed draws from: seeds for testing (``TEST_SEED_START`` up) the held-out states, where there are any."""
+        """What a seed draws from: one for testing (``TEST_SEED_START`` up) the held-out states, where there are any."""
         return self.held_out if self.held_out is not None and seed >= TEST_SEED_START else self
 
     def sample_state(self, rng: np.random.Generator) -> State:
@@ -141,5 +144,5 @@ def load_scene(name: str) -> Scene:
     """A built-in scene by name; raises ``ValueError`` listing the known names otherwise."""
     if name not in SCENES:
         raise ValueError(f"scene {name!r} is unknown; it must be one of {', '.join(SCENES)}: check the spelling")
-    scene: Scene = import_module(f"mereo.scenes.{name}").scene()
+    scene: Scene = import_module(f"mereo.scenes.{name.replace('-', '_')}").scene()
     return scene

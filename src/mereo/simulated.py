@@ -4,9 +4,9 @@ A random state is one recorded frame, drawn at random. Frames are finitely many,
 and test seeds never share one. See docs/design/0008-simulated-states.md for formats and accuracy.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -26,10 +26,11 @@ MATCHED = 1e-4
 """How near a vertex of the states must be to the mesh's, of the segment's longest side: what single precision and a
 few printed digits leave."""
 
-DOUBTFUL_STRETCH = 5.0
-"""Edges that a frame makes longer or shorter by this factor, in the median, are not those of one mesh."""
+DOUBTFUL_STRETCH = 2.0
+"""Edges that the first frame makes longer or shorter by this factor, in the median, are hardly those of one mesh."""
 
 
+@runtime_checkable
 class Frames(Protocol):
     """Recorded states as deformations of an object at rest."""
 
@@ -238,8 +239,10 @@ def surface_frames(
     surfaces = tuple(Surface(segment.vertices, segment.faces) for segment in rest.segments)
     frames = SurfaceFrames(surfaces, tuple(ordered), scale, shift)
     for index, segment in enumerate(rest.segments):
+        if segment.name not in record.rest:
+            _check_order(path, segment, frames.positions(index, 0))
         for frame, name in enumerate(record.frames):
-            _check_surface(path, name, segment, frames.positions(index, frame))
+            _check_volume(path, name, segment, frames.positions(index, frame))
     return frames
 
 
@@ -270,16 +273,20 @@ def _order(
     return np.asarray(nearest, dtype=np.int64)
 
 
-def _check_surface(path: Path, frame: str, segment: Segment, vertices: Float[np.ndarray, "v 3"]) -> None:
+def _check_order(path: Path, segment: Segment, vertices: Float[np.ndarray, "v 3"]) -> None:
+    """Refuse vertices whose neighbours are far apart: the order is another mesh's, or the unit another one."""
     edges = segment.faces[:, [0, 1]]
     before, after = (np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1) for v in (segment.vertices, vertices))
     stretch = float(np.exp(np.median(np.abs(np.log(np.maximum(after, 1e-300) / np.maximum(before, 1e-300))))))
     if stretch > DOUBTFUL_STRETCH:
         raise ValueError(
-            f"{path}: {frame} makes the edges of {segment.name!r} longer or shorter by a factor of {stretch:.3g}; its "
-            f"vertices are in another order or unit than the mesh's: check scale, or add '{segment.name}.rest'"
+            f"{path} makes the edges of {segment.name!r} longer or shorter by a factor of {stretch:.3g}; its vertices "
+            f"seem to be in another order or unit than the mesh's: check scale, or add '{segment.name}.rest'"
         )
-    volume = Segment(segment.name, segment.color, vertices, segment.faces).volume / segment.volume
+
+
+def _check_volume(path: Path, frame: str, segment: Segment, vertices: Float[np.ndarray, "v 3"]) -> None:
+    volume = replace(segment, vertices=vertices).volume / segment.volume
     if not volume > 0:
         raise ValueError(
             f"{path}: {frame} turns {segment.name!r} inside out (its volume is {volume:.3g} times that at rest); it "

@@ -23,7 +23,7 @@ from mereo.deformation import smooth_step
 from mereo.mesh import barycentric
 from mereo.ordering import farthest_point_order
 
-CONTROLS = 200
+CONTROLS = 100
 """Vertices that the spline goes through: more cost time in proportion, fewer leave more to the closest point."""
 
 REACH = 3.0

@@ -145,7 +145,7 @@ class TetrahedralMap:
         gradient = np.einsum("pk,pkij->pij", weights, self._node_gradients[corners])
         return base + _apply(gradient, points - place)
 
-    def inverse(
+    def rest_points(
         self, points: Float[np.ndarray, "p 3"], guess: Float[np.ndarray, "p 3"]
     ) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, " p"]]:
         """Exact for points in a deformed tetrahedron: the affine map undone; Newton's method for those outside.
