@@ -22,7 +22,7 @@ from mereo.weights import load_model
 
 def main(weights: str = "rope", resolution: int = 64, views: int = 2) -> None:
     model = load_model(weights)
-    scene = load_scene(trained_scene(model))
+    scene = load_scene(trained_scene(model)).for_seed(TEST_SEED_START)
     print("view   points asked      share   seconds (coarse to fine, dense)   labels that differ   largest lead there")
     for index in range(views):
         view = sample_view(scene, GenerateConfig(), example_rng(TEST_SEED_START, index))

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,10 @@ EXPECTED = {
     "reconstruct_cloud.py": "report.html",
     "sampling_2d.py": "",
     "sensors.py": "wrote",
+    "simulate_liver.py": "3 states of 98 nodes",
 }
+EXTRAS = {"simulate_liver.py": "mujoco"}
+"""Modules that come with an extra of the package."""
 
 
 def test_every_example_is_run() -> None:
@@ -21,7 +25,11 @@ def test_every_example_is_run() -> None:
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_example_runs(name: str, tmp_path: Path) -> None:
+def test_example_runs(name: str, tmp_path: Path, require_asset: Callable[[str], Path]) -> None:
+    if name == "simulate_liver.py":
+        require_asset("liver/lapgym_liver_volumetric.vtk")
+    if name in EXTRAS:
+        pytest.importorskip(EXTRAS[name], reason=f"{name} needs {EXTRAS[name]}")
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / name)],
         cwd=tmp_path,

@@ -24,6 +24,7 @@ NEEDED_ASSETS = {
     "skull": ("skull/sofa_skull_and_teeth_coarse.obj",),
     "liver": _LIVER,
     "tumor": _LIVER,
+    "liver-simulated": _LIVER,
     "human": (
         "human/makehuman_base.obj",
         "human/makehuman_default.mhskel",

@@ -32,6 +32,17 @@ class Deformation(Protocol):
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]: ...
 
 
+@runtime_checkable
+class Invertible(Protocol):
+    """A deformation that can undo itself better than Newton's method: exactly, or where finite differences mislead."""
+
+    def rest_points(
+        self, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+        """Rest points whose image is ``points``, and which of them were found; arguments as for ``invert``."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Identity:
     """Leaves every point where it is."""
@@ -160,11 +171,7 @@ def check_positive(
 def invert(
     deformation: Deformation, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Rest points whose image is ``points``: damped Newton's method with finite differences, all points at once.
-
-    A step is kept where the distance to the target falls by at least half of what the linear model promises; elsewhere
-    half of the step is tried, and so on, so that guesses from which the plain method overshoots still converge.
-    (Any decrease would not do: a point can run away along one axis while it gains along another.)
+    """Rest points whose image is ``points``: by the deformation itself where it is ``Invertible``, else by ``newton``.
 
     Args:
         points: deformed positions.
@@ -173,6 +180,20 @@ def invert(
     Returns:
         Rest points, and for each whether its image lies within ``TOLERANCE`` of the coordinates' magnitude.
         Where it does not, the best position found.
+    """
+    if isinstance(deformation, Invertible):
+        return deformation.rest_points(points, guess)
+    return newton(deformation, points, guess)
+
+
+def newton(
+    deformation: Deformation, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """``invert`` by damped Newton's method with finite differences, all points at once.
+
+    A step is kept where the distance to the target falls by at least half of what the linear model promises; elsewhere
+    half of the step is tried, and so on, so that guesses from which the plain method overshoots still converge.
+    (Any decrease would not do: a point can run away along one axis while it gains along another.)
     """
     tolerance = TOLERANCE * max(_magnitude(points), _magnitude(guess))
     rest, full, scale = guess.astype(float), np.zeros(points.shape), np.ones(len(points))

@@ -16,7 +16,7 @@ PURPOSES: dict[str, str] = {
     "onnx": "networks for other runtimes",
     "medical": "NIfTI and NRRD volumes",
     "sensors": "ROS bags and netCDF recordings",
-    "simulation": "physics and tetrahedra",
+    "simulation": "states from finite elements",
     "cluster": "data generation on several machines",
     "dev": "tests and checks",
 }

@@ -158,7 +158,7 @@ def trained_scene(model: Model) -> str:
 
 
 def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, index: int) -> TestCase:
-    view = sample_view(scene, settings, example_rng(seed, index))
+    view = sample_view(scene.for_seed(seed), settings, example_rng(seed, index))
     return TestCase(f"{scene.name} {index}", view.depth.to_points(), truth_grid(view.mesh, cells))
 
 

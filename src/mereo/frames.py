@@ -74,7 +74,7 @@ class Frame:
 
 def make_frame(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> Frame:
     """Example 0 of a test seed, its depth rounded as ``save_frame`` stores it."""
-    view = sample_view(load_scene(scene), GenerateConfig(), example_rng(seed, 0))
+    view = sample_view(load_scene(scene).for_seed(seed), GenerateConfig(), example_rng(seed, 0))
     rounded = np.rint(view.depth.depth / DEPTH_STEP)
     if rounded.max() > 65535:
         raise ValueError(

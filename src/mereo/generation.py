@@ -240,7 +240,8 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def _make_shard(work: _Work, shard: _Shard, cancelled: Callable[[], bool]) -> bytes:
     """The shard's file content; nothing when cancelled, which is asked before every example."""
-    scene = load_scene(work.scene) if isinstance(work.scene, str) else work.scene
+    loaded = load_scene(work.scene) if isinstance(work.scene, str) else work.scene
+    scene = loaded.for_seed(work.seed)
     rows = []
     for index in range(shard.first, shard.end):
         if cancelled():

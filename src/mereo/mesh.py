@@ -189,3 +189,13 @@ def check_segment(segment: Segment) -> None:
             f"segment {name!r} has volume {segment.volume:.4g}; it must be positive: its faces point inwards, "
             "so reverse them (for example trimesh.repair.fix_inversion)"
         )
+
+
+def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Barycentric coordinates of points in the planes of their triangles."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    normal = np.cross(b - a, c - a)
+    size = np.maximum(np.einsum("ni,ni->n", normal, normal), 1e-30)
+    v = np.einsum("ni,ni->n", np.cross(points - a, c - a), normal) / size
+    w = np.einsum("ni,ni->n", np.cross(b - a, points - a), normal) / size
+    return np.stack([1 - v - w, v, w], axis=1)

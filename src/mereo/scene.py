@@ -7,12 +7,16 @@ from importlib import import_module
 import numpy as np
 from jaxtyping import Float
 
+from mereo.config import TEST_SEED_START
 from mereo.deformation import Deformation
 from mereo.frame import rigid
 from mereo.mesh import SegmentedMesh
 
-SCENES = ("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet", "tumor")
-"""Built-in scenes, one module each in ``mereo.scenes``."""
+SCENES = (
+    *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
+    *("tumor", "liver-simulated"),
+)
+"""Built-in scenes, one module each in ``mereo.scenes``: the paper's ten, then ours."""
 
 PAPER_APERTURE_RAD = float(np.deg2rad(140.0))
 WHOLE_SPHERE_RAD = float(np.deg2rad(360.0))
@@ -96,6 +100,7 @@ class Scene:
         sample_deformations: draws one deformation per segment; segments that move together share one object.
         workspace: where the camera may be.
         source: where the mesh comes from, and its licence.
+        held_out: the same object in states that are kept for testing; None where states are drawn without end.
     """
 
     name: str
@@ -103,6 +108,18 @@ class Scene:
     sample_deformations: Callable[[np.random.Generator], tuple[Deformation, ...]]
     workspace: Workspace = field(default_factory=Workspace)
     source: str = "modelled in mereo's own code, MIT licence"
+    held_out: "Scene | None" = None
+
+    def __post_init__(self) -> None:
+        if self.held_out is not None and self.held_out.rest.names != self.rest.names:
+            raise ValueError(
+                f"scene {self.name!r} has the segments {', '.join(self.rest.names)} but its held-out states "
+                f"{', '.join(self.held_out.rest.names)}; they must be one object: give both the same rest mesh"
+            )
+
+    def for_seed(self, seed: int) -> "Scene":
+        """What a seed draws from: one for testing (``TEST_SEED_START`` up) the held-out states, where there are any."""
+        return self.held_out if self.held_out is not None and seed >= TEST_SEED_START else self
 
     def sample_state(self, rng: np.random.Generator) -> State:
         """A random deformed state within the scene's hand-made bounds."""
@@ -127,5 +144,5 @@ def load_scene(name: str) -> Scene:
     """A built-in scene by name; raises ``ValueError`` listing the known names otherwise."""
     if name not in SCENES:
         raise ValueError(f"scene {name!r} is unknown; it must be one of {', '.join(SCENES)}: check the spelling")
-    scene: Scene = import_module(f"mereo.scenes.{name}").scene()
+    scene: Scene = import_module(f"mereo.scenes.{name.replace('-', '_')}").scene()
     return scene

@@ -17,7 +17,7 @@ from mereo.camera import Camera, DepthImage
 from mereo.config import MIN_POINTS, GenerateConfig
 from mereo.deformation import Deformation, invert
 from mereo.frame import Normalizer, inverse_rigid, transform_points
-from mereo.mesh import SegmentedMesh
+from mereo.mesh import SegmentedMesh, barycentric
 from mereo.ordering import farthest_point_order
 from mereo.query_sampling import Samples, sample_queries
 from mereo.rest_pose import rest_frame
@@ -175,19 +175,9 @@ def _rest_guess(
     before, faces, _ = rest.merged()
     after, _, _ = deformed.merged()
     old, new = before[faces[face]], after[faces[face]]
-    weights = _barycentric(new, closest)
+    weights = barycentric(new, closest)
     local = np.einsum("nji,nj->ni", _triangle_frames(new), points - closest)
     return np.einsum("nk,nkj->nj", weights, old) + np.einsum("nij,nj->ni", _triangle_frames(old), local)
-
-
-def _barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Barycentric coordinates of points in the planes of their triangles."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    normal = np.cross(b - a, c - a)
-    size = np.maximum(np.einsum("ni,ni->n", normal, normal), 1e-30)
-    v = np.einsum("ni,ni->n", np.cross(points - a, c - a), normal) / size
-    w = np.einsum("ni,ni->n", np.cross(b - a, points - a), normal) / size
-    return np.stack([1 - v - w, v, w], axis=1)
 
 
 def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:

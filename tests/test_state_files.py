@@ -1,0 +1,199 @@
+"""States from files: every format gives the same motion, and what does not fit is named with its cure."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from lattice import boxes, lattice, states
+
+from mereo.simulated import load_states
+from mereo.tetrahedra import TetrahedralMap
+
+SCALE, SHIFT = 0.5, (1.0, -2.0, 3.0)
+"""From the files' coordinates to those of the scene, in which ``boxes`` are."""
+
+
+def to_file(points: np.ndarray) -> np.ndarray:
+    return (points - SHIFT) / SCALE
+
+
+def moved_vertices() -> dict[str, np.ndarray]:
+    """Positions [frames, vertices, 3] of both segments, scene coordinates."""
+    maps = [TetrahedralMap(lattice(), nodes) for nodes in states()]
+    return {part.name: np.stack([f(part.vertices) for f in maps]) for part in boxes().segments}
+
+
+def soup() -> dict[str, np.ndarray]:
+    """For each segment the vertex of each corner of each face, as in an STL file."""
+    return {part.name: part.faces.ravel() for part in boxes().segments}
+
+
+# --- formats ----------------------------------------------------------------------------------------------------------
+
+
+def nodes_npz(path: Path) -> Path:
+    mesh = lattice()
+    np.savez(path / "s.npz", rest_nodes=to_file(mesh.nodes), tetrahedra=mesh.elements, nodes=to_file(states()))
+    return path / "s.npz"
+
+
+def displacements_npz(path: Path) -> Path:
+    mesh = lattice()
+    moved = (states() - mesh.nodes) / SCALE
+    np.savez(path / "s.npz", rest_nodes=to_file(mesh.nodes), tetrahedra=mesh.elements, displacements=moved)
+    return path / "s.npz"
+
+
+def vertices_npz(path: Path) -> Path:
+    np.savez(path / "s.npz", **{name: to_file(moved) for name, moved in moved_vertices().items()})
+    return path / "s.npz"
+
+
+def unmerged_npz(path: Path) -> Path:
+    """As exporters write them that split vertices at normals: more of them than the mesh, in another order."""
+    rest = {f"{part.name}.rest": to_file(part.vertices[soup()[part.name]]) for part in boxes().segments}
+    np.savez(path / "s.npz", **rest, **{name: to_file(v[:, soup()[name]]) for name, v in moved_vertices().items()})
+    return path / "s.npz"
+
+
+def npz_per_frame(path: Path) -> Path:
+    for frame in range(10):
+        np.savez(path / f"state{frame + 1}.npz", **{k: to_file(v[frame]) for k, v in moved_vertices().items()})
+    return path
+
+
+def meshes(suffix: str, rest: bool) -> Callable[[Path], Path]:
+    """One folder for each segment, a mesh for each frame, numbered without leading zeros."""
+
+    def write(path: Path) -> Path:
+        for part in boxes().segments:
+            (path / part.name).mkdir()
+            poses = {f"{frame + 1}": v for frame, v in enumerate(moved_vertices()[part.name])}
+            for stem, vertices in {**poses, **({"rest": part.vertices} if rest else {})}.items():
+                mesh = trimesh.Trimesh(to_file(vertices), part.faces, process=False)
+                mesh.export(path / part.name / f"{stem}.{suffix}")
+        return path
+
+    return write
+
+
+FORMATS = {
+    "nodes": nodes_npz,
+    "displacements": displacements_npz,
+    "vertices": vertices_npz,
+    "unmerged": unmerged_npz,
+    "npz per frame": npz_per_frame,
+    "ply": meshes("ply", rest=False),
+    "obj": meshes("obj", rest=False),
+    "stl": meshes("stl", rest=True),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_gives_the_same_states(name: str, tmp_path: Path) -> None:
+    split = load_states(FORMATS[name](tmp_path), boxes(), scale=SCALE, shift=SHIFT)
+    frames, truth = split.training.frames, moved_vertices()
+    assert frames.count == 10 and (split.training.end, split.testing.first) == (9, 9)
+    for frame in range(10):
+        for part, deformation in zip(boxes().segments, frames.deformations(frame), strict=True):
+            tolerance = 1e-5 if name in ("ply", "stl", "obj") else 1e-9  # single precision, eight digits
+            assert np.abs(deformation(part.vertices) - truth[part.name][frame]).max() < tolerance
+
+
+# --- what does not fit ------------------------------------------------------------------------------------------------
+
+
+def tetrahedral(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    mesh = lattice()
+    return {"rest_nodes": mesh.nodes, "tetrahedra": mesh.elements, "nodes": states()} | changes
+
+
+def surfaces(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    return moved_vertices() | changes
+
+
+def with_value(array: np.ndarray, index: tuple, value: object) -> np.ndarray:
+    array = array.copy()
+    array[index] = value
+    return array
+
+
+def inside_out() -> np.ndarray:
+    return with_value(moved_vertices()["left"], (4,), boxes().segments[0].vertices * [1, 1, -1])
+
+
+def shuffled() -> np.ndarray:
+    moved = moved_vertices()["left"]
+    return moved[:, np.random.default_rng(0).permutation(moved.shape[1])]
+
+
+def inverted() -> np.ndarray:
+    """Frame 6 pulls node 37 through its neighbours."""
+    return with_value(states(), (6, 37), states()[6, 37] + 1.5)
+
+
+REFUSED: dict[str, tuple[Callable[[], dict[str, np.ndarray]], str]] = {
+    "inverted": (lambda: tetrahedral(nodes=inverted()), r"frame 6 inverts tetrahedron \d+ .* leave the frame out"),
+    "node count": (lambda: tetrahedral(nodes=states()[:, :-1]), "nodes has 95 nodes a frame but rest_nodes 96"),
+    "quads": (lambda: tetrahedral(tetrahedra=lattice().elements[:, :3]), r"the shape \[270, 3\] .* integers \[m, 4\]"),
+    "unknown": (lambda: tetrahedral(velocity=np.zeros(3)), "has the array 'velocity'; known are rest_nodes"),
+    "both": (lambda: tetrahedral(displacements=states()), "one of nodes or displacements"),
+    "far away": (lambda: tetrahedral(rest_nodes=1e-3 * lattice().nodes), "check the unit, scale and shift"),
+    "NaN": (lambda: surfaces(left=with_value(moved_vertices()["left"], (3, 5, 1), np.nan)), "frame 3 of left has NaN"),
+    "integers": (lambda: surfaces(left=np.zeros((10, 5, 3), dtype=int)), "must be floating-point numbers"),
+    "flat": (lambda: surfaces(left=np.zeros((10, 15))), r"the shape \[10, 15\] .* \[frames, vertices, 3\]"),
+    "frame count": (lambda: surfaces(left=moved_vertices()["left"][:7]), "7 frames of 'left' but 10 of 'right'"),
+    "vertex count": (lambda: surfaces(left=moved_vertices()["left"][:, 1:]), "97 vertices .* 98 .*'left.rest'"),
+    "order": (lambda: surfaces(left=shuffled()), "seem to be in another order or unit"),
+    "inside out": (lambda: surfaces(left=inside_out()), "frame 4 turns 'left' inside out"),
+    "missing": (lambda: {"left": moved_vertices()["left"]}, "states of left but not of segment 'right'"),
+    "stranger": (lambda: surfaces(middle=np.zeros((10, 4, 3))), "'middle', which is no segment"),
+    "other rest": (lambda: surfaces(**{"left.rest": 2 * boxes().segments[0].vertices}), "miss a vertex of its mesh by"),
+    "rest count": (lambda: surfaces(**{"left.rest": np.zeros((5, 3))}), "5 rest positions of 'left' but 98"),
+    "none": (lambda: surfaces(left=np.zeros((0, 98, 3)), right=np.zeros((0, 98, 3))), "has no frames"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_states_that_do_not_fit_are_named(case: str, tmp_path: Path) -> None:
+    arrays, text = REFUSED[case]
+    np.savez(tmp_path / "s.npz", **arrays())
+    with pytest.raises(ValueError, match=text) as caught:
+        load_states(tmp_path / "s.npz", boxes())
+    assert "\n" not in str(caught.value)
+
+
+def test_directories_that_are_not_states_are_explained(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"one folder of mesh files for each segment \(left, right\), or one NPZ"):
+        load_states(tmp_path, boxes())
+    meshes("ply", rest=False)(tmp_path)
+    (tmp_path / "right/10.ply").unlink()
+    with pytest.raises(ValueError, match="10 of 'left', 9 of 'right' frames; all segments need the same number"):
+        load_states(tmp_path, boxes())
+    trimesh.creation.box().export(tmp_path / "right/10.ply")
+    with pytest.raises(ValueError, match="frame 10.ply of 'right' has 8 vertices but frame 1.ply has 98; the topology"):
+        load_states(tmp_path, boxes())
+
+
+def test_paths_that_are_no_states_are_explained(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"s\.npz does not exist; a NPZ file is needed"):
+        load_states(tmp_path / "s.npz", boxes())
+    (tmp_path / "s.npz").write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="cannot be read as a NPZ file"):
+        load_states(tmp_path / "s.npz", boxes())
+    (tmp_path / "s.csv").write_text("1,2,3")
+    with pytest.raises(ValueError, match="has the suffix '.csv'; states are an NPZ file or a directory"):
+        load_states(tmp_path / "s.csv", boxes())
+
+
+def test_too_few_frames_to_split_and_bad_settings_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "s.npz", **{name: v[:1] for name, v in moved_vertices().items()})
+    with pytest.raises(ValueError, match="has 1 frames, of which 1 would be held out .* set held_out to 0"):
+        load_states(tmp_path / "s.npz", boxes())
+    assert load_states(tmp_path / "s.npz", boxes(), held_out=0.0).testing is None
+    with pytest.raises(ValueError, match="held_out is 1.5; the share of frames for testing is from 0"):
+        load_states(tmp_path / "s.npz", boxes(), held_out=1.5)
+    with pytest.raises(ValueError, match="scale is 0.0 and shift"):
+        load_states(tmp_path / "s.npz", boxes(), scale=0.0)
