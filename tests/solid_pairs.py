@@ -1,7 +1,8 @@
-"""Exact overlaps and gaps between the segments of a state, by Booleans on the meshes themselves."""
+"""Overlaps and gaps between the segments of a state: exact, by Booleans, or where vertices are, by winding numbers."""
 
 from itertools import combinations
 
+import igl
 import numpy as np
 from manifold3d import Manifold, Mesh64
 
@@ -28,3 +29,25 @@ def gap(mesh: SegmentedMesh, first: str, second: str) -> float:
     """Least distance between two segments, at most 1."""
     a, b = (solid(mesh.segments[mesh.names.index(name)]) for name in (first, second))
     return float(a.min_gap(b, 1.0))
+
+
+def crowded(mesh: SegmentedMesh, depth: float) -> dict[str, int]:
+    """How many vertices of each segment are held by more than one solid, or by one that passes through itself.
+
+    Winding numbers of all segments add up; a place in one nested segment counts twice, and may. Every vertex is moved
+    inwards by ``depth`` first, so what overlaps less is not counted.
+    """
+    vertices, faces, _ = mesh.merged()
+    corners = vertices[faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(vertices)
+    np.add.at(normals, faces, area[:, None])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-30
+    winding = igl.fast_winding_number(vertices, faces, vertices - depth * normals)
+    counts, start = {}, 0
+    for index, segment in enumerate(mesh.segments):
+        allowed = 1 + sum(inner == index for inner, _ in mesh.nesting)
+        end = start + len(segment.vertices)
+        counts[segment.name] = int((winding[start:end] > allowed + 0.5).sum())
+        start = end
+    return {name: count for name, count in counts.items() if count}

@@ -79,7 +79,7 @@ def sample_spine(rng: np.random.Generator) -> Float[np.ndarray, "h 3"]:
     along = np.arange(len(SPINE)) / (len(SPINE) - 1)
     waves = rng.normal(size=k.shape) / (1 + k) * np.cos(np.pi * k * along + rng.uniform(0, 2 * np.pi, size=k.shape))
     curve = waves.sum(axis=0)
-    yaw = SPINE_LIMIT_RAD * curve * rng.uniform(0.2, 1.0) / np.abs(curve).max()
+    yaw = SPINE_LIMIT_RAD * curve * rng.uniform(0.35, 1.0) / np.abs(curve).max()
     play = rng.uniform(-SPINE_PLAY_RAD, SPINE_PLAY_RAD, size=(len(SPINE), 2))
     return np.column_stack([play, yaw])
 
@@ -181,5 +181,5 @@ def scene() -> Scene:
         name="lizard",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(43.0))),
+        workspace=Workspace(fov_rad=float(np.deg2rad(46.0))),
     )
