@@ -31,23 +31,18 @@ def gap(mesh: SegmentedMesh, first: str, second: str) -> float:
     return float(a.min_gap(b, 1.0))
 
 
-def crowded(mesh: SegmentedMesh, depth: float) -> dict[str, int]:
-    """How many vertices of each segment are held by more than one solid, or by one that passes through itself.
+def crowded(mesh: SegmentedMesh, depth: float, chosen: slice = slice(None)) -> set[str]:
+    """Segments with a vertex, of those ``chosen``, that two solids hold, or one that passes through itself.
 
     Winding numbers of all segments add up; a place in one nested segment counts twice, and may. Every vertex is moved
     inwards by ``depth`` first, so what overlaps less is not counted.
     """
     vertices, faces, _ = mesh.merged()
     corners = vertices[faces]
-    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.zeros_like(vertices)
-    np.add.at(normals, faces, area[:, None])
+    np.add.at(normals, faces, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-30
-    winding = igl.fast_winding_number(vertices, faces, vertices - depth * normals)
-    counts, start = {}, 0
-    for index, segment in enumerate(mesh.segments):
-        allowed = 1 + sum(inner == index for inner, _ in mesh.nesting)
-        end = start + len(segment.vertices)
-        counts[segment.name] = int((winding[start:end] > allowed + 0.5).sum())
-        start = end
-    return {name: count for name, count in counts.items() if count}
+    owner = np.repeat(np.arange(len(mesh.segments)), [len(segment.vertices) for segment in mesh.segments])[chosen]
+    allowed = 1 + np.array([sum(inner == index for inner, _ in mesh.nesting) for index in range(len(mesh.segments))])
+    winding = igl.fast_winding_number(vertices, faces, (vertices - depth * normals)[chosen])
+    return {mesh.names[index] for index in np.unique(owner[winding > allowed[owner] + 0.5])}

@@ -16,16 +16,8 @@ from mereo.deformation import Compose, Deformation, Localized, Rigid
 from mereo.mesh import PALETTE, Segment
 from mereo.mesh_files import read_segmented_mesh
 from mereo.scene import Workspace
-from mereo.scenes._real_meshes import (
-    Faces,
-    Vertices,
-    close_hole,
-    largest_piece,
-    main_part,
-    segment_of,
-    simplified,
-    solid_of,
-)
+from mereo.scenes._real_meshes import close_hole, largest_piece, main_part, simplified
+from mereo.scenes._solids import Faces, Vertices, segment_of, solid_of
 from mereo.warps import Bend, FreeFormLattice, Squash, Twist
 
 SHORTEST_SIDE = 20.0

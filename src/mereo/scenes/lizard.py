@@ -41,7 +41,7 @@ from mereo.scenes._lizard_parts import (
     leg,
     spine_links,
 )
-from mereo.scenes._solids import to_segment, union
+from mereo.scenes._solids import segment, union
 
 SPINE_SEGMENTS = {"head": (0, 1), "body_front": (1, 4), "body_rear": (4, 6), "tail_base": (6, 10), "tail_tip": (10, 13)}
 """First link, and the one after the last."""
@@ -67,10 +67,10 @@ GAP = 0.2
 def rest_mesh() -> SegmentedMesh:
     """The straight lizard, symmetrical, its belly on z = 0."""
     links = spine_links()
-    parts = {name: union(links[first:last]) for name, (first, last) in SPINE_SEGMENTS.items()}
+    parts = {name: union(*links[first:last]) for name, (first, last) in SPINE_SEGMENTS.items()}
     for name, (plan, side, _) in LEGS.items():
-        parts[name] = union((leg(plan, side).upper, leg(plan, side).foot))
-    return SegmentedMesh(tuple(to_segment(name, PALETTE[i], part) for i, (name, part) in enumerate(parts.items())))
+        parts[name] = union(leg(plan, side).upper, leg(plan, side).foot)
+    return SegmentedMesh(tuple(segment(name, PALETTE[i], part) for i, (name, part) in enumerate(parts.items())))
 
 
 def sample_spine(rng: np.random.Generator) -> Float[np.ndarray, "h 3"]:
