@@ -45,8 +45,8 @@ from mereo.warps import SmoothField
 
 ATTEMPTS = 1000
 
-APART = 1.5
-"""Balls with at least this gap at rest are watched; closer ones touch or belong together."""
+APART = 3.2
+"""Balls with at least this gap at rest are watched; closer ones touch or belong together, as on both sides of a knee."""
 
 LEAST_GAP = 0.5
 """That watched balls must keep: what lies between them and the skin is at most half of this deep."""
@@ -137,6 +137,6 @@ def scene() -> Scene:
         name="human",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(48.0))),
+        workspace=Workspace(fov_rad=float(np.deg2rad(50.0))),
         source="MakeHuman base mesh, default skeleton and skin weights, MakeHuman community: CC0 1.0",
     )
