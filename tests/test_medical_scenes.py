@@ -10,7 +10,8 @@ import pytest
 from mereo.deformation import jacobian_determinant
 from mereo.scene import load_scene
 from mereo.scenes import _liver_parts, skull, tumor
-from mereo.scenes._real_meshes import close_hole, largest_piece, mesh_of, solid_of
+from mereo.scenes._real_meshes import close_hole, largest_piece
+from mereo.scenes._solids import mesh_of, solid_of
 from mereo.solid import Solids, check_overlap
 
 Require = Callable[[str], Path]

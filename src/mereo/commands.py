@@ -78,23 +78,32 @@ class SceneCheck:
 
 @dataclass(frozen=True)
 class ScenePreview:
-    """Draw nine random states of a scene, each with its camera and depth image.
+    """Draw nine random states of a scene, each with its camera and depth image; or all scenes on one sheet.
 
     Attributes:
-        scene: a name from `mereo scene list`.
         output: the picture, a PNG file.
+        scene: a name from `mereo scene list`.
+        all: draw every built-in scene: at rest, two random states and a depth image.
         seed: another seed shows other states.
     """
 
-    scene: Positional[str]
     output: Path
+    scene: Positional[str] = ""
+    all: bool = False
     seed: int = 0
 
     def run(self) -> None:
         from mereo.pictures import preview_scene
         from mereo.scene import load_scene
+        from mereo.scene_pictures import preview_all
 
-        preview_scene(load_scene(self.scene), self.output, self.seed)
+        if self.all == bool(self.scene):
+            given = f"both {self.scene!r} and --all are" if self.all else "neither a scene nor --all is"
+            raise ValueError(f"{given} given; one of them is needed: name a scene, or give --all")
+        if self.all:
+            preview_all(self.output, self.seed)
+        else:
+            preview_scene(load_scene(self.scene), self.output, self.seed)
         print(f"wrote {self.output}")
 
 

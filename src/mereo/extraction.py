@@ -2,12 +2,13 @@
 
 The surface of segment k is the zero level of its margin ``logit_k - max over j != k of logit_j``. Where two classes
 meet, their margins are exact negatives of each other, so marching cubes gives both segments the same interface
-vertices, below the size of a voxel. The field is evaluated coarse to fine (``mereo.refinement``); every cell that a
-surface crosses is known at all its corners, so the surfaces are those of the dense grid.
+vertices, below the size of a voxel. A segment with others nested in it has the surface of all of them together, as in
+the model (``SegmentedMesh``). The field is evaluated coarse to fine (``mereo.refinement``); every cell that a surface
+crosses is known at all its corners, so the surfaces are those of the dense grid.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -15,6 +16,9 @@ from skimage.measure import marching_cubes
 
 from mereo.mesh import Color, Segment, SegmentedMesh
 from mereo.refinement import Field, Sampled, sample_coarse_to_fine, sample_dense
+
+Nested = tuple[tuple[str, str], ...]
+"""Pairs of names (inner, outer), see ``SegmentedMesh``."""
 
 MAX_NODES = 80_000_000
 
@@ -77,6 +81,7 @@ def extract(
     resolution: int,
     names: Sequence[str],
     colors: Sequence[Color],
+    nested: Nested = (),
 ) -> Extraction:
     """Surfaces and labels of a field, evaluated only where labels may change.
 
@@ -85,10 +90,11 @@ def extract(
         box: lower and upper corner of the region; a segment that leaves it is closed half a voxel outside.
         resolution: cells along the longest side; voxels are cubes.
         names, colors: of the segments.
+        nested: which of them lie inside another; the outer one's surface is then that of both together.
 
     Raises ``ValueError`` for a resolution below 4, an empty box, or a grid over ``MAX_NODES`` nodes.
     """
-    return _extract(sample_coarse_to_fine, field, box, resolution, names, colors)
+    return _extract(sample_coarse_to_fine, field, box, resolution, names, colors, nested)
 
 
 def extract_dense(
@@ -97,9 +103,10 @@ def extract_dense(
     resolution: int,
     names: Sequence[str],
     colors: Sequence[Color],
+    nested: Nested = (),
 ) -> Extraction:
     """``extract`` with the field evaluated at every node: the reference, many times slower."""
-    return _extract(sample_dense, field, box, resolution, names, colors)
+    return _extract(sample_dense, field, box, resolution, names, colors, nested)
 
 
 def _extract(
@@ -109,15 +116,19 @@ def _extract(
     resolution: int,
     names: Sequence[str],
     colors: Sequence[Color],
+    nested: Nested,
 ) -> Extraction:
     origin, spacing, shape = _grid(box, resolution)
     sampled = sample(field, origin, spacing, shape)
     grid = LabelGrid(sampled.labels, origin, spacing, tuple(names))
-    segments = tuple(
-        _segment(sampled, grid, label, name, color)
-        for label, (name, color) in enumerate(zip(names, colors, strict=True), start=1)
-    )
-    return Extraction(SegmentedMesh(segments), grid, len(sampled.logits))
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    empty = SegmentedMesh(tuple(Segment(*named, *nothing) for named in zip(names, colors, strict=True)), nested)
+    surfaces = [
+        _surface(sampled, grid, [index + 1, *(inner + 1 for inner, outer in empty.nesting if outer == index)])
+        for index in range(len(names))
+    ]
+    found = (replace(s, vertices=v, faces=f) for s, (v, f) in zip(empty.segments, surfaces, strict=True))
+    return Extraction(replace(empty, segments=tuple(found)), grid, len(sampled.logits))
 
 
 def _grid(
@@ -158,19 +169,24 @@ def locate(field: Field, box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 
 
 
 def extract_whole(
-    field: Field, box: Float[np.ndarray, "2 3"], resolution: int, names: Sequence[str], colors: Sequence[Color]
+    field: Field,
+    box: Float[np.ndarray, "2 3"],
+    resolution: int,
+    names: Sequence[str],
+    colors: Sequence[Color],
+    nested: Nested = (),
 ) -> Extraction:
     """``extract`` in a box that grows, at most ``GROWTHS`` times, where a segment touches it.
 
     Raises ``ValueError`` where the field knows only empty space.
     """
-    found = extract(field, box, resolution, names, colors)
+    found = extract(field, box, resolution, names, colors, nested)
     for _ in range(GROWTHS):
         touched = found.grid.touched_sides()
         if not touched.any():
             break
         box = _grown(box, touched, 0.1)
-        found = extract(field, box, resolution, names, colors)
+        found = extract(field, box, resolution, names, colors, nested)
     _check_found(found.grid)
     return found
 
@@ -188,39 +204,42 @@ def _grown(box: Float[np.ndarray, "2 3"], sides: Bool[np.ndarray, "2 3"], fracti
     return box + step * sides * np.array([[-1.0], [1.0]])
 
 
-def _segment(sampled: Sampled, grid: LabelGrid, label: int, name: str, color: Color) -> Segment:
-    """The closed surface of one label; without faces where it does not occur."""
-    occupied = np.argwhere(sampled.labels == label)
-    if len(occupied) == 0:
-        return Segment(name, color, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+def _surface(
+    sampled: Sampled, grid: LabelGrid, held: list[int]
+) -> tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]:
+    """Vertices and faces around ``held``, a label and those nested in it; none where the first does not occur."""
+    if not (sampled.labels == held[0]).any():
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    occupied = np.argwhere(np.isin(sampled.labels, held))
     low = np.maximum(occupied.min(axis=0) - 1, 0)
     part = tuple(slice(a, b) for a, b in zip(low, occupied.max(axis=0) + 2, strict=True))
-    margin = np.pad(_margin(sampled.labels[part], sampled.rows[part], sampled.logits, label), 1, mode="edge")
+    margin = np.pad(_margin(sampled.labels[part], sampled.rows[part], sampled.logits, held), 1, mode="edge")
     # one empty layer around, as far below zero as its neighbour is above: the surface closes half a voxel outside
     core = (slice(1, -1),) * 3
     closed = -np.abs(margin)
     closed[core] = margin[core]
     vertices, faces, _, _ = marching_cubes(closed, 0.0, gradient_direction="ascent")
     positions = grid.origin + (vertices.astype(np.float64) - 1 + low) * grid.spacing
-    return Segment(name, color, positions, faces.astype(np.int64))
+    return positions, faces.astype(np.int64)
 
 
 def _margin(
     labels: UInt8[np.ndarray, "x y z"],
     rows: Int[np.ndarray, "x y z"],
     logits: Float[np.ndarray, "m c"],
-    label: int,
+    held: list[int],
 ) -> Float[np.ndarray, "x y z"]:
-    """``logit - max of the others``, its sign that of the label; where nothing was evaluated only the sign counts.
+    """Largest logit of ``held`` less that of the others, its sign by the label; where nothing was evaluated only the
+    sign counts.
 
     A tie would put a vertex on a node, and marching cubes would make faces without area there; so ties are moved by a
     millionth.
     """
     known = rows >= 0
     values = logits[rows[known]].astype(np.float64)
-    own = values[:, label].copy()
-    values[:, label] = -np.inf
-    margin = np.where(labels == label, 1.0, -1.0)
+    own = values[:, held].max(axis=1)
+    values[:, held] = -np.inf
+    margin = np.where(np.isin(labels, held), 1.0, -1.0)
     sign = margin[known]
     least = 1e-6 * np.abs(own).max(initial=1e-6)
     margin[known] = sign * np.maximum(sign * (own - values.max(axis=1)), least)

@@ -20,7 +20,7 @@ class FoundSegment:
 
     Attributes:
         name, label: of the segment.
-        volume: inside its surface; 0 where it was not found.
+        volume: inside its surface, less what is nested in it; 0 where it was not found.
         centroid: mean of its voxels, NaN where it was not found.
         box: lower and upper corner of its surface, NaN where it was not found.
         confidence: mean probability that the model gives it over its voxels, NaN where it was not found.
@@ -40,13 +40,16 @@ class FoundSegment:
 
 def measure(found: Extraction, model: Model, code: EncodedCloud) -> tuple[FoundSegment, ...]:
     """Every segment in numbers."""
+    owned = zip(found.surfaces.segments, found.surfaces.owned_volumes, strict=True)
     return tuple(
-        _measure(found.grid, label, segment, model, code)
-        for label, segment in enumerate(found.surfaces.segments, start=1)
+        _measure(found.grid, label, segment, float(volume), model, code)
+        for label, (segment, volume) in enumerate(owned, start=1)
     )
 
 
-def _measure(grid: LabelGrid, label: int, segment: Segment, model: Model, code: EncodedCloud) -> FoundSegment:
+def _measure(
+    grid: LabelGrid, label: int, segment: Segment, volume: float, model: Model, code: EncodedCloud
+) -> FoundSegment:
     voxels = np.argwhere(grid.labels == label)
     if len(voxels) == 0:
         nothing = np.full((2, 3), np.nan)
@@ -60,7 +63,7 @@ def _measure(grid: LabelGrid, label: int, segment: Segment, model: Model, code: 
     return FoundSegment(
         name=segment.name,
         label=label,
-        volume=segment.volume,
+        volume=volume,
         centroid=grid.positions(voxels).mean(axis=0),
         box=segment.bounds,
         confidence=float(probability.mean()),

@@ -127,10 +127,16 @@ class SegmentedMesh:
         return tuple(sorted(pairs))
 
     @property
+    def opaque(self) -> tuple[bool, ...]:
+        """For each segment whether to draw it opaque: it hides no segment that has faces."""
+        hiding = {outer for inner, outer in self.nesting if len(self.segments[inner].faces)}
+        return tuple(index not in hiding for index in range(len(self.segments)))
+
+    @property
     def owned_volumes(self) -> Float[np.ndarray, " s"]:
         """The volume that belongs to each segment: its mesh's without that of the segments nested in it."""
         volumes = np.array([segment.volume for segment in self.segments])
-        for outer in range(len(volumes)):  # the inner ones come first and are done
+        for outer in (i for i, s in enumerate(self.segments) if len(s.faces)):  # the inner ones come first and are done
             volumes[outer] -= sum(volumes[inner] for inner, other in self.nesting if other == outer)
         return volumes
 

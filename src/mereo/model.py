@@ -127,6 +127,7 @@ class Model:
         loss: the terms it was trained with; "l1" alone knows inside from outside but no segments.
         domain: normalized box outside which everything is answered as empty: nothing was ever there in training, and
             a network may say anything where it was never corrected. None means no limit.
+        nested: pairs of names (inner, outer), see ``SegmentedMesh``.
     """
 
     network: Network
@@ -135,6 +136,7 @@ class Model:
     loss: str = "ce+l1"
     provenance: dict[str, object] = field(default_factory=dict)
     domain: Box | None = None
+    nested: tuple[tuple[str, str], ...] = ()
 
     @property
     def device(self) -> torch.device:

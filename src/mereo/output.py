@@ -22,6 +22,9 @@ from mereo.camera import Camera
 from mereo.mesh import Segment, SegmentedMesh
 from mereo.mesh_files import VIEWER_ROOT
 
+OUTER_OPACITY = 0.35
+"""Of segments with others nested in them, which viewers draw see-through."""
+
 GLTF_CAMERA_ROTATION = np.diag([1.0, -1.0, -1.0])
 """Half a turn about x: from the camera frame (y down, z forward) to glTF (y up, z toward the viewer)."""
 
@@ -198,7 +201,8 @@ def write_segments_glb(
 ) -> None:
     """One named, coloured, double-sided node per segment, below one root node that turns the frame for viewers.
 
-    Vertices stay as they are (rounded to float32, all that glTF holds). Segments without faces are left out.
+    Vertices stay as they are (rounded to float32, all that glTF holds). Segments without faces are left out; those
+    around a nested segment that was found are translucent.
 
     Args:
         path: the .glb file.
@@ -208,7 +212,7 @@ def write_segments_glb(
     """
     solid = [(label, segment) for label, segment in enumerate(surfaces.segments, start=1) if len(segment.faces)]
     chunks: list[bytes] = []
-    document = _gltf_skeleton(solid, np.asarray(frame_rotation) * unit_m)
+    document = _gltf_skeleton(solid, surfaces.opaque, np.asarray(frame_rotation) * unit_m)
     for _, segment in solid:
         _add_array(document, chunks, segment.vertices.astype("<f4"), "VEC3", 34962)
         _add_array(document, chunks, segment.faces.astype("<u4").reshape(-1, 1), "SCALAR", 34963)
@@ -224,7 +228,9 @@ def write_segments_glb(
         file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
 
 
-def _gltf_skeleton(solid: list[tuple[int, Segment]], linear: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
+def _gltf_skeleton(
+    solid: list[tuple[int, Segment]], opaque: tuple[bool, ...], linear: Float[np.ndarray, "3 3"]
+) -> dict[str, Any]:
     matrix = np.eye(4)
     matrix[:3, :3] = linear
     children = list(range(1, len(solid) + 1))
@@ -236,7 +242,7 @@ def _gltf_skeleton(solid: list[tuple[int, Segment]], linear: Float[np.ndarray, "
         "nodes": [{"name": VIEWER_ROOT, "matrix": matrix.T.ravel().tolist(), "children": children}]
         + [{"name": segment.name, "mesh": index} for index, (_, segment) in enumerate(solid)],
         "meshes": [_gltf_mesh(index, label, segment) for index, (label, segment) in enumerate(solid)],
-        "materials": [_gltf_material(segment) for _, segment in solid],
+        "materials": [_gltf_material(segment, opaque[label - 1]) for label, segment in solid],
         "accessors": [],
         "bufferViews": [],
     }
@@ -248,12 +254,14 @@ def _gltf_mesh(index: int, label: int, segment: Segment) -> dict[str, Any]:
     return {"name": segment.name, "primitives": [primitive], "extras": {"label": label, "color": list(segment.color)}}
 
 
-def _gltf_material(segment: Segment) -> dict[str, Any]:
+def _gltf_material(segment: Segment, opaque: bool) -> dict[str, Any]:
     """glTF colour factors are linear light, ours are sRGB (glTF 2.0, section 3.9.2)."""
     srgb = np.asarray(segment.color) / 255.0
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    surface = {"baseColorFactor": [*linear.round(6).tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7}
-    return {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
+    color = [*linear.round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
+    surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
+    material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
+    return material if opaque else {**material, "alphaMode": "BLEND"}
 
 
 def _add_array(document: dict[str, Any], chunks: list[bytes], array: np.ndarray, kind: str, target: int) -> None:

@@ -72,8 +72,9 @@ def render_cloud_and_segments(
 
 
 def _with_faces(surfaces: SegmentedMesh) -> SegmentedMesh:
-    kept = tuple(segment for segment in surfaces.segments if len(segment.faces))
-    return SegmentedMesh(kept or surfaces.segments[:1])
+    kept = tuple(segment for segment in surfaces.segments if len(segment.faces)) or surfaces.segments[:1]
+    names = [segment.name for segment in kept]
+    return SegmentedMesh(kept, tuple(pair for pair in surfaces.nested if set(pair) <= set(names)))
 
 
 def _joint_bounds(*clouds: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "2 3"]:

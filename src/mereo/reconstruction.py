@@ -45,7 +45,8 @@ class Reconstruction:
     """An object with all its segments, in the input's frame and units.
 
     Attributes:
-        surfaces: every segment of the model as a closed mesh; without faces where it was not found.
+        surfaces: every segment of the model as a closed mesh; without faces where it was not found. Which lie inside
+            another is declared as in the model's scene.
         labels: the label grid.
         segments: each segment in numbers, in the same order.
         timings_s: seconds of each stage.
@@ -85,7 +86,7 @@ def reconstruct(
     with _timed(timings, "locate"):
         box = locate(field, code.normalizer.invert(SEARCH_BOX))
     with _timed(timings, "extract"):
-        found = extract_whole(field, box, resolution, names, colors)
+        found = extract_whole(field, box, resolution, names, colors, model.nested if "ce" in model.loss else ())
     with _timed(timings, "measure"):
         segments = measure(found, model, code)
     clipped = bool(found.grid.touched_sides().any())
@@ -148,6 +149,7 @@ def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:
     ]
     return {
         **facts,
+        "nested": [list(pair) for pair in result.surfaces.nested],
         "spacing": float(result.labels.spacing[0]),
         "evaluated_points": result.evaluated,
         "clipped": result.clipped,

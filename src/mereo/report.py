@@ -17,7 +17,7 @@ from jaxtyping import Float, Int, UInt16
 
 from mereo.camera import PointCloud
 from mereo.mesh import Segment, SegmentedMesh
-from mereo.output import GLTF_CAMERA_ROTATION, atomic_file
+from mereo.output import GLTF_CAMERA_ROTATION, OUTER_OPACITY, atomic_file
 
 BUDGET_BYTES = 5_000_000
 CLOUD_POINTS = 60_000
@@ -38,7 +38,8 @@ def write_report(
     Args:
         path: the .html file.
         cloud: the input, in its frame and units; at most ``CLOUD_POINTS`` of it are shown.
-        surfaces: the segments in the same frame; those without faces are listed but not drawn.
+        surfaces: the segments in the same frame; those without faces are listed but not drawn, those
+            around a nested one are drawn see-through.
         summary: what the page says in words; every key may be missing. ``title`` and ``unit`` are text; ``segments`` is
             a list of ``{"name", "centroid" [3], "volume", "confidence" in 0..1}`` in the order of ``surfaces``;
             ``timings_s`` maps stages to seconds; other texts and numbers are listed as facts.
@@ -76,11 +77,12 @@ def _page_data(
             {
                 "name": full.name,
                 "color": list(full.color),
+                "opacity": 1.0 if opaque else OUTER_OPACITY,
                 "faces": len(full.faces),
                 "positions": _base64(_quantize(part.vertices, low, high)),
                 "indices": _base64(part.faces.astype("<u4")),
             }
-            for full, part in zip(surfaces.segments, shown, strict=True)
+            for full, part, opaque in zip(surfaces.segments, shown, surfaces.opaque, strict=True)
         ],
         "coarsened": any(len(a.faces) != len(b.faces) for a, b in zip(surfaces.segments, shown, strict=True)),
         "summary": _readable(summary),

@@ -273,6 +273,7 @@ class Trainer:
             loss=self.config.loss,
             provenance=provenance,
             domain=self.data.domain(),
+            nested=tuple((inner, outer) for inner, outer in manifest.get("nested", ())),
         )
 
     def resume(self) -> bool:

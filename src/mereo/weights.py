@@ -25,6 +25,7 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
         "loss": model.loss,
         "normalizer": "center and half of the longest side of the observed cloud's box",
         "domain": model.domain,
+        "nested": model.nested,
         "provenance": model.provenance,
     }
     tensors = {
@@ -85,4 +86,5 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
         loss=header["loss"],
         provenance=header["provenance"],
         domain=None if header["domain"] is None else (tuple(header["domain"][0]), tuple(header["domain"][1])),
+        nested=tuple((inner, outer) for inner, outer in header.get("nested", ())),  # older weights have none
     )

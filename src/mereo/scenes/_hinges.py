@@ -15,7 +15,7 @@ from manifold3d import CrossSection, Manifold
 from scipy.spatial.transform import Rotation
 
 from mereo.deformation import Rigid, turn
-from mereo.scenes._solids import Vector, turned
+from mereo.scenes._solids import Vector, revolved
 
 FAR = 300.0
 """Longer than any object, for prisms that stand for a sector of space."""
@@ -68,7 +68,7 @@ class Knuckle:
         end = max(end, 0.3 * self.radius + more)
         height = (middle - end) / CONE_SLOPE
         profile = [(0.0, -FAR), (end, -FAR), (end, -height), (middle, 0.0), (end, height), (end, FAR), (0.0, FAR)]
-        return turned(np.array(profile), 14).translate(self.pivot)
+        return revolved(np.array(profile), 14).translate(self.pivot)
 
     def share(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """1 in the knob's link, 0 in the socket's, and between them linear across the air."""

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import igl
 import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
 
 from mereo import assets
-from mereo.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.mesh import PALETTE, SegmentedMesh
+from mereo.scenes._real_meshes import simplified
+from mereo.scenes._solids import Vector, mesh_of, segment_of, solid_of
 
 SCALE = 4.0
 """Scene units per decimetre: the body is 17 units deep, 40 wide and 67 tall."""
@@ -32,8 +33,6 @@ MOUTH = ((-0.37, 6.23, 0.5), (0.37, 7.0, 1.44))
 
 EYE, EYE_RADIUS = (0.308, 7.284, 1.245), 0.146
 """The left eyeball, which is not in the group `body` (centre and size of MakeHuman's `helper-l-eye`)."""
-
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -140,13 +139,18 @@ def rest_mesh() -> SegmentedMesh:
         limbs[f"shin_{side}"], limbs[f"thigh_{side}"] = lower.split(shin.solid())
     order = [f"{part}_{side}" for part in ("upper_arm", "forearm", "thigh", "shin") for side in ("left", "right")]
     parts = {"torso": torso, "head": head, **{name: limbs[name] for name in order}}
-    return SegmentedMesh(tuple(_segment(name, part, PALETTE[i]) for i, (name, part) in enumerate(parts.items())))
+    return SegmentedMesh(
+        tuple(
+            segment_of(name, PALETTE[i], part.refine_to_length(LONGEST_EDGE))
+            for i, (name, part) in enumerate(parts.items())
+        )
+    )
 
 
 def _body() -> manifold3d.Manifold:
     """The whole body, mouth filled and eyes put in, simplified by quadric edge collapses (Garland & Heckbert 1997)."""
     mesh = base()
-    solid = _manifold(mesh.vertices[: mesh.faces.max() + 1], mesh.faces)
+    solid = solid_of(mesh.vertices[: mesh.faces.max() + 1], mesh.faces)
     low, high = np.array(MOUTH)
     mouth = mesh.vertices[np.unique(mesh.faces)]
     mouth = mouth[((mouth > low) & (mouth < high)).all(axis=1)]
@@ -154,20 +158,5 @@ def _body() -> manifold3d.Manifold:
     for side in (1.0, -1.0):
         solid += manifold3d.Manifold.sphere(EYE_RADIUS, 24).translate((side * EYE[0], EYE[1], EYE[2]))
     outer = max(solid.decompose(), key=lambda part: part.volume())  # the others are voids behind the lips
-    vertices, faces = _arrays(outer)
-    collapsed = igl.qslim(to_scene(vertices), faces, FACES)
-    # libigl's faces are C's long long, which numpy tells apart
-    return _manifold(collapsed[0], collapsed[1].astype(np.int64))
-
-
-def _manifold(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> manifold3d.Manifold:
-    return manifold3d.Manifold(manifold3d.Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
-
-
-def _arrays(solid: manifold3d.Manifold) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    mesh = solid.to_mesh()
-    return np.array(mesh.vert_properties[:, :3], dtype=np.float64), np.array(mesh.tri_verts, dtype=np.int64)
-
-
-def _segment(name: str, part: manifold3d.Manifold, color: tuple[int, int, int]) -> Segment:
-    return Segment(name, color, *_arrays(part.refine_to_length(LONGEST_EDGE)))
+    vertices, faces = mesh_of(outer)
+    return simplified(solid_of(to_scene(vertices), faces), FACES, block_intersections=True)

@@ -16,16 +16,8 @@ from mereo.deformation import Compose, Deformation, Localized, Rigid
 from mereo.mesh import PALETTE, Segment
 from mereo.mesh_files import read_segmented_mesh
 from mereo.scene import Workspace
-from mereo.scenes._real_meshes import (
-    Faces,
-    Vertices,
-    close_hole,
-    largest_piece,
-    main_part,
-    segment_of,
-    simplified,
-    solid_of,
-)
+from mereo.scenes._real_meshes import close_hole, largest_piece, main_part, simplified
+from mereo.scenes._solids import Faces, Vertices, segment_of, solid_of
 from mereo.warps import Bend, FreeFormLattice, Squash, Twist
 
 SHORTEST_SIDE = 20.0
@@ -101,8 +93,8 @@ GRASPER = Instrument((10.0, 32.0), tip_mm=14.0, reach_mm=94.0)
 RETRACTOR = Instrument((5.0, 16.0), tip_mm=14.0, reach_mm=80.0)
 PROBE = Instrument((-16.0, -5.0), tip_mm=8.0, reach_mm=70.0)
 
-BEND_RAD, TWIST_RAD, SQUASH = 0.42, 0.35, 0.08
-LATTICE_CELLS, LATTICE_STRENGTH = (3, 3, 3), 0.25
+BEND_RAD, TWIST_RAD, SQUASH = 0.6, 0.6, 0.12
+LATTICE_CELLS, LATTICE_STRENGTH = (3, 3, 3), 0.4
 
 EDGE_SHARE = 0.12
 """A grasper holds the liver by the sharpest part of its vertices."""

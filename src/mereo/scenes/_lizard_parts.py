@@ -116,14 +116,14 @@ def _limb(plan: LegPlan, root: tuple[float, float], knee: tuple[float, float], a
             x, y, z = (1 - share) * np.array(start) + share * np.array(end)
             along = np.subtract(end, start)[:2] / np.linalg.norm(np.subtract(end, start)[:2])
             parts.append(_spike((x, y, z + 0.7 * radius), 0.55, (0.35 * along[0], 0.35 * along[1], 0.75)))
-    return _on_the_ground(union(parts))
+    return _on_the_ground(union(*parts))
 
 
 def _foot(plan: LegPlan, ankle: tuple[float, float]) -> Manifold:
     """A palm and five toes in a fan, each with one joint and a claw."""
     heading = np.array([np.cos(plan.foot_rad), np.sin(plan.foot_rad)])
     palm_x, palm_y = np.array(ankle) + 1.7 * heading
-    palm = hull((ball((*ankle, 1.0), 1.25), ball((palm_x, palm_y, 0.9), 1.35)))
+    palm = hull(ball((*ankle, 1.0), 1.25), ball((palm_x, palm_y, 0.9), 1.35))
     parts = [palm]
     for number, length in enumerate(plan.toes):
         angle_rad = plan.foot_rad + np.deg2rad(-56.0 + 28.0 * number)
@@ -132,9 +132,9 @@ def _foot(plan: LegPlan, ankle: tuple[float, float]) -> Manifold:
         claw = (palm_x + (1.6 + length) * x, palm_y + (1.6 + length) * y, 0.15)
         parts += [
             rod((palm_x, palm_y, 0.75), joint, 0.7, 0.62, 8),
-            hull((ball(joint, 0.62, 8), ball(claw, 0.18, 4))),
+            hull(ball(joint, 0.62, 8), ball(claw, 0.18, 4)),
         ]
-    return _on_the_ground(union(parts))
+    return _on_the_ground(union(*parts))
 
 
 def _on_the_ground(part: Manifold) -> Manifold:
@@ -204,13 +204,13 @@ def _head() -> Manifold:
         return (NOSE - station, y, z)
 
     jaw = hull(
-        [ball(at(1.6, y, 1.2), 1.2, 8) for y in (-0.9, 0.9)] + [ball(at(8.2, y, 1.6), 1.6, 8) for y in (-2.9, 2.9)]
+        *(ball(at(1.6, y, 1.2), 1.2, 8) for y in (-0.9, 0.9)), *(ball(at(8.2, y, 1.6), 1.6, 8) for y in (-2.9, 2.9))
     )
     skull = hull(
-        [ball(at(1.5, y, 2.3), 1.0, 8) for y in (-0.8, 0.8)]
-        + [ball(at(5.6, y, 4.0), 1.3, 8) for y in (-1.7, 1.7)]
-        + [ball(at(8.6, y, 3.4), 1.8, 8) for y in (-2.6, 2.6)]
-        + [ball(at(11.0, 0.0, 3.0), 1.9, 8)]
+        *(ball(at(1.5, y, 2.3), 1.0, 8) for y in (-0.8, 0.8)),
+        *(ball(at(5.6, y, 4.0), 1.3, 8) for y in (-1.7, 1.7)),
+        *(ball(at(8.6, y, 3.4), 1.8, 8) for y in (-2.6, 2.6)),
+        ball(at(11.0, 0.0, 3.0), 1.9, 8),
     )
     parts, holes = [jaw, skull], []
     for side in (-1.0, 1.0):
@@ -221,23 +221,24 @@ def _head() -> Manifold:
         for station, y in ((9.9, 1.4), (9.6, 2.8), (8.9, 4.0)):
             parts.append(_spike(at(station, y * side, 5.4 - 0.45 * y), 0.6, (-1.3, 0.45 * side * y, 0.7)))
     lips = hull(
-        [ball(at(-0.5, y, 1.95), 0.22, 4) for y in (-4.0, 4.0)] + [ball(at(6.6, y, 2.15), 0.22, 4) for y in (-6.0, 6.0)]
+        *(ball(at(-0.5, y, 1.95), 0.22, 4) for y in (-4.0, 4.0)),
+        *(ball(at(6.6, y, 2.15), 0.22, 4) for y in (-6.0, 6.0)),
     )
     inner = hull(
-        [ball(at(1.5, y, 1.95), 0.9, 8) for y in (-0.4, 0.4)] + [ball(at(7.0, y, 2.1), 0.9, 8) for y in (-2.6, 2.6)]
+        *(ball(at(1.5, y, 1.95), 0.9, 8) for y in (-0.4, 0.4)), *(ball(at(7.0, y, 2.1), 0.9, 8) for y in (-2.6, 2.6))
     )
-    return union(parts) - (lips - inner) - union(holes)
+    return union(*parts) - (lips - inner) - union(*holes)
 
 
 @cache
 def spine_links() -> tuple[Manifold, ...]:
     """Head, five of the trunk and seven of the tail: one solid for each link, with air between."""
-    body = _on_the_ground(union([_trunk_and_tail(), _head(), *_scales()]))
+    body = _on_the_ground(union(_trunk_and_tail(), _head(), *_scales()))
     carried = {SHOULDER_LINK: FRONT_LEG, HIP_LINK: REAR_LEG}
     links = []
     for number in range(len(SPINE) + 1):
         roots = [leg(carried[number], side).root for side in (1, -1)] if number in carried else []
-        link = union([body, *(_boss(root) for root in roots)])
+        link = union(body, *(_boss(root) for root in roots))
         if number > 0:
             link ^= SPINE[number - 1].knob_side()
         if number < len(SPINE):

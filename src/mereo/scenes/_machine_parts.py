@@ -10,14 +10,26 @@ from typing import Literal
 import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
 
-from mereo.mesh import Color, Segment
+from mereo.scenes._solids import Vector, hull, segment, union
+
+__all__ = [
+    "Vector",
+    "along",
+    "bolts",
+    "box",
+    "hull",
+    "plate",
+    "ring_of",
+    "segment",
+    "shaft",
+    "toothed",
+    "turned",
+    "union",
+    "without",
+]
 
 Axis = Literal["x", "y", "z"]
-Vector = tuple[float, float, float]
 Outline = Sequence[tuple[float, float]]
-
-SIMPLIFY = 1e-3
-"""Detail below this is dropped from finished parts; it is far below the camera's noise and spares slivers."""
 
 
 def along(axis: Axis, part: Manifold) -> Manifold:
@@ -98,25 +110,6 @@ def toothed(axis: Axis, start: Vector, length: float, radius: float, teeth: int,
     return along(axis, part).translate(start)
 
 
-def union(*parts: Manifold) -> Manifold:
-    return Manifold.batch_boolean(list(parts), OpType.Add)
-
-
 def without(part: Manifold, *cuts: Manifold) -> Manifold:
     """``part`` minus all ``cuts``."""
     return Manifold.batch_boolean([part, *cuts], OpType.Subtract)
-
-
-def hull(*parts: Manifold) -> Manifold:
-    return Manifold.batch_hull(list(parts))
-
-
-def segment(name: str, color: Color, part: Manifold, longest_edge: float = np.inf) -> Segment:
-    """The finished part as a segment, with no more triangles than its shape needs.
-
-    A bounded ``longest_edge`` helps large parts: long slivers have large boxes, which slow down searches among them.
-    """
-    part = part.as_original().simplify(SIMPLIFY)
-    mesh = (part if longest_edge == np.inf else part.refine_to_length(longest_edge)).to_mesh64()
-    vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
-    return Segment(name, color, vertices, np.array(mesh.tri_verts, dtype=np.int64))

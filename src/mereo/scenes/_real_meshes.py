@@ -1,4 +1,4 @@
-"""Real meshes made fit for scenes: largest piece, closed holes, fewer faces, and to and from manifold3d's solids.
+"""Real meshes made fit for scenes: largest piece, closed holes, fewer faces.
 
 All of it is deterministic, and none of it moves what is there: pieces are dropped, holes filled, flat edges collapsed.
 """
@@ -6,14 +6,10 @@ All of it is deterministic, and none of it moves what is there: pieces are dropp
 import igl
 import manifold3d
 import numpy as np
-from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mereo.mesh import Color, Segment
-
-Vertices = Float[np.ndarray, "_ 3"]
-Faces = Int[np.ndarray, "_ 3"]
+from mereo.scenes._solids import Faces, Vertices, mesh_of, solid_of
 
 
 def largest_piece(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
@@ -40,34 +36,19 @@ def close_hole(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     return np.concatenate([vertices, vertices[loop[:, :1]].mean(axis=0)]), np.concatenate([faces, fan])
 
 
-def solid_of(vertices: Vertices, faces: Faces) -> manifold3d.Manifold:
-    """A closed mesh as a solid; raises ``ValueError`` where manifold3d does not accept it."""
-    mesh = manifold3d.Mesh64(
-        np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.uint64)
-    )
-    solid = manifold3d.Manifold(mesh)
-    if solid.status() != manifold3d.Error.NoError:
-        raise ValueError(f"a mesh of {len(faces)} faces is no solid ({solid.status().name}); it must be closed")
-    return solid
-
-
-def mesh_of(solid: manifold3d.Manifold) -> tuple[Vertices, Faces]:
-    """Vertices and faces of a solid."""
-    mesh = solid.to_mesh64()
-    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64)
-
-
-def segment_of(name: str, color: Color, solid: manifold3d.Manifold) -> Segment:
-    return Segment(name, color, *mesh_of(solid))
-
-
 def main_part(solid: manifold3d.Manifold) -> manifold3d.Manifold:
     """The largest of a solid's parts: Booleans of meshes that nearly touch leave flecks."""
     return max(solid.decompose(), key=lambda part: part.volume())
 
 
-def simplified(solid: manifold3d.Manifold, faces: int) -> manifold3d.Manifold:
-    """The solid with at most ``faces`` faces: edges collapse, flattest first (Garland & Heckbert, SIGGRAPH 1997)."""
+def simplified(solid: manifold3d.Manifold, faces: int, block_intersections: bool = False) -> manifold3d.Manifold:
+    """The solid with at most ``faces`` faces: edges collapse, flattest first (Garland & Heckbert, SIGGRAPH 1997).
+
+    Where the surface folds closely upon itself (lips, eyelids), ``block_intersections`` keeps it from passing through
+    itself; that takes twice as long.
+    """
     vertices, indices = mesh_of(solid)
-    fewer = igl.qslim(np.asfortranarray(vertices), np.asfortranarray(indices.astype(np.int32)), faces, False)
+    fewer = igl.qslim(
+        np.asfortranarray(vertices), np.asfortranarray(indices.astype(np.int32)), faces, block_intersections
+    )
     return solid_of(fewer[0], fewer[1].astype(np.int64))  # C's long long, which numpy tells apart

@@ -8,7 +8,8 @@ that turn upon each other are 0.2 apart.
 import numpy as np
 from manifold3d import Manifold
 
-from mereo.scenes._machine_parts import Vector, bolts, box, hull, plate, ring_of, shaft, turned, union, without
+from mereo.scenes._machine_parts import bolts, box, plate, ring_of, shaft, turned, without
+from mereo.scenes._solids import Vector, hull, union
 
 SHOULDER: Vector = (3.5, 0.0, 19.0)
 """A point of the second axis, which is along y."""

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from manifold3d import CrossSection, Manifold
 
-from mereo.scenes._solids import ball, turned
+from mereo.scenes._solids import ball, revolved
 
 POST_RADIUS, POST_HEIGHT = 2.5, 15.5
 RING_RADIUS, RING_TUBE = 4.6, 1.3
@@ -41,7 +41,7 @@ def ring() -> Manifold:
     """A torus about z at z = 0, with a bump like the stone of a finger ring at +x."""
     angle = 2 * np.pi * np.arange(14) / 14
     profile = np.stack([RING_RADIUS + RING_TUBE * np.cos(angle), RING_TUBE * np.sin(angle)], axis=1)
-    return turned(profile, 32) + ball((RING_RADIUS + 0.25, 0.0, 0.0), 1.65, 16)
+    return revolved(profile, 32) + ball((RING_RADIUS + 0.25, 0.0, 0.0), 1.65, 16)
 
 
 def cone() -> Manifold:
@@ -51,7 +51,7 @@ def cone() -> Manifold:
     )
     notch = Manifold.cube((2.0, 1.2, 4.0), True)
     notches = notch.translate((CONE_RADIUS, 0.0, 0.0)) + notch.translate((CONE_RADIUS, 0.0, 0.0)).rotate((0, 0, 110))
-    return turned(profile, 24) - notches
+    return revolved(profile, 24) - notches
 
 
 def box() -> Manifold:

@@ -1,25 +1,58 @@
-"""Small helpers between manifold3d's solids and the package's segments. Lengths are in scene units."""
+"""What all scenes need of manifold3d: solids joined, and made into segments. Lengths are in scene units."""
 
-from collections.abc import Iterable
-
+import manifold3d
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from manifold3d import CrossSection, Manifold, OpType
 
 from mereo.mesh import Color, Segment
 
 Vector = tuple[float, float, float]
+Vertices = Float[np.ndarray, "_ 3"]
+Faces = Int[np.ndarray, "_ 3"]
 
 SIMPLIFY = 1e-3
 """Detail below this is dropped from finished parts; it is far below the camera's noise and spares slivers."""
 
 
-def union(parts: Iterable[Manifold]) -> Manifold:
+def solid_of(vertices: Vertices, faces: Faces) -> Manifold:
+    """A closed mesh as a solid; raises ``ValueError`` where manifold3d does not accept it."""
+    mesh = manifold3d.Mesh64(
+        np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.uint64)
+    )
+    solid = Manifold(mesh)
+    if solid.status() != manifold3d.Error.NoError:
+        raise ValueError(f"a mesh of {len(faces)} faces is no solid ({solid.status().name}); it must be closed")
+    return solid
+
+
+def mesh_of(solid: Manifold) -> tuple[Vertices, Faces]:
+    """Vertices and faces of a solid."""
+    mesh = solid.to_mesh64()
+    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64)
+
+
+def segment_of(name: str, color: Color, solid: Manifold) -> Segment:
+    """A solid as it is."""
+    return Segment(name, color, *mesh_of(solid))
+
+
+def segment(name: str, color: Color, part: Manifold, longest_edge: float = np.inf) -> Segment:
+    """The finished part as a segment, with no more triangles than its shape needs.
+
+    Edges longer than ``longest_edge`` are split, so that flat faces can bend. It also helps large parts: long slivers
+    have large boxes, which slow down searches among them.
+    """
+    part = part.as_original().simplify(SIMPLIFY)
+    return segment_of(name, color, part if longest_edge == np.inf else part.refine_to_length(longest_edge))
+
+
+def union(*parts: Manifold) -> Manifold:
     """All parts as one solid."""
     return Manifold.batch_boolean(list(parts), OpType.Add)
 
 
-def hull(parts: Iterable[Manifold]) -> Manifold:
+def hull(*parts: Manifold) -> Manifold:
     """The convex hull around all parts."""
     return Manifold.batch_hull(list(parts))
 
@@ -31,19 +64,9 @@ def ball(center: Vector, radius: float, sides: int = 12) -> Manifold:
 
 def rod(start: Vector, end: Vector, start_radius: float, end_radius: float, sides: int = 12) -> Manifold:
     """A tapering limb with round ends."""
-    return hull((ball(start, start_radius, sides), ball(end, end_radius, sides)))
+    return hull(ball(start, start_radius, sides), ball(end, end_radius, sides))
 
 
-def turned(profile: Float[np.ndarray, "n 2"], sides: int) -> Manifold:
+def revolved(profile: Float[np.ndarray, "n 2"], sides: int) -> Manifold:
     """A lathe part about the z axis from rows (radius, height), counter-clockwise."""
     return Manifold.revolve(CrossSection([profile]), sides)
-
-
-def to_segment(name: str, color: Color, solid: Manifold, longest_edge: float | None = None) -> Segment:
-    """A finished part; edges longer than ``longest_edge`` are split, so that its flat faces can bend."""
-    solid = solid.simplify(SIMPLIFY)
-    if longest_edge is not None:
-        solid = solid.refine_to_length(longest_edge)
-    mesh = solid.to_mesh()
-    vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
-    return Segment(name, color, vertices, np.array(mesh.tri_verts, dtype=np.int64))

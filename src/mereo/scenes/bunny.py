@@ -20,14 +20,12 @@ from mereo import assets
 from mereo.deformation import Compose, Deformation, smooth_step, turn
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.scene import WHOLE_SPHERE_RAD, Scene, Workspace
+from mereo.scenes._solids import Vector
 from mereo.warps import SmoothField, Squash
 
 SHORTEST_SIDE = 20.0
 LONGEST_EDGE = 1.2
 """Longer edges are split, so that the flat faces of the cuts bend with the rest."""
-
-
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)

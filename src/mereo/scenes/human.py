@@ -45,13 +45,16 @@ from mereo.warps import SmoothField
 
 ATTEMPTS = 1000
 
-APART = 1.5
-"""Balls with at least this gap at rest are watched; closer ones touch or belong together."""
+APART = 3.2
+"""Balls with at least this gap at rest are watched; closer ones touch or belong together, as on both sides of a knee."""
 
 LEAST_GAP = 0.5
 """That watched balls must keep: what lies between them and the skin is at most half of this deep."""
 
 SMALLEST_BALL = 0.45
+BARE = 0.7
+"""Vertices farther than this from all balls, as of fingers, are balls without size."""
+
 CRITICAL = 200
 LEAST_DETERMINANT = 0.12
 
@@ -83,6 +86,9 @@ def balls() -> Balls:
             break
         if not (np.linalg.norm(centers - nodes[row], axis=1) < radii + 0.4).any():
             centers, radii = np.concatenate([centers, nodes[row : row + 1]]), np.append(radii, depth[row])
+    for vertex in np.concatenate([segment.vertices for segment in rest.segments]):
+        if (np.linalg.norm(centers - vertex, axis=1) - radii).min() > BARE:
+            centers, radii = np.concatenate([centers, vertex[None]]), np.append(radii, 0.0)
     touching = radii[:, None] + radii
     return Balls(centers, np.where(cdist(centers, centers) - touching > APART, touching + LEAST_GAP, -1.0))
 
@@ -131,6 +137,6 @@ def scene() -> Scene:
         name="human",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(48.0))),
+        workspace=Workspace(fov_rad=float(np.deg2rad(50.0))),
         source="MakeHuman base mesh, default skeleton and skin weights, MakeHuman community: CC0 1.0",
     )

@@ -41,7 +41,7 @@ from mereo.scenes._lizard_parts import (
     leg,
     spine_links,
 )
-from mereo.scenes._solids import to_segment, union
+from mereo.scenes._solids import segment, union
 
 SPINE_SEGMENTS = {"head": (0, 1), "body_front": (1, 4), "body_rear": (4, 6), "tail_base": (6, 10), "tail_tip": (10, 13)}
 """First link, and the one after the last."""
@@ -67,10 +67,10 @@ GAP = 0.2
 def rest_mesh() -> SegmentedMesh:
     """The straight lizard, symmetrical, its belly on z = 0."""
     links = spine_links()
-    parts = {name: union(links[first:last]) for name, (first, last) in SPINE_SEGMENTS.items()}
+    parts = {name: union(*links[first:last]) for name, (first, last) in SPINE_SEGMENTS.items()}
     for name, (plan, side, _) in LEGS.items():
-        parts[name] = union((leg(plan, side).upper, leg(plan, side).foot))
-    return SegmentedMesh(tuple(to_segment(name, PALETTE[i], part) for i, (name, part) in enumerate(parts.items())))
+        parts[name] = union(leg(plan, side).upper, leg(plan, side).foot)
+    return SegmentedMesh(tuple(segment(name, PALETTE[i], part) for i, (name, part) in enumerate(parts.items())))
 
 
 def sample_spine(rng: np.random.Generator) -> Float[np.ndarray, "h 3"]:
@@ -79,7 +79,7 @@ def sample_spine(rng: np.random.Generator) -> Float[np.ndarray, "h 3"]:
     along = np.arange(len(SPINE)) / (len(SPINE) - 1)
     waves = rng.normal(size=k.shape) / (1 + k) * np.cos(np.pi * k * along + rng.uniform(0, 2 * np.pi, size=k.shape))
     curve = waves.sum(axis=0)
-    yaw = SPINE_LIMIT_RAD * curve * rng.uniform(0.2, 1.0) / np.abs(curve).max()
+    yaw = SPINE_LIMIT_RAD * curve * rng.uniform(0.35, 1.0) / np.abs(curve).max()
     play = rng.uniform(-SPINE_PLAY_RAD, SPINE_PLAY_RAD, size=(len(SPINE), 2))
     return np.column_stack([play, yaw])
 
@@ -181,5 +181,5 @@ def scene() -> Scene:
         name="lizard",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(43.0))),
+        workspace=Workspace(fov_rad=float(np.deg2rad(46.0))),
     )

@@ -35,7 +35,7 @@ from mereo.deformation import Compose, Deformation, Identity, Rigid
 from mereo.mesh import PALETTE, SegmentedMesh
 from mereo.scene import Scene, Workspace
 from mereo.scenes import _robot_parts as parts
-from mereo.scenes._machine_parts import Vector, segment
+from mereo.scenes._solids import Vector, segment
 
 
 class Joint(NamedTuple):

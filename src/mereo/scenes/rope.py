@@ -148,5 +148,5 @@ def scene() -> Scene:
         name="rope",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(42.0))),
+        workspace=Workspace(fov_rad=float(np.deg2rad(45.0))),
     )

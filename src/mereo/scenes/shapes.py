@@ -29,7 +29,7 @@ from mereo.deformation import Compose, Deformation, Rigid
 from mereo.mesh import PALETTE, SegmentedMesh
 from mereo.scene import Scene, Workspace
 from mereo.scenes import _shapes_parts as solid
-from mereo.scenes._solids import to_segment
+from mereo.scenes._solids import segment
 from mereo.warps import Bend, SmoothField, Squash, Taper, Twist
 
 LONGEST_EDGE = 1.15
@@ -74,7 +74,7 @@ def rest_mesh() -> SegmentedMesh:
         "arch": _placed("arch", solid.arch()),
     }
     return SegmentedMesh(
-        tuple(to_segment(name, PALETTE[i], part, LONGEST_EDGE) for i, (name, part) in enumerate(parts.items()))
+        tuple(segment(name, PALETTE[i], part, LONGEST_EDGE) for i, (name, part) in enumerate(parts.items()))
     )
 
 

@@ -9,12 +9,14 @@ Degrees of freedom, in this order:
 - up to two corners, 9 to 17 units deep, bend by 35 to 180 degrees about lines within 26 degrees of the diagonals'
   normals, with a radius of 2.7 to 9 units; five of six bend upwards;
 - the sheet is swept along a plane curve in a random direction: gentle waves (curvature up to 0.05 per unit), and with
-  them nothing more, one fold of 60 to 190 degrees, two folds in opposite senses, or a roll of 180 to 450 degrees from
-  one edge. No curvature exceeds 0.42 per unit, so the Jacobian, 1 minus curvature times offset, stays above 0.3;
+  them nothing more (1 of 10 states), one fold of 60 to 190 degrees (3.5), two folds in opposite senses (2.5), or a roll
+  of 180 to 450 degrees from one edge (3). No curvature exceeds 0.42 per unit, so the Jacobian, 1 minus curvature times
+  offset, stays above 0.3;
 - a twist of up to 0.5 radians end to end, smooth waves of all space (gradient up to 0.18), a tilt of up to 0.3 radians.
 
-Bends and sweep keep lengths in the middle surface. A state whose layers would touch is drawn again, and so is one in
-which the sweep would press or stretch a corner that is already bent by more than 0.7, or two corners meet.
+Bends and sweep keep lengths in the middle surface. A state whose layers would touch is drawn again, of the same kind,
+and so is one in which the sweep would press or stretch a corner that is already bent by more than 0.7, or two corners
+meet. Six of seven states show some of the underside from above.
 
 What makes it hard: layers hide each other and their undersides look the same; turned by half a turn the mat is the
 same but for the tab and for holes that become studs.
@@ -36,6 +38,8 @@ NODES = np.linspace(-42.0, 42.0, 169)
 """Stations along the sweep's curve; the sheet reaches 34 units from its middle."""
 
 GENTLE = 0.05
+KINDS = ("waves", "fold", "two folds", "roll")
+KIND_SHARES = (0.1, 0.35, 0.25, 0.3)
 FOLD_CURVATURE = (0.16, 0.37)
 ROLL_PITCH = 3.9
 """Between the layers of a roll: their thickness, 2.5 at the hem, and air."""
@@ -66,12 +70,11 @@ def _fold(start: float, length: float) -> Float[np.ndarray, " m"]:
     return smooth_step((NODES - start) / ramp) * (1.0 - smooth_step((NODES - start - length + ramp) / ramp))
 
 
-def sample_profile(rng: np.random.Generator, low: float, high: float) -> Profile:
-    """Waves and, by chance, folds or a roll of a sheet that reaches from station ``low`` to ``high``."""
+def sample_profile(rng: np.random.Generator, kind: str, low: float, high: float) -> Profile:
+    """Waves and, by ``kind``, folds or a roll of a sheet that reaches from station ``low`` to ``high``."""
     wavelengths, phases = rng.uniform(22.0, 60.0, size=(3, 1)), rng.uniform(0, 2 * np.pi, size=(3, 1))
     waves = rng.uniform(-1, 1, size=(3, 1)) * np.sin(2 * np.pi * NODES / wavelengths + phases)
     curvature = GENTLE / 3 * waves.sum(axis=0)
-    kind = rng.choice(["waves", "fold", "two folds", "roll"], p=[0.2, 0.35, 0.2, 0.25])
     bent: list[tuple[float, float]] = []  # from station to station
     if kind == "roll":
         angle, radius = np.deg2rad(rng.uniform(180.0, 450.0)), rng.uniform(2.7, 3.6)
@@ -144,13 +147,13 @@ def _do_not_meet(corners: list[Bend]) -> bool:
     return True
 
 
-def sample_deformation(rng: np.random.Generator) -> Deformation | None:
-    """One state's map, or None where it is not to be used."""
+def sample_deformation(rng: np.random.Generator, kind: str) -> Deformation | None:
+    """One state's map, its profile of one of ``KINDS``, or None where it is not to be used."""
     corners = [sample_corner(rng, int(k)) for k in rng.permutation(4)[: rng.choice(3, p=[0.4, 0.4, 0.2])]]
     heading = rng.uniform(0, 2 * np.pi)
     before = Compose((*corners, _turned(-heading)))
     flat, lifted = _turned(-heading)(_middle()), before(_middle())
-    profile = sample_profile(rng, float(flat[:, 0].min()), float(flat[:, 0].max()))
+    profile = sample_profile(rng, kind, float(flat[:, 0].min()), float(flat[:, 0].max()))
     curvature = np.abs(np.interp(lifted[:, 0], NODES, profile.curvature))
     pressed = curvature * (np.abs(lifted[:, 2]) + LARGEST_OFFSET)
     if pressed.max() > MOST_PRESSED or not _do_not_meet(corners):
@@ -172,8 +175,10 @@ def is_clear(moved: Float[np.ndarray, "k 3"]) -> bool:
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """One map moves all segments."""
+    # drawn once: were it drawn with every attempt, folds and rolls, which are refused more often, would be rare
+    kind = str(rng.choice(KINDS, p=KIND_SHARES))
     for _ in range(ATTEMPTS):
-        deformation = sample_deformation(rng)
+        deformation = sample_deformation(rng, kind)
         if deformation is not None:
             return (deformation,) * len(rest_mesh().segments)
     raise ValueError(f"no state of the sheet in {ATTEMPTS} draws keeps its layers apart: widen the bounds")

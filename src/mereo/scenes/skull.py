@@ -31,9 +31,8 @@ from mereo.deformation import Compose, Deformation, Identity, Rigid
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.mesh_files import read_segmented_mesh
 from mereo.scene import Scene, Workspace
-from mereo.scenes._real_meshes import close_hole, largest_piece, main_part, segment_of, simplified, solid_of
-
-Vector = tuple[float, float, float]
+from mereo.scenes._real_meshes import close_hole, largest_piece, main_part, simplified
+from mereo.scenes._solids import Vector, segment_of, solid_of, union
 
 UNITS = 3.2342
 """Scene units per unit of the source, where the skull is 6.184 wide."""
@@ -150,8 +149,7 @@ def _solid(name: str) -> manifold3d.Manifold:
 
 
 def _teeth(row: str) -> manifold3d.Manifold:
-    parts = [_solid(name) for name in _source() if name.startswith(row)]
-    return manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add)
+    return union(*(_solid(name) for name in _source() if name.startswith(row)))
 
 
 @cache
