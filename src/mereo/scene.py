@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -96,6 +97,9 @@ class Scene:
         sample_deformations: draws one deformation per segment; segments that move together share one object.
         workspace: where the camera may be.
         source: where the mesh comes from, and its licence.
+        unit_m: metres per scene unit; None where the object's true size is not known.
+        definition: what a scene from a file states, in a text that changes exactly when its meaning does. Empty for
+            built-in scenes: the version of mereo stands for it.
     """
 
     name: str
@@ -103,6 +107,8 @@ class Scene:
     sample_deformations: Callable[[np.random.Generator], tuple[Deformation, ...]]
     workspace: Workspace = field(default_factory=Workspace)
     source: str = "modelled in mereo's own code, MIT licence"
+    unit_m: float | None = None
+    definition: str = ""
 
     def sample_state(self, rng: np.random.Generator) -> State:
         """A random deformed state within the scene's hand-made bounds."""
@@ -123,9 +129,26 @@ class Scene:
         return State(self.rest.with_vertices(moved), deformations)
 
 
-def load_scene(name: str) -> Scene:
-    """A built-in scene by name; raises ``ValueError`` listing the known names otherwise."""
-    if name not in SCENES:
-        raise ValueError(f"scene {name!r} is unknown; it must be one of {', '.join(SCENES)}: check the spelling")
-    scene: Scene = import_module(f"mereo.scenes.{name}").scene()
+def is_yaml(scene: "str | Path | Scene") -> bool:
+    """Whether this names a YAML scene file."""
+    return isinstance(scene, str | Path) and Path(scene).suffix.lower() in (".yaml", ".yml")
+
+
+def load_scene(name: str | Path) -> Scene:
+    """A scene by its built-in name, or from a file: YAML (``scene_file``), or Python (``scene_code``), which is run.
+
+    Raises ``ValueError`` listing what there is for an unknown name, or saying what is wrong with a file;
+    ``FileNotFoundError`` where it, or a mesh that it names, does not exist.
+    """
+    if is_yaml(name):
+        scene: Scene = import_module("mereo.scene_file").load(Path(name))
+    elif Path(name).suffix == ".py":
+        scene = import_module("mereo.scene_code").load(Path(name))
+    elif name in SCENES:
+        scene = import_module(f"mereo.scenes.{name}").scene()
+    else:
+        raise ValueError(
+            f"scene {str(name)!r} is unknown; it must be one of {', '.join(SCENES)}, or a file of your own (.yaml, as "
+            "`mereo scene new` writes it, or .py with a function scene()): check the spelling"
+        )
     return scene
