@@ -16,6 +16,7 @@ from mereo.mesh_files import read_segmented_mesh
 from mereo.output import atomic_file
 from mereo.random_motion import default_cells
 from mereo.scene import SCENES
+from mereo.scene_rewrite import quoted
 from mereo.scene_schema import UNITS
 
 SIZE = 20.0
@@ -103,15 +104,15 @@ def _from_meshes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
     bounds = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
     lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
     for number, (name, file) in enumerate(zip(names, relative, strict=True)):
-        lines += [f"  - name: {_quoted(name)}", f"    file: {_quoted(file)}", f"    color: {_color(number)}"]
+        lines += [f"  - name: {quoted(name)}", f"    file: {quoted(file)}", f"    color: {_color(number)}"]
     lines.append("    # nested_in: NAME  # for a segment that lies inside another one, which has to come after it")
     return _Source("\n".join(lines), bounds, names, *_unit_of(files[0], bounds))
 
 
 def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
-    lines = [f"model: {_quoted(relative)}", "parts:  # delete what is not wanted; their order is that of the labels"]
+    lines = [f"model: {quoted(relative)}", "parts:  # delete what is not wanted; their order is that of the labels"]
     for number, name in enumerate(mesh.names):
-        lines += [f"  - name: {_quoted(name)}", f"    color: {_color(number)}"]
+        lines += [f"  - name: {quoted(name)}", f"    color: {_color(number)}"]
     lines.append("    # parts: [A, B]  # parts of the model to join into this segment, instead of the one of its name")
     return _Source("\n".join(lines), mesh.bounds, mesh.names, *_unit_of(file, mesh.bounds))
 
@@ -123,8 +124,8 @@ def _from_volume(file: Path, relative: str) -> _Source:
         raise ValueError(f"{file} holds only empty space; a label volume has values above 0: export it again")
     names = {value: volume.names.get(value, f"label_{value}") for value in values}
     bounds = segment_surfaces(volume, names, LABEL_CELLS).bounds
-    lines = [f"labels: {_quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
-    lines += [f"  {value}: {_quoted(name)}" for value, name in names.items()]
+    lines = [f"labels: {quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
+    lines += [f"  {value}: {quoted(name)}" for value, name in names.items()]
     lines.append(f"cells: {LABEL_CELLS}  # of the grid along the longest side on which surfaces are found")
     return _Source("\n".join(lines), bounds, tuple(names.values()), "mm", "the convention of NIfTI and NRRD")
 
@@ -171,17 +172,10 @@ def _text(name: str, source: _Source, units: str | None) -> str:
         length=f"{sides[longest]:.4g}",
         # half of the angle at which a straight bar of this thickness would fold over
         angle=int(min(90, np.rad2deg(0.45 * sides[longest] / np.linalg.norm(np.delete(sides, longest) / 2)))),
-        part=_quoted(source.names[-1]),
+        part=quoted(source.names[-1]),
         push=f"{0.1 * sides.min():.3g}",
         reach=f"{0.5 * sides.min():.3g}",
     )
-
-
-def _quoted(text: str) -> str:
-    """As a YAML value: quoted unless it is a plain word."""
-    plain = re.fullmatch(r"[A-Za-z_./][\w./ -]*", text) and not text.endswith(" ")
-    reserved = text.lower() in ("yes", "no", "on", "off", "true", "false", "null", "y", "n", "~")
-    return text if plain and not reserved else "'" + text.replace("'", "''") + "'"
 
 
 def _color(number: int) -> str:

@@ -30,8 +30,9 @@ from mereo import assets
 from mereo.deformation import Compose, Deformation, Identity, Rigid
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.mesh_files import read_segmented_mesh
+from mereo.mesh_repair import close_holes, largest_piece, solid_of
 from mereo.scene import Scene, Workspace
-from mereo.scenes._real_meshes import close_hole, largest_piece, main_part, segment_of, simplified, solid_of
+from mereo.scenes._real_meshes import main_part, segment_of, simplified
 
 Vector = tuple[float, float, float]
 
@@ -145,7 +146,7 @@ def _source() -> dict[str, Segment]:
 def _solid(name: str) -> manifold3d.Manifold:
     """A part without the source's six stray triangles, and with the cranium's one missing triangle; simplified."""
     part = _source()[name]
-    whole = solid_of(*close_hole(*largest_piece(part.vertices, part.faces)))
+    whole = solid_of(*close_holes(*largest_piece(part.vertices, part.faces)))
     return simplified(whole, FACES.get(name, TOOTH_FACES))
 
 
