@@ -28,6 +28,9 @@ MERGED_WITHIN = (1e-6, 1e-4)
 FRAGMENT = 0.02
 """A piece whose diagonal is below this share of the segment's is a stray."""
 
+FLECK = 1e-5
+"""Of the largest piece's volume."""
+
 REMESH_CELLS = 128
 """Cells along the longest side of the grid on which the last resort finds a new surface."""
 
@@ -71,7 +74,7 @@ def _drop_unusable(vertices: Vertices, faces: Faces) -> Step:
     _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
     kept = kept[np.sort(first)]
     used, kept = np.unique(kept, return_inverse=True)
-    dropped = len(faces) - len(kept) // 3
+    dropped = len(faces) - len(kept)
     return vertices[used], kept.reshape(-1, 3), f"dropped {dropped} unusable or repeated faces" if dropped else ""
 
 
@@ -105,7 +108,7 @@ def _drop_fragments(vertices: Vertices, faces: Faces) -> Step:
     if not stray.any() or stray.all():
         return vertices, faces, ""
     used, kept = np.unique(faces[~stray[piece]], return_inverse=True)
-    lost = len(faces) - len(kept) // 3
+    lost = len(faces) - len(kept)
     return vertices[used], kept.reshape(-1, 3), f"removed {int(stray.sum())} fragments ({lost} faces)"
 
 
@@ -138,7 +141,7 @@ def _fill_holes(vertices: Vertices, faces: Faces) -> Step:
 
 
 def _unite(vertices: Vertices, faces: Faces) -> Step:
-    """Closed shells that reach into each other become one; shells around a cavity stay."""
+    """Closed shells that reach into each other become one; shells that face inwards are cavities, and are cut out."""
     try:
         solid = solid_of(vertices, faces)
     except ValueError:
@@ -146,7 +149,10 @@ def _unite(vertices: Vertices, faces: Faces) -> Step:
     shells = solid.decompose()
     if len(shells) < 2:
         return vertices, faces, ""
-    united = manifold3d.Manifold.batch_boolean(shells, manifold3d.OpType.Add)
+    filled = [shell for shell in shells if shell.volume() > 0]
+    hollow = [solid_of(v, f[:, ::-1]) for v, f in (mesh_of(shell) for shell in shells if shell.volume() < 0)]
+    united = manifold3d.Manifold.batch_boolean(filled, manifold3d.OpType.Add)
+    united -= manifold3d.Manifold.batch_boolean(hollow, manifold3d.OpType.Add)
     return *mesh_of(united), f"united {len(shells)} shells that overlap"
 
 
@@ -200,23 +206,25 @@ def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list
             solid_of(segments[name].vertices, segments[name].faces) for name in (overlap.small, overlap.large)
         )
         changed = overlap.small if overlap.nested else overlap.large
-        cut = without_flecks(small ^ large if overlap.nested else large - small)
+        cut = small ^ large if overlap.nested else large - small
         if cut.is_empty():
             raise ValueError(
                 f"segment {changed!r} lies within {overlap.small!r}; nothing of it would be left: remove one"
             )
-        vertices, faces = mesh_of(cut)
+        vertices, faces = _without_flecks(*mesh_of(cut))
         segments[changed] = replace(segments[changed], vertices=vertices, faces=faces)
         what = f"cut off what reached out of {overlap.large!r}" if overlap.nested else f"cut out {overlap.small!r}"
         changes.setdefault(changed, []).append(what)
     return replace(mesh, segments=tuple(segments.values())), changes
 
 
-def without_flecks(solid: manifold3d.Manifold) -> manifold3d.Manifold:
-    """Without parts below a thousandth of the volume: Booleans of meshes that nearly touch leave them."""
-    parts = solid.decompose()
-    kept = [part for part in parts if part.volume() > 1e-3 * solid.volume()]
-    return manifold3d.Manifold.compose(kept) if len(kept) < len(parts) else solid
+def _without_flecks(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
+    """Without pieces of hardly any volume: Booleans of meshes that nearly touch leave them."""
+    piece = pieces(faces, len(vertices))
+    a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
+    volume = np.abs(np.bincount(piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c))))
+    used, kept = np.unique(faces[(volume > FLECK * volume.max())[piece]], return_inverse=True)
+    return vertices[used], kept.reshape(-1, 3)
 
 
 # --- pieces and holes -------------------------------------------------------------------------------------------------

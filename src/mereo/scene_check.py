@@ -41,13 +41,13 @@ def check_scene(name: str, repair: bool = False) -> None:
         if repair:
             raise ValueError(f"--repair works on YAML scene files, and {name!r} is none: repair its meshes where it is")
         scene = load_scene(name)
-        faults = _report(scene.rest, "unit")
+        faults = _report(scene.rest, "cubic units")
     else:
         document = Document(Path(name))
         file = read(document)
         mesh = read_segments(document, file)
         unit = next((key for key, value in UNITS.items() if value == file.units), "unit")
-        faults = _report(mesh, unit)
+        faults = _report(mesh, f"{unit}³")
         _report_size(mesh, file.units, unit)
         if faults and repair:
             _check_repaired(document, mesh)
@@ -80,7 +80,8 @@ def _report(mesh: SegmentedMesh, unit: str) -> int:
         if found.hopeless:
             amount = "no volume"
         else:
-            amount = f"volume {volume if found.sound else grid_volume(replace(segment, solid=False)):.4g} cubic {unit}s"
+            inside = volume if found.sound else grid_volume(replace(segment, solid=False))
+            amount = f"volume {inside:.4g} {unit}"
         print(f"{segment.name:<20} {len(segment.faces):>7} faces   {amount}")
         for fault in (*found.hopeless, *found.dirty):
             faults += 1

@@ -231,8 +231,9 @@ def label_grid(
             continue
         box = tuple(slice(low, high) for low, high in zip(lows, highs, strict=True))
         block = labels[box]
-        axes = (x[box[0]], y[box[1]], z[box[2]])
-        block[(block == 0) & (winding_grid if segment.solid else _winding_nodes)(segment, *axes)] = index + 1
+        has_holes = not segment.solid and segment.edge_imbalance() != (0, 0)
+        inside = (_winding_nodes if has_holes else winding_grid)(segment, x[box[0]], y[box[1]], z[box[2]])
+        block[(block == 0) & inside] = index + 1
     return labels
 
 
