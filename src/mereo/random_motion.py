@@ -11,7 +11,7 @@ its axis: the angle is drawn from what that leaves of its range. Lengths are in 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +30,7 @@ FOLD_SHARE = 0.9
 """A bend stays below this share of the angle at which space would fold over."""
 
 
+@runtime_checkable
 class Draw(Protocol):
     """The bounds of one deformation."""
 

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
+from manifold3d import Manifold, OpType
 
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.mesh_files import read_segmented_mesh
+from mereo.mesh_repair import mesh_of, solid_of
 from mereo.scene_schema import FilePart, ModelPart, PartLook, SceneFile, similar
 from mereo.yaml_document import Document
 
@@ -63,10 +64,15 @@ def _from_model(document: Document, parts: Sequence[ModelPart], model: Segmented
 
 
 def _joined(part: PartLook, pieces: Sequence[Segment]) -> Segment:
-    """One segment of all pieces, as they are: where they overlap, the winding number holds them together."""
-    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces[:-1])])
-    faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)])
-    return Segment(part.name, pieces[0].color, np.concatenate([piece.vertices for piece in pieces]), faces)
+    """One segment of all pieces: their union where each is a solid, else all of their faces."""
+    if len(pieces) == 1:
+        return Segment(part.name, pieces[0].color, pieces[0].vertices, pieces[0].faces)
+    try:
+        solids = [solid_of(piece.vertices, piece.faces) for piece in pieces]
+        vertices, faces = mesh_of(Manifold.batch_boolean(solids, OpType.Add))
+    except ValueError:
+        vertices, faces, _ = SegmentedMesh(tuple(pieces)).merged()
+    return Segment(part.name, pieces[0].color, vertices, faces)
 
 
 def _assembled(document: Document, key: str, parts: Sequence[PartLook], segments: Sequence[Segment]) -> SegmentedMesh:
