@@ -125,9 +125,9 @@ def _slicer_names(header: Mapping[str, Any]) -> dict[int, str]:
 def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) -> SegmentedMesh:
     """A closed surface for each name, smoothed, in the volume's world coordinates.
 
-    Labels become shares of the cells of a coarser grid, each smoothed by a Gaussian; empty space is what remains. The
-    surface of a segment is where its share equals the largest other one: marching cubes gives neighbours the same
-    interface there, so that they touch without overlap (as in ``extraction``).
+    Labels become shares of the cells of a coarser grid, each smoothed by a Gaussian. The object is where they add up to
+    more than a half, and in it a segment is where its share is the largest: marching cubes gives neighbours the same
+    interface, so that they touch without overlap (as in ``extraction``), and no groove runs along it.
 
     Args:
         volume: the labels; those without a name count as empty space.
@@ -146,12 +146,13 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     masks = [np.isin(volume.labels, [value for value in names if names[value] == name]) for name in segments]
     grid = _Grid.around(np.logical_or.reduce(masks), volume.T_world_index, cells)
     shares = np.stack([grid.share(mask) for mask in masks])
-    shares = np.concatenate([shares, 1.0 - shares.sum(axis=0, keepdims=True)])
-    owner = shares.argmax(axis=0)
+    filled = 2 * shares.sum(axis=0) - 1
+    owner = np.where(filled > 0, shares.argmax(axis=0), -1)
     parts = []
     for index, name in enumerate(segments):
+        others = np.delete(shares, index, axis=0).max(axis=0, initial=0)
         sign = np.where(owner == index, np.float32(1), np.float32(-1))
-        margin = sign * (shares[index] - np.delete(shares, index, axis=0).max(axis=0))
+        margin = sign * np.minimum(filled, shares[index] - others)
         part = grid.surface(sign * np.maximum(margin, LEAST_MARGIN), name, index)
         true = float(masks[index].sum()) * abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
         if part is None or part.volume < LEAST_VOLUME * true:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from mereo.mesh import Segment, SegmentedMesh
-from mereo.mesh_check import examine, overlaps
+from mereo.mesh_check import examine, faces_astray, overlaps
 
 Vertices = Float[np.ndarray, "_ 3"]
 Faces = Int[np.ndarray, "_ 3"]
@@ -30,6 +30,9 @@ FRAGMENT = 0.02
 
 FLECK = 1e-5
 """Of the largest piece's volume."""
+
+MOST_SHELLS = 300
+"""More are no object of parts but debris, and their union would take minutes."""
 
 REMESH_CELLS = 128
 """Cells along the longest side of the grid on which the last resort finds a new surface."""
@@ -81,20 +84,25 @@ def _drop_unusable(vertices: Vertices, faces: Faces) -> Step:
 def _merge_near(vertices: Vertices, faces: Faces) -> Step:
     """Vertices of open edges that are nearly the same, where that closes edges."""
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    for share in MERGED_WITHIN:
-        rim = np.unique(open_edges(vertices, faces))
-        if len(rim) == 0:
-            break
-        pairs = rim[cKDTree(vertices[rim]).query_pairs(share * diagonal, output_type="ndarray")]
-        graph = coo_array((np.ones(len(pairs)), pairs.reshape(-1, 2).T), shape=(len(vertices),) * 2)
-        _, group = connected_components(graph, directed=False)
-        _, first = np.unique(group, return_index=True)
-        merged = group[faces]
-        merged = merged[(merged != np.roll(merged, 1, axis=1)).all(axis=1)]
-        if len(open_edges(vertices[first], merged)) < len(open_edges(vertices, faces)):
-            change = f"merged {len(vertices) - len(first)} vertices within {share * diagonal:.2g}"
-            return vertices[first], merged, change
-    return vertices, faces, ""
+    best, fewest, change = (vertices, faces), len(open_edges(vertices, faces)), ""
+    for distance in (share * diagonal for share in MERGED_WITHIN):
+        if fewest:
+            merged = _merged(vertices, faces, distance)
+            left = len(open_edges(*merged))
+            if left < fewest:
+                best, fewest = merged, left
+                change = f"merged {len(vertices) - len(merged[0])} vertices within {distance:.2g}"
+    return *best, change
+
+
+def _merged(vertices: Vertices, faces: Faces, distance: float) -> tuple[Vertices, Faces]:
+    rim = np.unique(open_edges(vertices, faces))
+    pairs = rim[cKDTree(vertices[rim]).query_pairs(distance, output_type="ndarray")].reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
+    _, group = connected_components(graph, directed=False)
+    _, first = np.unique(group, return_index=True)
+    merged = group.astype(np.int64)[faces]
+    return vertices[first], merged[(merged != np.roll(merged, 1, axis=1)).all(axis=1)]
 
 
 def _drop_fragments(vertices: Vertices, faces: Faces) -> Step:
@@ -113,17 +121,17 @@ def _drop_fragments(vertices: Vertices, faces: Faces) -> Step:
 
 
 def _orient(vertices: Vertices, faces: Faces) -> Step:
-    """Neighbours agree, and each patch faces outwards."""
+    """Neighbours agree, and each patch faces outwards; nothing where that is so, for a cavity's wall faces inwards."""
+    if not faces_astray(vertices, faces):
+        return vertices, faces, ""
     turned, patch = igl.bfs_orient(faces.astype(np.int64))
     turned = turned.astype(np.int64)  # C's long long, which numpy tells apart
     for index in range(int(patch.max()) + 1):
         members = patch == index
         if _signed_volume(vertices, turned[members]) < 0:
             turned[members] = turned[members][:, ::-1]
-    a, b = np.sort(faces, axis=1), np.sort(turned, axis=1)
-    assert np.array_equal(a, b), "orienting keeps the order of faces"
-    first = np.array([np.flatnonzero(row == start)[0] for row, start in zip(turned, faces[:, 0], strict=True)])
-    changed = int((turned[np.arange(len(faces)), (first + 1) % 3] != faces[:, 1]).sum())
+    same = np.any([(np.roll(turned, k, axis=1) == faces).all(axis=1) for k in range(3)], axis=0)
+    changed = int((~same).sum())
     return vertices, turned, f"turned {changed} faces around" if changed else ""
 
 
@@ -147,7 +155,7 @@ def _unite(vertices: Vertices, faces: Faces) -> Step:
     except ValueError:
         return vertices, faces, ""
     shells = solid.decompose()
-    if len(shells) < 2:
+    if not 1 < len(shells) <= MOST_SHELLS:
         return vertices, faces, ""
     filled = [shell for shell in shells if shell.volume() > 0]
     hollow = [solid_of(v, f[:, ::-1]) for v, f in (mesh_of(shell) for shell in shells if shell.volume() < 0)]

@@ -9,7 +9,7 @@ import trimesh
 from mereo.camera import Camera
 from mereo.frame import inverse_rigid, transform_points
 from mereo.mesh import Segment, SegmentedMesh
-from mereo.mesh_check import PLAUSIBLE_M, examine, grid_volume, likely_unit, overlaps
+from mereo.mesh_check import PLAUSIBLE_M, Overlap, examine, grid_volume, likely_unit, overlaps
 from mereo.mesh_repair import repaired, without_overlaps
 from mereo.output import atomic_file
 from mereo.scene import SCENES, Scene, is_yaml, load_scene
@@ -112,22 +112,20 @@ def _report_size(mesh: SegmentedMesh, unit_m: float, unit: str) -> None:
 def _report_states(scene: Scene) -> int:
     """Print what goes wrong in random states; returns the number of faults."""
     camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
-    worst: dict[tuple[str, str], str] = {}
-    shares: dict[tuple[str, str], float] = {}
+    worst: dict[frozenset[str], Overlap] = {}
     seen = 1.0
     for index in range(STATES):
         rng = example_rng(0, index)
         mesh = scene.sample_state(rng).mesh
-        for found in overlaps(mesh, STATE_TOLERANCE, cells=48):
-            pair = (found.small, found.large)
-            if found.share > shares.get(pair, 0.0):
-                shares[pair], worst[pair] = found.share, str(found)
+        for found in overlaps(mesh, STATE_TOLERANCE):
+            pair = frozenset((found.small, found.large))
+            worst[pair] = max(worst.get(pair, found), found, key=lambda overlap: overlap.share)
         pose = scene.workspace.sample(rng, mesh.bounds.mean(axis=0))
         local = transform_points(inverse_rigid(pose), mesh.merged()[0])
         pixels = camera.project(local)
         seen = min(seen, float(((pixels > 0) & (pixels < 96)).all(axis=1).mean()))
-    for text in worst.values():
-        print(f"  fault: in random states {text}: narrow the deformations, or let both segments move by the same ones")
+    for overlap in worst.values():
+        print(f"  fault: in random states {overlap}: narrow the deformations, or let both move by the same ones")
     if seen < 0.98:
         print(f"  note: in a random view only {seen:.0%} of the object is in the picture: widen `field_of_view`")
     return len(worst)
