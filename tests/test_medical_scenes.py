@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from mereo.deformation import jacobian_determinant
+from mereo.mesh_repair import close_holes, largest_piece, mesh_of, solid_of
 from mereo.scene import load_scene
 from mereo.scenes import _liver_parts, skull, tumor
-from mereo.scenes._real_meshes import close_hole, largest_piece
-from mereo.scenes._solids import mesh_of, solid_of
 from mereo.solid import Solids, check_overlap
 
 Require = Callable[[str], Path]
@@ -38,10 +37,10 @@ def test_repair_keeps_the_largest_piece_and_closes_its_hole() -> None:
     vertices = np.concatenate([cube, [[5.0, 5, 5], [6, 5, 5]]])
     kept = largest_piece(vertices, np.concatenate([stray, faces]))
     assert [len(part) for part in kept] == [8, 10]
-    closed = close_hole(*kept)
+    closed = close_holes(*kept)
     assert [len(part) for part in closed] == [9, 14]
     assert solid_of(*closed).volume() == pytest.approx(1.0)
-    again = close_hole(*closed)
+    again = close_holes(*closed)
     assert again[0] is closed[0] and again[1] is closed[1]
     with pytest.raises(ValueError, match="a mesh of 10 faces is no solid .NotManifold.; it must be closed"):
         solid_of(*kept)

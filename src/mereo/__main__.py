@@ -3,6 +3,7 @@
 import importlib.metadata
 import os
 import sys
+import warnings
 from collections.abc import Mapping
 from dataclasses import field, make_dataclass
 from itertools import pairwise
@@ -11,7 +12,7 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo import commands
+from mereo import commands, scene_commands
 from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
 
 Choice = TypeVar("Choice")
@@ -34,6 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments in (["--version"], ["-V"]):
         print(f"mereo {version()}")
         return 0
+    warnings.formatwarning = _warning_line
     try:
         parse(arguments).run()
         sys.stdout.flush()
@@ -67,6 +69,10 @@ def one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
+def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:
+    return f"mereo: warning: {' '.join(str(message).split())}\n"
+
+
 def _stop(message: str, code: int) -> int:
     sys.stdout.flush()
     print(message, file=sys.stderr)
@@ -88,12 +94,17 @@ def parse(arguments: list[str]) -> Command:
 
 def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
     """All commands as a type that tyro reads; ``train`` starts from this recipe, what renders from this sensor."""
-    scene = (commands.SceneList, "list"), (commands.SceneCheck, "check"), (commands.ScenePreview, "preview")
+    scene = (
+        (scene_commands.SceneList, "list"),
+        (scene_commands.SceneNew, "new"),
+        (scene_commands.SceneCheck, "check"),
+        (scene_commands.ScenePreview, "preview"),
+    )
     assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")
     return (
         Annotated[commands.Demo, subcommand("demo")]
         | Annotated[commands.Doctor, subcommand("doctor")]
-        | Annotated[_group(scene), subcommand("scene", description="List, check or draw the built-in scenes.")]
+        | Annotated[_group(scene), subcommand("scene", description="List, write, check or draw scenes.")]
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
         | Annotated[_starting(commands.Generate, settings=GenerateConfig(sensor=sensor)), subcommand("generate")]
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]

@@ -42,72 +42,6 @@ class Doctor:
 
 
 @dataclass(frozen=True)
-class SceneList:
-    """Name the built-in scenes."""
-
-    def run(self) -> None:
-        from mereo.scene import SCENES
-
-        for name in SCENES:
-            print(name)
-
-
-@dataclass(frozen=True)
-class SceneCheck:
-    """Check that every segment is closed and outward oriented, and that no two overlap unless declared nested.
-
-    Attributes:
-        scene: a name from `mereo scene list`.
-    """
-
-    scene: Positional[str]
-
-    def run(self) -> None:
-        from mereo.scene import load_scene
-        from mereo.solid import check_overlap
-
-        scene = load_scene(self.scene)
-        scene.rest.check()
-        check_overlap(scene.rest)
-        for segment, volume in zip(scene.rest.segments, scene.rest.owned_volumes, strict=True):
-            print(f"{segment.name:<20} {len(segment.faces):>7} faces   volume {volume:.4g} cubic units")
-        nested = "".join(f", {inner} nested in {outer}" for inner, outer in scene.rest.nested)
-        print(f"{scene.name}: {len(scene.rest.segments)} segments, closed, outward oriented, without overlap{nested}")
-        print(f"source: {scene.source}")
-
-
-@dataclass(frozen=True)
-class ScenePreview:
-    """Draw nine random states of a scene, each with its camera and depth image; or all scenes on one sheet.
-
-    Attributes:
-        output: the picture, a PNG file.
-        scene: a name from `mereo scene list`.
-        all: draw every built-in scene: at rest, two random states and a depth image.
-        seed: another seed shows other states.
-    """
-
-    output: Path
-    scene: Positional[str] = ""
-    all: bool = False
-    seed: int = 0
-
-    def run(self) -> None:
-        from mereo.pictures import preview_scene
-        from mereo.scene import load_scene
-        from mereo.scene_pictures import preview_all
-
-        if self.all == bool(self.scene):
-            given = f"both {self.scene!r} and --all are" if self.all else "neither a scene nor --all is"
-            raise ValueError(f"{given} given; one of them is needed: name a scene, or give --all")
-        if self.all:
-            preview_all(self.output, self.seed)
-        else:
-            preview_scene(load_scene(self.scene), self.output, self.seed)
-        print(f"wrote {self.output}")
-
-
-@dataclass(frozen=True)
 class AssetsList:
     """Name the downloadable meshes and scans, with licence and credit."""
 
@@ -141,7 +75,7 @@ class Generate:
     """Make labelled training examples of a scene.
 
     Attributes:
-        scene: a name from `mereo scene list`.
+        scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
         examples: how many.
         output: folder to create.
         seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
@@ -211,7 +145,7 @@ class Evaluate:
         output: folder to create.
         examples: how many.
         seed: test seeds start at 1,000,000.
-        scene: the scene, where it is not the one that the weights were trained on.
+        scene: the scene's name or file, where it is not the built-in one that the weights were trained on.
         scans: score the four real range scans of the bunny, whose poses are known, instead of rendered views.
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
         noise_std: Gaussian noise on the depth, standard deviation in scene units.

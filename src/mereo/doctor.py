@@ -14,6 +14,7 @@ PURPOSES: dict[str, str] = {
     "track": "training curves in TensorBoard",
     "vtk": "smooth surfaces from label volumes",
     "onnx": "networks for other runtimes",
+    "cad": "3MF files",
     "medical": "NIfTI and NRRD volumes",
     "sensors": "ROS bags and netCDF recordings",
     "simulation": "states from finite elements",

@@ -27,7 +27,7 @@ from mereo.output import new_directory, write_json
 from mereo.reconstruction import segment_names
 from mereo.refinement import sample_coarse_to_fine
 from mereo.scans import SCANS, scan_in_camera
-from mereo.scene import Scene, load_scene
+from mereo.scene import SCENES, Scene, load_scene
 from mereo.synthesis import example_rng, sample_view
 from mereo.weights import load_model
 
@@ -128,7 +128,7 @@ def evaluate(
 
     Args:
         model: the trained model.
-        scene: a scene or its name; by default the one that the model was trained on.
+        scene: a scene, its name or its file; by default the built-in one that the model was trained on.
         examples: how many; example i is made from (seed, i) alone.
         seed: at least ``config.TEST_SEED_START``: smaller ones are for training.
         cells: of the grid along each axis.
@@ -150,10 +150,15 @@ def evaluate(
 
 
 def trained_scene(model: Model) -> str:
-    """The scene in the weights' provenance; raises ``ValueError`` where there is none."""
+    """The built-in scene in the weights' provenance; raises ``ValueError`` where there is none."""
     scene = model.provenance.get("scene")
     if not isinstance(scene, str):
         raise ValueError("the weights do not say which scene they were trained on; name it with --scene")
+    if scene not in SCENES:
+        raise ValueError(
+            f"the weights were trained on the scene {scene!r}, which is not built in; its file is needed: name it with "
+            "--scene FILE.yaml"
+        )
     return scene
 
 

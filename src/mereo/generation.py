@@ -35,7 +35,7 @@ from mereo.output import atomic_file, write_json
 from mereo.parallel import in_processes
 from mereo.query_sampling import check_settings
 from mereo.rest_pose import rest_distances
-from mereo.scene import Scene, load_scene
+from mereo.scene import Scene, is_yaml, load_scene
 from mereo.sensor import check_sensor
 from mereo.synthesis import Example, example_rng, synthesize
 
@@ -52,7 +52,7 @@ SECONDS_BETWEEN_LINES = 10.0
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """What all shards of a dataset have in common; a built-in scene is sent to workers by its name."""
+    """What all shards of a dataset have in common; a scene made by code is sent to workers by its name or file."""
 
     scene: str | Scene
     settings: GenerateConfig
@@ -96,7 +96,7 @@ def generate(
     """Make ``examples`` labelled examples of a scene in the directory ``output``.
 
     Args:
-        scene: a built-in scene's name, or a scene of your own (which workers must be able to unpickle).
+        scene: a built-in scene's name, a scene file, or a scene (which workers must be able to unpickle).
         output: created; with ``resume`` its complete shards are kept and the missing ones made.
         settings: how one example is made.
         seed: seeds from ``TEST_SEED_START`` up are for testing and need ``test``, which refuses smaller ones.
@@ -125,7 +125,8 @@ def generate(
             temporary.write_bytes(save({"distance": rest_distances(loaded.rest)}))
     missing = [item for item in shards if not item.is_complete()]
     total = sum(item.end - item.first for item in missing)
-    work = partial(_make_shard, _Work(scene, settings, seed))
+    # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile
+    work = partial(_make_shard, _Work(loaded if is_yaml(scene) else scene, settings, seed))
     with closing(in_processes(work, missing, workers)) as made, _progress(total) as advance:
         for item, data in made:
             with atomic_file(item.path) as temporary:
@@ -160,8 +161,8 @@ def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: i
     """Everything that decides the dataset, and what training needs to know of the scene, as JSON values."""
     digest = hashlib.sha256()
     for segment in scene.rest.segments:
-        digest.update(np.ascontiguousarray(segment.vertices, dtype="<f8").tobytes())
-        digest.update(np.ascontiguousarray(segment.faces, dtype="<i8").tobytes())
+        for array, dtype in ((segment.vertices, "<f8"), (segment.faces, "<i8")):
+            digest.update(np.ascontiguousarray(array, dtype=dtype).tobytes())
     manifest = {
         "scene": scene.name,
         "source": scene.source,
@@ -174,6 +175,8 @@ def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: i
         "examples": examples,
         "shard_size": SHARD_SIZE,
         "rest_sha256": digest.hexdigest(),
+        "scene_file_sha256": hashlib.sha256(scene.definition.encode()).hexdigest() if scene.definition else None,
+        "unit_m": scene.unit_m,
         "version": version("mereo"),
         "libraries": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
         "bytes": examples * example_bytes(settings, len(scene.rest.segments)),
@@ -274,9 +277,8 @@ def _progress(total: int) -> Iterator[Callable[[int], None]]:
     """Yields a function that takes the number of new examples; a bar on a terminal, a line now and then elsewhere."""
     bar = Progress(BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), transient=True)
     task = bar.add_task("", total=total)
-    terminal = sys.stdout.isatty()
+    terminal, done = sys.stdout.isatty(), 0
     start = shown = time.monotonic()
-    done = 0
 
     def advance(count: int) -> None:
         nonlocal done, shown

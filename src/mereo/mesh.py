@@ -39,12 +39,15 @@ class Segment:
         color: red, green, blue in 0..255.
         vertices: positions, any unit.
         faces: vertex indices, counter-clockwise seen from outside.
+        solid: whether the faces bound a solid, closed and free of self-intersections. Of a mesh that does not, the
+            generalized winding number decides what is inside, which is slower.
     """
 
     name: str
     color: Color
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
+    solid: bool = True
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
@@ -161,6 +164,7 @@ class SegmentedMesh:
     def check(self) -> None:
         """Raise ``ValueError`` unless every segment is finite, closed, outward oriented and of positive volume.
 
+        Of a segment that is marked as no solid, only finite vertices and existing indices are asked.
         Overlap between segments needs inside tests, see ``mereo.solid.check_overlap``.
         """
         for segment in self.segments:
@@ -179,6 +183,8 @@ def check_segment(segment: Segment) -> None:
             f"segment {name!r} has a face that refers to vertex {int(faces.max())} of {len(vertices)}; "
             "indices must exist: export the part again"
         )
+    if not segment.solid:
+        return
     open_edges, misoriented = segment.edge_imbalance()
     if open_edges:
         raise ValueError(

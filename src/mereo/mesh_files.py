@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from mereo.mesh import PALETTE, Color, Segment, SegmentedMesh
 VIEWER_ROOT = "camera_frame"
 """Name of the root node of our own GLB files; below it, vertices are in the input's camera frame."""
 
-MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf")
 
 
 @contextmanager
@@ -37,11 +38,11 @@ def readable(path: Path, kind: str) -> Iterator[None]:
 
 
 def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
-    """The segments of one or more GLB, OBJ, PLY, STL or OFF files, in label order.
+    """The segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order.
 
-    A file with several named parts (GLB nodes, OBJ objects or groups) gives one segment each; a file with one part
-    gives one segment called after its GLB node, or else after the file. A directory stands for the mesh files in it,
-    by name.
+    A file with several named parts (GLB nodes, OBJ objects or groups, 3MF objects) gives one segment each; a file with
+    one part gives one segment called after its GLB node, or else after the file. A directory stands for the mesh files
+    in it, by name.
     Node transforms are applied, except the root of GLB files written by mereo: those come back in the camera frame.
     Vertices at the same position are merged, because exporters split them at normals and texture seams, which would
     open a closed mesh. ``SegmentedMesh.check`` is left to the caller.
@@ -49,6 +50,7 @@ def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
     Raises:
         FileNotFoundError, ValueError: a file is missing, of another format, damaged or without faces, or two segments
             have the same name.
+        ImportError: a 3MF file, without the extra `cad`.
     """
     files = [file for path in paths for file in _mesh_files(Path(path))]
     parts = [part for file in files for part in _parts(file)]
@@ -76,6 +78,8 @@ def _parts(path: Path) -> list[Part]:
     if path.exists() and path.suffix.lower() not in MESH_SUFFIXES:
         known = ", ".join(MESH_SUFFIXES)
         raise ValueError(f"{path} has the suffix {path.suffix!r}; a mesh is one of {known}: convert or rename it")
+    if path.suffix.lower() == ".3mf" and find_spec("lxml") is None:
+        raise ImportError(f"{path} needs lxml, which reads 3MF files and is not installed: pip install 'mereo[cad]'")
     with readable(path, "mesh"):
         parts = _obj_parts(path) if path.suffix.lower() == ".obj" else _scene_parts(path)
         if not parts:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -101,6 +102,9 @@ class Scene:
         workspace: where the camera may be.
         source: where the mesh comes from, and its licence.
         held_out: the same object in states that are kept for testing; None where states are drawn without end.
+        unit_m: metres per scene unit; None where the object's true size is not known.
+        definition: what a scene from a file states, in a text that changes exactly when its meaning does. Empty for
+            built-in scenes: the version of mereo stands for it.
     """
 
     name: str
@@ -109,6 +113,8 @@ class Scene:
     workspace: Workspace = field(default_factory=Workspace)
     source: str = "modelled in mereo's own code, MIT licence"
     held_out: "Scene | None" = None
+    unit_m: float | None = None
+    definition: str = ""
 
     def __post_init__(self) -> None:
         if self.held_out is not None and self.held_out.rest.names != self.rest.names:
@@ -140,9 +146,26 @@ class Scene:
         return State(self.rest.with_vertices(moved), deformations)
 
 
-def load_scene(name: str) -> Scene:
-    """A built-in scene by name; raises ``ValueError`` listing the known names otherwise."""
-    if name not in SCENES:
-        raise ValueError(f"scene {name!r} is unknown; it must be one of {', '.join(SCENES)}: check the spelling")
-    scene: Scene = import_module(f"mereo.scenes.{name.replace('-', '_')}").scene()
+def is_yaml(scene: "str | Path | Scene") -> bool:
+    """Whether this names a YAML scene file."""
+    return isinstance(scene, str | Path) and Path(scene).suffix.lower() in (".yaml", ".yml")
+
+
+def load_scene(name: str | Path) -> Scene:
+    """A scene by its built-in name, or from a file: YAML (``scene_file``), or Python (``scene_code``), which is run.
+
+    Raises ``ValueError`` listing what there is for an unknown name, or saying what is wrong with a file;
+    ``FileNotFoundError`` where it, or a mesh that it names, does not exist.
+    """
+    if is_yaml(name):
+        scene: Scene = import_module("mereo.scene_file").load(Path(name))
+    elif Path(name).suffix == ".py":
+        scene = import_module("mereo.scene_code").load(Path(name))
+    elif name in SCENES:
+        scene = import_module(f"mereo.scenes.{str(name).replace('-', '_')}").scene()
+    else:
+        raise ValueError(
+            f"scene {str(name)!r} is unknown; it must be one of {', '.join(SCENES)}, or a file of your own (.yaml, as "
+            "`mereo scene new` writes it, or .py with a function scene()): check the spelling"
+        )
     return scene

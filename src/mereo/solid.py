@@ -3,7 +3,8 @@
 Inside tests cast one ray and ask whether the first face hit is seen from behind. Two rays in unrelated directions are
 compared; where they disagree (a ray through an edge, an imperfect mesh) the generalized winding number decides
 (Jacobson et al., SIGGRAPH 2013; Barill et al., SIGGRAPH 2018). Each segment has a ray scene of its own: in a joint one
-the coincident faces of two neighbours would make the first face hit ambiguous.
+the coincident faces of two neighbours would make the first face hit ambiguous. A segment that is marked as no solid
+(holes, self-intersections) is left to the winding number altogether.
 """
 
 from functools import cached_property
@@ -28,6 +29,7 @@ class _Solid:
     def __init__(self, segment: Segment) -> None:
         self.vertices = np.ascontiguousarray(segment.vertices, dtype=np.float64)
         self.faces = np.ascontiguousarray(segment.faces, dtype=np.int64)
+        self.is_solid = segment.solid
         self.low, self.high = segment.bounds
         self.center = (self.low + self.high) / 2
 
@@ -53,6 +55,8 @@ class _Solid:
         """Whether points, already known to lie in the box, are inside."""
         if len(points) == 0:
             return np.zeros(0, dtype=bool)
+        if not self.is_solid:
+            return igl.fast_winding_number(self.vertices, self.faces, points) > 0.5
         first, second = self._behind_first_hit(points)
         doubtful = first != second
         if doubtful.any():
@@ -215,8 +219,18 @@ def label_grid(
             continue
         box = tuple(slice(low, high) for low, high in zip(lows, highs, strict=True))
         block = labels[box]
-        block[(block == 0) & winding_grid(segment, x[box[0]], y[box[1]], z[box[2]])] = index + 1
+        has_holes = not segment.solid and segment.edge_imbalance() != (0, 0)
+        inside = (_winding_nodes if has_holes else winding_grid)(segment, x[box[0]], y[box[1]], z[box[2]])
+        block[(block == 0) & inside] = index + 1
     return labels
+
+
+def _winding_nodes(
+    segment: Segment, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
+) -> Bool[np.ndarray, "nx ny nz"]:
+    """``winding_grid`` for a mesh with holes, node by node: a column may enter it and never leave."""
+    nodes = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    return _Solid(segment).holds(nodes).reshape(len(x), len(y), len(z))
 
 
 def check_overlap(mesh: SegmentedMesh, tolerance: float = 1e-3, cells: int = 64) -> None:
@@ -231,7 +245,7 @@ def check_overlap(mesh: SegmentedMesh, tolerance: float = 1e-3, cells: int = 64)
         _check_within(mesh.segments[mesh.names.index(inner)], mesh.segments[mesh.names.index(outer)], tolerance, cells)
     order = sorted(mesh.segments, key=lambda segment: abs(segment.volume))
     for number, small in enumerate(order):
-        grid = _Filled(small, cells)
+        grid = Filled(small, cells)
         for large in order[number + 1 :]:
             share = 0.0 if {(small.name, large.name), (large.name, small.name)} & nested else grid.share_in(large)
             if share > tolerance:
@@ -244,7 +258,7 @@ def check_overlap(mesh: SegmentedMesh, tolerance: float = 1e-3, cells: int = 64)
 
 
 def _check_within(inner: Segment, outer: Segment, tolerance: float, cells: int) -> None:
-    outside = 1.0 - _Filled(inner, cells).share_in(outer)
+    outside = 1.0 - Filled(inner, cells).share_in(outer)
     if outside > tolerance:
         raise ValueError(
             f"segment {inner.name!r} is declared nested in {outer.name!r}, but {100 * outside:.2g} % of it lies "
@@ -252,7 +266,7 @@ def _check_within(inner: Segment, outer: Segment, tolerance: float, cells: int) 
         )
 
 
-class _Filled:
+class Filled:
     """A segment as the filled cells of a grid over its box."""
 
     def __init__(self, segment: Segment, cells: int) -> None:

@@ -16,8 +16,9 @@ from jaxtyping import Float, Int
 
 from mereo import assets
 from mereo.mesh import PALETTE, SegmentedMesh
+from mereo.mesh_repair import mesh_of, solid_of
 from mereo.scenes._real_meshes import simplified
-from mereo.scenes._solids import Vector, mesh_of, segment_of, solid_of
+from mereo.scenes._solids import Vector, segment_of
 
 SCALE = 4.0
 """Scene units per decimetre: the body is 17 units deep, 40 wide and 67 tall."""

@@ -15,9 +15,10 @@ from mereo import assets
 from mereo.deformation import Compose, Deformation, Localized, Rigid
 from mereo.mesh import PALETTE, Segment
 from mereo.mesh_files import read_segmented_mesh
+from mereo.mesh_repair import Faces, Vertices, close_holes, largest_piece, solid_of
 from mereo.scene import Workspace
-from mereo.scenes._real_meshes import close_hole, largest_piece, main_part, simplified
-from mereo.scenes._solids import Faces, Vertices, segment_of, solid_of
+from mereo.scenes._real_meshes import main_part, simplified
+from mereo.scenes._solids import segment_of
 from mereo.warps import Bend, FreeFormLattice, Squash, Twist
 
 SHORTEST_SIDE = 20.0
@@ -42,7 +43,7 @@ WORKSPACE = Workspace(axis=(-0.05, -0.6, -0.8), fov_rad=float(np.deg2rad(22.0)))
 def repaired_liver() -> tuple[Vertices, Faces]:
     """The liver's largest piece with its open loop closed, millimetres: 28,560 faces, 1,762 cubic centimetres."""
     raw = read_segmented_mesh(assets.get("liver/lapgym_liver_visual.stl")).segments[0]
-    return close_hole(*largest_piece(raw.vertices, raw.faces))
+    return close_holes(*largest_piece(raw.vertices, raw.faces))
 
 
 def to_scene(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

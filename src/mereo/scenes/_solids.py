@@ -1,35 +1,16 @@
 """What all scenes need of manifold3d: solids joined, and made into segments. Lengths are in scene units."""
 
-import manifold3d
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from manifold3d import CrossSection, Manifold, OpType
 
 from mereo.mesh import Color, Segment
+from mereo.mesh_repair import mesh_of
 
 Vector = tuple[float, float, float]
-Vertices = Float[np.ndarray, "_ 3"]
-Faces = Int[np.ndarray, "_ 3"]
 
 SIMPLIFY = 1e-3
 """Detail below this is dropped from finished parts; it is far below the camera's noise and spares slivers."""
-
-
-def solid_of(vertices: Vertices, faces: Faces) -> Manifold:
-    """A closed mesh as a solid; raises ``ValueError`` where manifold3d does not accept it."""
-    mesh = manifold3d.Mesh64(
-        np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.uint64)
-    )
-    solid = Manifold(mesh)
-    if solid.status() != manifold3d.Error.NoError:
-        raise ValueError(f"a mesh of {len(faces)} faces is no solid ({solid.status().name}); it must be closed")
-    return solid
-
-
-def mesh_of(solid: Manifold) -> tuple[Vertices, Faces]:
-    """Vertices and faces of a solid."""
-    mesh = solid.to_mesh64()
-    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64)
 
 
 def segment_of(name: str, color: Color, solid: Manifold) -> Segment:

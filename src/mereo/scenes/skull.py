@@ -30,9 +30,10 @@ from mereo import assets
 from mereo.deformation import Compose, Deformation, Identity, Rigid
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.mesh_files import read_segmented_mesh
+from mereo.mesh_repair import close_holes, largest_piece, solid_of
 from mereo.scene import Scene, Workspace
-from mereo.scenes._real_meshes import close_hole, largest_piece, main_part, simplified
-from mereo.scenes._solids import Vector, segment_of, solid_of, union
+from mereo.scenes._real_meshes import main_part, simplified
+from mereo.scenes._solids import Vector, segment_of, union
 
 UNITS = 3.2342
 """Scene units per unit of the source, where the skull is 6.184 wide."""
@@ -144,7 +145,7 @@ def _source() -> dict[str, Segment]:
 def _solid(name: str) -> manifold3d.Manifold:
     """A part without the source's six stray triangles, and with the cranium's one missing triangle; simplified."""
     part = _source()[name]
-    whole = solid_of(*close_hole(*largest_piece(part.vertices, part.faces)))
+    whole = solid_of(*close_holes(*largest_piece(part.vertices, part.faces)))
     return simplified(whole, FACES.get(name, TOOTH_FACES))
 
 

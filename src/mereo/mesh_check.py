@@ -1,0 +1,154 @@
+"""What is wrong with a user's meshes: each segment by itself, segments with each other, and at random states."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import igl
+import numpy as np
+from jaxtyping import Float, Int
+
+from mereo.mesh import Segment, SegmentedMesh
+from mereo.solid import Filled
+
+BESIDE = 1e-4
+"""How far beside a face the winding number is asked, in diagonals of the box; libigl's is in single precision."""
+
+NEGLIGIBLE = 1e-3
+"""Share of a segment's surface that may lie within itself, and of its volume that may lie in another segment."""
+
+MOST_BACKWARDS = 0.05
+"""Share of the surface that may face inwards before the winding number has no meaning."""
+
+
+CELLS = 40
+"""Along each side of a segment's box, where volumes are measured: fast also for meshes with holes."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """What is wrong with one segment, as parts of a sentence that starts with its name.
+
+    Attributes:
+        dirty: faults that the winding number copes with.
+        hopeless: faults that leave no inside.
+    """
+
+    dirty: tuple[str, ...] = ()
+    hopeless: tuple[str, ...] = ()
+
+    @property
+    def sound(self) -> bool:
+        return not (self.dirty or self.hopeless)
+
+
+def examine(segment: Segment) -> Health:
+    """The faults of a mesh: missing or broken data, open edges, faces that disagree, face inwards or are buried.
+
+    Across a face the winding number rises by one from its front to its back. In front of it, it is 0 on a solid's
+    surface, 1 where the face lies within the mesh itself (a self-intersection), and -1 where it faces inwards.
+    """
+    vertices, faces = segment.vertices, segment.faces
+    if len(faces) == 0:
+        return Health(hopeless=("has no faces",))
+    if not np.isfinite(vertices).all():
+        return Health(hopeless=("has NaN or infinite vertices",))
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        return Health(hopeless=(f"has a face that refers to vertex {int(faces.max())} of {len(vertices)}",))
+    if not (segment.bounds[1] > segment.bounds[0]).all():
+        return Health(hopeless=("is flat, without any volume",))
+    dirty = []
+    open_edges, misoriented = segment.edge_imbalance()
+    if open_edges:
+        dirty.append(f"has {open_edges} open edges (holes)")
+    buried, backwards = _wrong_shares(segment)
+    if backwards > MOST_BACKWARDS:
+        return Health(tuple(dirty), (f"has {backwards:.0%} of its surface facing inwards",))
+    if misoriented:
+        dirty.append(f"has {misoriented} edges at which faces disagree in orientation")
+    if buried > NEGLIGIBLE:
+        dirty.append(f"intersects itself ({max(buried, 0.001):.1%} of its surface lies within it)")
+    return Health(tuple(dirty))
+
+
+def faces_astray(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Whether neighbouring faces disagree in orientation, or some face inwards."""
+    segment = Segment("", (0, 0, 0), vertices, faces)
+    return segment.edge_imbalance()[1] > 0 or _wrong_shares(segment)[1] > NEGLIGIBLE
+
+
+def _wrong_shares(segment: Segment) -> tuple[float, float]:
+    """Shares of the surface that lie within the mesh itself, and that face inwards."""
+    low, high = segment.bounds
+    vertices = (segment.vertices - (low + high) / 2) / float(np.linalg.norm(high - low))
+    a, b, c = (vertices[segment.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1)
+    proper = area > 1e-12
+    front = ((a + b + c) / 3)[proper] + BESIDE * normal[proper] / area[proper, None]
+    winding = igl.fast_winding_number(vertices, segment.faces.astype(np.int64), front)
+    share = area[proper] / area.sum()
+    return float(share[winding > 0.5].sum()), float(share[winding < -0.5].sum())
+
+
+# --- segments together ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Volume that two segments share without being declared nested, or that a nested one has outside.
+
+    Attributes:
+        small, large: names; the smaller one, or the inner one, first.
+        share: of the smaller segment's volume.
+        nested: whether the pair is declared nested; then ``share`` lies outside of the outer one.
+    """
+
+    small: str
+    large: str
+    share: float
+    nested: bool = False
+
+    def __str__(self) -> str:
+        if self.nested:
+            return f"{self.small} is nested in {self.large}, but {self.share:.2%} of it lies outside"
+        return f"{self.small} and {self.large} overlap in {self.share:.2%} of {self.small}"
+
+
+def overlaps(mesh: SegmentedMesh, tolerance: float = NEGLIGIBLE, cells: int = CELLS) -> tuple[Overlap, ...]:
+    """All pairs that ``solid.check_overlap`` would refuse, measured in the same way."""
+    return tuple(found for found in _overlaps(mesh, cells) if found.share > tolerance)
+
+
+def _overlaps(mesh: SegmentedMesh, cells: int) -> Iterator[Overlap]:
+    nesting = set(mesh.nesting)
+    order = sorted(range(len(mesh.segments)), key=lambda index: _box_volume(mesh.segments[index]))
+    grids = {index: Filled(mesh.segments[index], cells) for index in order}
+    for small, large in combinations(order, 2):
+        first, second = sorted((small, large))
+        inner, outer = (first, second) if (first, second) in nesting else (small, large)
+        share = grids[inner].share_in(mesh.segments[outer])
+        nested = (inner, outer) in nesting
+        yield Overlap(mesh.names[inner], mesh.names[outer], 1 - share if nested else share, nested)
+
+
+def _box_volume(segment: Segment) -> float:
+    return float(np.prod(segment.bounds[1] - segment.bounds[0]))
+
+
+def grid_volume(segment: Segment, cells: int = CELLS) -> float:
+    """The volume inside a mesh, also of one with holes, measured on a grid: within a percent or so."""
+    return Filled(segment, cells).volume
+
+
+# --- units ------------------------------------------------------------------------------------------------------------
+
+
+def likely_unit(bounds: Float[np.ndarray, "2 3"]) -> str:
+    """A guess from the longest side: CAD and scanners write millimetres, robots and glTF metres."""
+    longest = float((bounds[1] - bounds[0]).max())
+    return "m" if longest < 3 else "mm"
+
+
+PLAUSIBLE_M = (0.005, 5.0)
+"""Longest side of what a depth camera looks at: from 5 mm to 5 m."""

@@ -1,0 +1,128 @@
+"""Label volumes: surfaces where the voxels are, in millimetres of the patient, closed, smooth, and in contact."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Int
+
+from mereo.label_volume import is_volume, read_label_volume, segment_surfaces
+from mereo.mesh import SegmentedMesh
+from mereo.scene import load_scene
+from mereo.solid import Solids, check_overlap
+
+nibabel = pytest.importorskip("nibabel")
+nrrd = pytest.importorskip("nrrd")
+
+SPACING = np.array([1.5, 1.0, 2.5])
+ORIGIN = np.array([-40.0, 7.0, 100.0])
+CENTER = np.array([60.0, 70.0, 55.0])
+RADIUS = 40.0
+
+
+def halves() -> Int[np.ndarray, "80 140 44"]:
+    """A ball of radius 40 mm as 1 (lower x) and 2, with a stray voxel of 7; position is index times spacing."""
+    axes = [np.arange(n) * s for n, s in zip((80, 140, 44), SPACING, strict=True)]
+    position = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - CENTER
+    ball = np.linalg.norm(position, axis=-1) < RADIUS
+    labels = np.where(ball, np.where(position[..., 0] < 0, 1, 2), 0)
+    labels[0, 0, 0] = 7
+    return labels.astype(np.int64)
+
+
+def write_nifti(path: Path, labels: np.ndarray, flips: tuple[int, int, int] = (1, 1, 1)) -> Path:
+    affine = np.diag([*(SPACING * flips), 1.0])
+    affine[:3, 3] = ORIGIN
+    nibabel.save(nibabel.Nifti1Image(labels.astype(np.uint8), affine), path)
+    return path
+
+
+def check_halves(mesh: SegmentedMesh, center: np.ndarray) -> None:
+    mesh.check()
+    check_overlap(mesh)
+    assert mesh.names == ("liver", "spleen")
+    for label, segment in enumerate(mesh.segments, start=1):
+        assert segment.volume == pytest.approx((halves() == label).sum() * SPACING.prod(), rel=0.02)
+    joint = mesh.bounds
+    np.testing.assert_allclose(joint.mean(axis=0), center, atol=1.0)
+    np.testing.assert_allclose(joint[1] - joint[0], 2 * RADIUS, atol=2.5)
+
+
+@pytest.mark.parametrize("cells", [96, 40])
+def test_a_nifti_volume_is_in_millimetres_of_ras(cells: int, tmp_path: Path) -> None:
+    volume = read_label_volume(write_nifti(tmp_path / "a.nii.gz", halves()))
+    mesh = segment_surfaces(volume, {1: "liver", 2: "spleen"}, cells)
+    check_halves(mesh, ORIGIN + CENTER)
+    assert mesh.segments[0].bounds[1, 0] == pytest.approx(ORIGIN[0] + CENTER[0], abs=2.0)
+
+
+def test_left_handed_voxels_stay_outward_oriented(tmp_path: Path) -> None:
+    volume = read_label_volume(write_nifti(tmp_path / "a.nii", halves(), (-1, 1, 1)))
+    check_halves(segment_surfaces(volume, {1: "liver", 2: "spleen"}, 60), ORIGIN + CENTER * [-1, 1, 1])
+
+
+def test_nrrd_in_lps_is_the_same_place_as_nifti_in_ras(tmp_path: Path) -> None:
+    header = {
+        "space": "left-posterior-superior",
+        "space directions": np.diag(SPACING * [-1, -1, 1]),
+        "space origin": ORIGIN * [-1, -1, 1],
+        "Segment0_LabelValue": "2",
+        "Segment0_Name": "spleen",
+    }
+    nrrd.write(str(tmp_path / "a.seg.nrrd"), halves().astype(np.uint8), header)
+    volume = read_label_volume(tmp_path / "a.seg.nrrd")
+    expected = read_label_volume(write_nifti(tmp_path / "a.nii", halves()))
+    np.testing.assert_allclose(volume.T_world_index, expected.T_world_index)
+    np.testing.assert_array_equal(volume.labels, expected.labels)
+    assert volume.names == {2: "spleen"}
+
+
+def test_surfaces_are_smooth_and_neighbours_touch(tmp_path: Path) -> None:
+    volume = read_label_volume(write_nifti(tmp_path / "a.nii", halves()))
+    mesh = segment_surfaces(volume, {1: "liver", 2: "spleen"}, 96)
+    outer = mesh.merged()[0] - (ORIGIN + CENTER)
+    radius = np.linalg.norm(outer[np.abs(outer[:, 0]) > 5], axis=1)
+    assert np.abs(radius - RADIUS).max() < 1.25  # slices are 2.5 mm apart; unsmoothed steps would be as high
+    assert radius.std() < 0.4
+    wall = np.stack(np.meshgrid([-1.0, 1.0], np.linspace(-25, 25, 9), np.linspace(-25, 25, 9), indexing="ij"), axis=-1)
+    labels = Solids(mesh).label(wall.reshape(-1, 3) + ORIGIN + CENTER).reshape(2, -1)
+    assert (labels[0] == 1).all() and (labels[1] == 2).all()
+
+
+def test_a_segment_at_the_border_is_closed(tmp_path: Path) -> None:
+    labels = np.ones((20, 30, 10), dtype=np.int64)
+    mesh = segment_surfaces(read_label_volume(write_nifti(tmp_path / "a.nii", labels)), {1: "block"}, 96)
+    mesh.check()
+    np.testing.assert_allclose(mesh.bounds[0], ORIGIN - SPACING / 2, atol=0.6)
+    assert mesh.segments[0].volume == pytest.approx(labels.size * SPACING.prod(), rel=0.06)  # its edges are rounded
+
+
+def test_wrong_volumes_are_explained(tmp_path: Path) -> None:
+    labels = halves()
+    volume = read_label_volume(write_nifti(tmp_path / "a.nii", labels))
+    with pytest.raises(ValueError, match=r"no voxel of 'x', value 3; it holds the values 1, 2, 7"):
+        segment_surfaces(volume, {3: "x"}, 96)
+    with pytest.raises(ValueError, match=r"segment 'speck' would keep 0% .*raise `cells`, or leave"):
+        segment_surfaces(volume, {1: "liver", 7: "speck"}, 96)
+    nibabel.save(nibabel.Nifti1Image(np.full((4, 4, 4), 0.5, np.float32), np.eye(4)), tmp_path / "b.nii")
+    with pytest.raises(ValueError, match="no labels; they must be whole numbers"):
+        read_label_volume(tmp_path / "b.nii")
+    nrrd.write(str(tmp_path / "c.nrrd"), np.zeros((2, 4, 4, 4), np.uint8))
+    with pytest.raises(ValueError, match="has 4 dimensions; a label volume has 3"):
+        read_label_volume(tmp_path / "c.nrrd")
+    with pytest.raises(FileNotFoundError, match="none.nii does not exist"):
+        read_label_volume(tmp_path / "none.nii")
+    assert is_volume(Path("A.NII.GZ")) and not is_volume(Path("a.stl"))
+
+
+def test_a_scene_from_a_label_volume(tmp_path: Path) -> None:
+    write_nifti(tmp_path / "ct.nii.gz", halves())
+    path = tmp_path / "organs.yaml"
+    path.write_text("name: organs\nunits: mm\nlabels: ct.nii.gz\nnames: {1: liver, 2: spleen}\ncells: 48\n")
+    scene = load_scene(path)
+    assert scene.rest.names == ("liver", "spleen")
+    assert scene.unit_m == pytest.approx(0.08 / 20, rel=0.05)
+    check_overlap(scene.sample_state(np.random.default_rng(0)).mesh)
+    path.write_text("name: organs\nunits: mm\nlabels: ct.nii.gz\nnames: {1: liver, 5: spleen}\n")
+    with pytest.raises(ValueError, match=r"organs.yaml:3: the volume has no voxel of 'spleen'"):
+        load_scene(path)

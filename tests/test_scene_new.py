@@ -1,0 +1,120 @@
+"""`mereo scene new`: the file it writes loads as it is, fits the object, and explains every choice."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scene_files import write_mesh
+from shapes import ball, box
+from test_label_volume import halves, write_nifti
+
+import mereo.__main__ as command_line
+from mereo.camera import Camera
+from mereo.frame import inverse_rigid, transform_points
+from mereo.random_motion import RandomMotion
+from mereo.scene import SCENES, load_scene
+from mereo.scene_new import identifier, write_scene_file
+
+
+def uncommented(text: str) -> str:
+    """With every example switched on."""
+    return re.sub(r"^#  ", "  ", text, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("longest", [30.0, 400.0, 4000.0])
+def test_the_file_loads_and_the_object_is_in_view(longest: float, tmp_path: Path) -> None:
+    (tmp_path / "parts").mkdir()
+    files = [
+        write_mesh(box((0, 0, 0), (longest / 2, 12, 10)), tmp_path / "parts" / "left part.stl"),
+        write_mesh(box((longest / 2, 0, 0), (longest, 12, 10)), tmp_path / "parts" / "no.stl"),
+    ]
+    path = write_scene_file(files, tmp_path / "thing.yaml")
+    scene = load_scene(path)
+    assert (scene.name, scene.rest.names) == ("thing", ("left part", "no"))
+    assert scene.unit_m is not None
+    assert scene.unit_m * (scene.rest.bounds[1] - scene.rest.bounds[0]).max() == pytest.approx(longest / 1000)
+    camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        mesh = scene.sample_state(rng).mesh
+        pose = scene.workspace.sample(rng, mesh.bounds.mean(axis=0))
+        pixels = camera.project(transform_points(inverse_rigid(pose), mesh.merged()[0]))
+        assert ((pixels > 0) & (pixels < 96)).all(axis=1).mean() > 0.97
+    assert "file: parts/left part.stl" in path.read_text() and "name: 'no'" in path.read_text()
+
+
+def test_every_example_in_the_comments_is_valid(tmp_path: Path) -> None:
+    path = write_scene_file([write_mesh(ball((5, 5, 5), 30.0), tmp_path / "a.ply")], tmp_path / "a.yaml")
+    path.write_text(uncommented(path.read_text()))
+    scene = load_scene(path)
+    assert isinstance(scene.sample_deformations, RandomMotion)
+    assert len(scene.sample_deformations.steps) == 7
+    scene.sample_state(np.random.default_rng(0)).mesh.check()
+
+
+def test_a_model_and_a_label_volume(tmp_path: Path) -> None:
+    model = trimesh.Scene()
+    for name, low in (("Body", 0.0), ("Lid #2", 1.0)):
+        part = box((low, 0, 0), (low + 1, 1, 1))
+        model.add_geometry(trimesh.Trimesh(part.vertices, part.faces), node_name=name, geom_name=name)
+    model.export(tmp_path / "box.glb")
+    path = write_scene_file([tmp_path / "box.glb"], tmp_path / "box.yaml")
+    assert load_scene(path).rest.names == ("Body", "Lid #2")
+    assert "units: m  # the rule of glTF" in path.read_text()
+    volume = write_nifti(tmp_path / "ct.nii.gz", np.where(halves() == 7, 0, halves()))
+    path = write_scene_file([volume], tmp_path / "ct.yaml")
+    assert load_scene(path).rest.names == ("label_1", "label_2")
+
+
+def test_3mf(tmp_path: Path) -> None:
+    part = box((0, 0, 0), (10, 20, 30))
+    file = tmp_path / "plate.3mf"
+    try:
+        import lxml  # noqa: F401
+    except ImportError:
+        file.write_bytes(b"PK")
+        with pytest.raises(ImportError, match="mereo\\[cad\\]"):
+            write_scene_file([file])
+        return
+    trimesh.Scene({"plate": trimesh.Trimesh(part.vertices, part.faces)}).export(file)
+    scene = load_scene(write_scene_file([file], tmp_path / "plate.yaml"))
+    assert scene.rest.segments[0].volume == pytest.approx(8 * 6000)
+    assert scene.unit_m == pytest.approx(0.0005)
+
+
+def test_nothing_is_overwritten_and_bad_input_is_explained(tmp_path: Path) -> None:
+    file = write_mesh(ball((0, 0, 0), 3.0), tmp_path / "a.ply")
+    (tmp_path / "sub").mkdir()
+    same = write_mesh(ball((0, 0, 0), 3.0), tmp_path / "sub" / "a.stl")
+    path = write_scene_file([file], tmp_path / "a.yaml")
+    for files, output, error, message in (
+        ([file], path, FileExistsError, "a.yaml exists; it is not overwritten"),
+        ([file], tmp_path / "a.txt", ValueError, "a scene file is .yaml"),
+        ([], None, ValueError, "no mesh is given"),
+        ([file, same], tmp_path / "b.yaml", ValueError, "two files are called 'a'"),
+        ([tmp_path / "none.stl"], tmp_path / "b.yaml", FileNotFoundError, "none.stl does not exist"),
+        ([file, tmp_path / "ct.nii"], tmp_path / "b.yaml", ValueError, "a label volume among them"),
+    ):
+        with pytest.raises(error, match=message):
+            write_scene_file(files, output)
+    assert not (tmp_path / "b.yaml").exists()
+
+
+def test_names_are_valid_and_new() -> None:
+    assert identifier("My part (2)") == "My-part-2"
+    assert identifier("...") == "object"
+    assert identifier(SCENES[0]) == f"my-{SCENES[0]}"
+
+
+def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    write_mesh(ball((0, 0, 0), 30.0), tmp_path / "a.ply")
+    monkeypatch.chdir(tmp_path)
+    assert command_line.main(["scene", "new", "a.ply", "--units", "cm"]) == 0
+    assert "units: cm  # as you said" in (tmp_path / "a.yaml").read_text()
+    assert "wrote a.yaml" in capsys.readouterr().out
+    assert command_line.main(["scene", "check", "a.yaml"]) == 0
+    assert "a: 1 segments, closed" in capsys.readouterr().out
+    assert command_line.main(["scene", "preview", "a.yaml", "--output", "a.png"]) == 0
+    assert (tmp_path / "a.png").stat().st_size > 10_000
