@@ -2,6 +2,7 @@
 
 import pickle
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from mereo.deformation import jacobian_determinant
 from mereo.mesh import PALETTE
 from mereo.random_motion import RandomMotion
 from mereo.scene import SCENES, load_scene
+from mereo.scene_schema import Deformation, SceneFile
 from mereo.warps import FreeFormLattice
 
 EVERYTHING = """
@@ -214,3 +216,12 @@ def test_a_scene_from_a_python_file(tmp_path: Path) -> None:
             load_scene(path)
     with pytest.raises(FileNotFoundError, match="none.py does not exist"):
         load_scene(tmp_path / "none.py")
+
+
+def test_every_key_and_every_deformation_is_documented() -> None:
+    text = (Path(__file__).parent.parent / "docs" / "own-object.md").read_text("utf-8")
+    assert [key for key in SceneFile.model_fields if f"| `{key}` |" not in text] == []
+    for block in get_args(Deformation):
+        (kind,) = get_args(block.model_fields["type"].annotation)
+        row = next(line for line in text.splitlines() if line.startswith(f"| `{kind}` |"))
+        assert [key for key in block.model_fields if key not in ("type", "segments") and f"`{key}`" not in row] == []

@@ -26,13 +26,14 @@ OWN_OBJECT = """[bold]On your own data[/bold]
   mereo reconstruct cloud.ply --weights bunny --output result
   mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --weights bunny --output result
 
-[bold]On your own object[/bold]: describe it as in src/mereo/scenes/rope.py, then
-  mereo scene check NAME
-  mereo scene preview NAME --output states.png
-  mereo generate NAME --examples 12000 --seed 1 --sampler nested-sort-sample --uniform-fraction 0.5 --output data/NAME
-  mereo train data/NAME --output runs/NAME --preset base --epochs 20
-  mereo evaluate runs/NAME/weights.safetensors --output runs/NAME/test
-  mereo reconstruct frame.ply --weights runs/NAME/weights.safetensors --output result"""
+[bold]On your own object[/bold], from its meshes; docs/own-object.md explains each step
+  mereo scene new PART.stl PART.stl --output NAME.yaml
+  mereo scene check NAME.yaml
+  mereo scene preview NAME.yaml --output states.png
+  mereo generate NAME.yaml --examples 12000 --seed 1 --sampler nested-sort-sample --uniform-fraction 0.5 --output data
+  mereo train data --output run --preset base --epochs 20
+  mereo evaluate run/weights.safetensors --scene NAME.yaml --output test
+  mereo reconstruct frame.ply --weights run/weights.safetensors --output result"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -177,7 +177,7 @@ def _remesh(vertices: Vertices, faces: Faces) -> Step:
         field.reshape([len(axis) for axis in axes]), 0.0, gradient_direction="ascent"
     )
     solid = solid_of(found.astype(np.float64) * step + [axis[0] for axis in axes], triangles.astype(np.int64))
-    solid = solid.simplify(0.1 * step)
+    solid = solid.simplify(0.2 * step)
     return *mesh_of(solid), f"made a new surface from the winding number; details below {2 * step:.2g} are lost"
 
 

@@ -154,7 +154,7 @@ def _difference(before: Segment, after: Segment) -> str:
     faces = f"{len(before.faces)} faces before, {len(after.faces)} now"
     if examine(before).hopeless:
         return faces
-    was = grid_volume(replace(before, solid=examine(before).sound))
+    was = before.volume if examine(before).sound else grid_volume(replace(before, solid=False))
     return f"{faces}; volume {100 * (after.volume / was - 1) if was else np.inf:+.2g} %"
 
 
