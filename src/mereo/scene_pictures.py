@@ -30,6 +30,7 @@ VIEWS: Mapping[str, tuple[Vector, Vector]] = {
     "shapes": ((0.5, 1.0, -0.6), (0.0, 0.0, 1.0)),
     "sheet": ((0.3, 0.8, -0.75), (0.0, 0.0, 1.0)),
     "tumor": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
+    "liver-simulated": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
 }
 """From where each scene is drawn: viewing direction and up, in the scene's frame."""
 

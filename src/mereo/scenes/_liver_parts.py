@@ -94,7 +94,7 @@ GRASPER = Instrument((10.0, 32.0), tip_mm=14.0, reach_mm=94.0)
 RETRACTOR = Instrument((5.0, 16.0), tip_mm=14.0, reach_mm=80.0)
 PROBE = Instrument((-16.0, -5.0), tip_mm=8.0, reach_mm=70.0)
 
-BEND_RAD, TWIST_RAD, SQUASH = 0.6, 0.6, 0.12
+BEND_RAD, TWIST_RAD, SQUASH = 0.5, 0.6, 0.12
 LATTICE_CELLS, LATTICE_STRENGTH = (3, 3, 3), 0.4
 
 EDGE_SHARE = 0.12

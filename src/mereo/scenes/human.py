@@ -46,7 +46,7 @@ from mereo.warps import SmoothField
 ATTEMPTS = 1000
 
 APART = 3.2
-"""Balls with at least this gap at rest are watched; closer ones touch or belong together, as beside a knee."""
+"""Balls with at least this gap at rest are watched; closer ones touch or belong together, like both sides of a knee."""
 
 LEAST_GAP = 0.5
 """That watched balls must keep: what lies between them and the skin is at most half of this deep."""
