@@ -3,6 +3,7 @@
 Document -validated-> SceneFile -read_segments-> SegmentedMesh in the file's unit -scaled-> Scene
 """
 
+import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from mereo.mesh_check import examine
 from mereo.scene import SCENES, Scene, Workspace
 from mereo.scene_parts import read_segments
 from mereo.scene_schema import SceneFile, similar
+from mereo.simulated import load_states
 from mereo.yaml_document import Document
 
 ELSEWHERE = {"source", "segments", "model", "parts", "labels", "names", "cells"}
@@ -69,15 +71,36 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     placement = placed(mesh, file.size)
     rest = mesh.with_vertices([placement.apply(segment.vertices) for segment in mesh.segments])
     workspace = _workspace(document, file.camera, rest.bounds)
-    return Scene(
-        name=file.name,
-        rest=rest,
-        sample_deformations=_Builder(document, placement, rest).random_motion(file.deformations),
-        workspace=workspace,
-        source=file.source,
-        unit_m=file.units / placement.scale,
-        definition=file.model_dump_json(exclude=ELSEWHERE),
-    )
+    unit_m, definition = file.units / placement.scale, file.model_dump_json(exclude=ELSEWHERE)
+    if file.states is not None:
+        scene = _recorded(document, file, rest, placement, workspace)
+        definition += _digest(document.path.parent / file.states)
+    else:
+        motions = _Builder(document, placement, rest).random_motion(file.deformations)
+        scene = Scene(file.name, rest, motions, workspace, file.source)
+    return replace(scene, unit_m=unit_m, definition=definition)
+
+
+def _recorded(
+    document: Document, file: SceneFile, rest: SegmentedMesh, placement: Normalizer, workspace: Workspace
+) -> Scene:
+    """A scene in the states of ``states``, whose coordinates are those of the meshes."""
+    assert file.states is not None
+    path = document.path.parent / file.states
+    if not path.exists():
+        raise document.error(("states",), f"`states` is {file.states!r}, and {path} does not exist: check the path")
+    x, y, z = -placement.scale * placement.center
+    states = load_states(path, rest, scale=placement.scale, shift=(x, y, z), held_out=file.held_out)
+    return states.scene(file.name, rest, workspace, file.source)
+
+
+def _digest(path: Path) -> str:
+    """Of recorded states, a file or a directory: other states are another scene."""
+    digest = hashlib.sha256()
+    for file in [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file()):
+        with file.open("rb") as content:
+            digest.update(file.name.encode() + hashlib.file_digest(content, "sha256").digest())
+    return digest.hexdigest()
 
 
 def placed(mesh: SegmentedMesh, size: float) -> Normalizer:

@@ -208,6 +208,7 @@ class SceneFile(Block):
         size: length of the object's shortest side, in scene units.
         camera: its workspace.
         deformations: applied in this order; a lattice over all segments where absent.
+        states, held_out: recorded states instead of deformations, and the share of frames kept for testing.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
@@ -224,6 +225,14 @@ class SceneFile(Block):
     deformations: Annotated[list[Annotated[Deformation, Field(discriminator="type")]], Field(min_length=1)] | None = (
         None
     )
+    states: str | None = None
+    held_out: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.1
+
+    @model_validator(mode="after")
+    def _moves_in_one_way(self) -> "SceneFile":
+        if self.states is not None and self.deformations is not None:
+            raise ValueError("it has both states and deformations; recorded states say how the object moves: drop one")
+        return self
 
     @model_validator(mode="after")
     def _has_one_source(self) -> "SceneFile":
