@@ -238,4 +238,6 @@ deformations:
 #    pivot: {center}
 #    axis: [0, 0, 1]
 #    angle: [-30, 30]
+# Recorded frames of a simulator take the place of all deformations:
+#states: states.npz
 """
