@@ -15,7 +15,10 @@ BESIDE = 1e-4
 """How far beside a face the winding number is asked, in diagonals of the box; libigl's is in single precision."""
 
 NEGLIGIBLE = 1e-3
-"""Share of a segment's surface that may lie within itself, and of its volume that may lie in another segment."""
+"""Share of a segment's volume that may lie in another one, and of its surface that may face inwards."""
+
+MOST_BURIED = 5e-3
+"""Share of a segment's surface that may lie within itself, as lips and eyelids do: two rays are compared anyway."""
 
 MOST_BACKWARDS = 0.05
 """Share of the surface that may face inwards before the winding number has no meaning."""
@@ -66,8 +69,8 @@ def examine(segment: Segment) -> Health:
         return Health(tuple(dirty), (f"has {backwards:.0%} of its surface facing inwards",))
     if misoriented:
         dirty.append(f"has {misoriented} edges at which faces disagree in orientation")
-    if buried > NEGLIGIBLE:
-        dirty.append(f"intersects itself ({max(buried, 0.001):.1%} of its surface lies within it)")
+    if buried > MOST_BURIED:
+        dirty.append(f"intersects itself ({buried:.1%} of its surface lies within it)")
     return Health(tuple(dirty))
 
 
