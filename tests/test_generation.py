@@ -16,7 +16,7 @@ import pytest
 from safetensors.numpy import load_file
 from toy_scene import toy_scene
 
-from mereo import generation
+from mereo import progress
 from mereo.config import TEST_SEED_START, GenerateConfig, SamplingConfig
 from mereo.dataset import Dataset
 from mereo.generation import example_bytes, generate
@@ -289,7 +289,7 @@ def test_wrong_numbers_are_named(
 def test_progress_tells_rate_and_time_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(generation, "SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
     generate(TOY, tmp_path / "data", SMALL, examples=6, seed=3)
     lines = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"4 of 6, \d+\.\d examples/s, \d+ s left", lines[0])

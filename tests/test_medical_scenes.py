@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mereo.deformation import jacobian_determinant
-from mereo.mesh_repair import close_holes, largest_piece, mesh_of, solid_of
+from mereo.manifold import mesh_of, solid_of
+from mereo.mesh_repair import close_holes, largest_piece
 from mereo.scene import load_scene
 from mereo.scenes import _liver_parts, skull, tumor
 from mereo.solid import Solids, check_overlap

@@ -9,8 +9,8 @@ from PIL import Image
 from toy_scene import toy_scene
 
 from mereo import scene_pictures
-from mereo.commands import ScenePreview
 from mereo.scene import SCENES, Scene
+from mereo.scene_commands import ScenePreview
 from mereo.scene_pictures import SIZE, preview_all, scene_row
 
 

@@ -15,10 +15,8 @@ nothing half-written.
 import hashlib
 import json
 import platform
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
@@ -26,13 +24,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from mereo.config import TEMPLATE, TEST_SEED_START, GenerateConfig
 from mereo.output import atomic_file, write_json
 from mereo.parallel import in_processes
+from mereo.progress import progress
 from mereo.query_sampling import check_settings
 from mereo.rest_pose import rest_distances
 from mereo.scene import Scene, is_yaml, load_scene
@@ -46,8 +44,6 @@ LIBRARIES = ("numpy", "scipy", "embreex", "libigl", "manifold3d", "trimesh")
 
 NOT_COMPARED = ("libraries", "bytes")
 """Manifest entries that may differ when a dataset is resumed."""
-
-SECONDS_BETWEEN_LINES = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +123,7 @@ def generate(
     total = sum(item.end - item.first for item in missing)
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile
     work = partial(_make_shard, _Work(loaded if is_yaml(scene) else scene, settings, seed))
-    with closing(in_processes(work, missing, workers)) as made, _progress(total) as advance:
+    with closing(in_processes(work, missing, workers)) as made, progress(total) as advance:
         for item, data in made:
             with atomic_file(item.path) as temporary:
                 temporary.write_bytes(data)
@@ -267,37 +263,3 @@ def pack(example: Example, points: int) -> dict[str, np.ndarray]:
         "directions": queries.directions.astype(np.float16),
         "rest": queries.rest.astype(np.float16),
     }
-
-
-# --- progress ---------------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Callable[[int], None]]:
-    """Yields a function that takes the number of new examples; a bar on a terminal, a line now and then elsewhere."""
-    bar = Progress(BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), transient=True)
-    task = bar.add_task("", total=total)
-    terminal, done = sys.stdout.isatty(), 0
-    start = shown = time.monotonic()
-
-    def advance(count: int) -> None:
-        nonlocal done, shown
-        done, now = done + count, time.monotonic()
-        rate = done / max(now - start, 1e-9)
-        text = f"{rate:.1f} examples/s, {_duration((total - done) / rate)} left"
-        if terminal:
-            bar.update(task, completed=done, description=text)
-        elif now - shown >= SECONDS_BETWEEN_LINES:
-            print(f"{done} of {total}, {text}", flush=True)
-            shown = now
-
-    with bar if terminal else nullcontext():
-        yield advance
-    print(f"{done} examples made in {_duration(time.monotonic() - start)}", flush=True)
-
-
-def _duration(seconds: float) -> str:
-    minutes = round(seconds / 60)
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"

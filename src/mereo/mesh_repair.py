@@ -1,4 +1,4 @@
-"""Meshes made fit: pieces, holes, orientation, self-intersections, overlaps; and to and from manifold3d's solids.
+"""Meshes made fit: pieces, holes, orientation, self-intersections, overlaps.
 
 ``repaired`` does only what a segment needs, in the order of least change, and says what it did. The surface itself is
 moved by the last resort alone, a new surface from the winding number. Everything is deterministic.
@@ -16,11 +16,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
+from mereo.manifold import Faces, Vertices, mesh_of, solid_of
 from mereo.mesh import Segment, SegmentedMesh
 from mereo.mesh_check import examine, faces_astray, overlaps
-
-Vertices = Float[np.ndarray, "_ 3"]
-Faces = Int[np.ndarray, "_ 3"]
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""
@@ -278,23 +276,3 @@ def _grouped(rim: Int[np.ndarray, "_ 2"], group: Int[np.ndarray, " v"]) -> Itera
     """The edges of each connected loop."""
     for index in np.unique(group[rim[:, 0]]):
         yield rim[group[rim[:, 0]] == index]
-
-
-# --- solids -----------------------------------------------------------------------------------------------------------
-
-
-def solid_of(vertices: Vertices, faces: Faces) -> manifold3d.Manifold:
-    """A closed mesh as a solid; raises ``ValueError`` where manifold3d does not accept it."""
-    mesh = manifold3d.Mesh64(
-        np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.uint64)
-    )
-    solid = manifold3d.Manifold(mesh)
-    if solid.status() != manifold3d.Error.NoError:
-        raise ValueError(f"a mesh of {len(faces)} faces is no solid ({solid.status().name}); it must be closed")
-    return solid
-
-
-def mesh_of(solid: manifold3d.Manifold) -> tuple[Vertices, Faces]:
-    """Vertices and faces of a solid."""
-    mesh = solid.to_mesh64()
-    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from manifold3d import Manifold, OpType
 
+from mereo.manifold import mesh_of, solid_of
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.mesh_files import read_segmented_mesh
-from mereo.mesh_repair import mesh_of, solid_of
 from mereo.scene_schema import FilePart, ModelPart, PartLook, SceneFile, similar
 from mereo.yaml_document import Document
 

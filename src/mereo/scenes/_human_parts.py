@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo import assets
+from mereo.manifold import mesh_of, solid_of
 from mereo.mesh import PALETTE, SegmentedMesh
-from mereo.mesh_repair import mesh_of, solid_of
 from mereo.scenes._real_meshes import simplified
 from mereo.scenes._solids import Vector, segment_of
 

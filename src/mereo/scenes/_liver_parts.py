@@ -13,9 +13,10 @@ from scipy.spatial import cKDTree
 
 from mereo import assets
 from mereo.deformation import Compose, Deformation, Localized, Rigid
+from mereo.manifold import Faces, Vertices, solid_of
 from mereo.mesh import PALETTE, Segment
 from mereo.mesh_files import read_segmented_mesh
-from mereo.mesh_repair import Faces, Vertices, close_holes, largest_piece, solid_of
+from mereo.mesh_repair import close_holes, largest_piece
 from mereo.scene import Workspace
 from mereo.scenes._real_meshes import main_part, simplified
 from mereo.scenes._solids import segment_of

@@ -1,10 +1,10 @@
-"""Real meshes as solids for the built-in scenes, after ``mesh_repair``: largest part, fewer faces."""
+"""Real meshes as solids for the built-in scenes, after ``mesh_repair`` has made them so: largest part, fewer faces."""
 
 import igl
 import manifold3d
 import numpy as np
 
-from mereo.mesh_repair import mesh_of, solid_of
+from mereo.manifold import mesh_of, solid_of
 
 
 def main_part(solid: manifold3d.Manifold) -> manifold3d.Manifold:

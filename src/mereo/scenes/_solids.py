@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from manifold3d import CrossSection, Manifold, OpType
 
+from mereo.manifold import mesh_of
 from mereo.mesh import Color, Segment
-from mereo.mesh_repair import mesh_of
 
 Vector = tuple[float, float, float]
 

@@ -28,9 +28,10 @@ from jaxtyping import Float
 
 from mereo import assets
 from mereo.deformation import Compose, Deformation, Identity, Rigid
+from mereo.manifold import solid_of
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.mesh_files import read_segmented_mesh
-from mereo.mesh_repair import close_holes, largest_piece, solid_of
+from mereo.mesh_repair import close_holes, largest_piece
 from mereo.scene import Scene, Workspace
 from mereo.scenes._real_meshes import main_part, simplified
 from mereo.scenes._solids import Vector, segment_of, union
