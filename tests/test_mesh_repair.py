@@ -196,6 +196,19 @@ def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path) -> None:
     check_overlap(load_scene(tmp_path / "two-repaired.yaml").rest)
 
 
+def test_a_mesh_without_an_inside_is_reported_and_turned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_bar(tmp_path)
+    part = trimesh.load_mesh(tmp_path / "left.stl")
+    write_mesh(
+        Segment("left", (0, 0, 0), np.array(part.vertices), np.array(part.faces)[:, ::-1]), tmp_path / "left.stl"
+    )
+    with pytest.raises(ValueError, match="has 1 fault, listed above"):
+        check_scene(str(path))
+    assert "left                     192 faces\n  fault: it has 100% of its surface facing" in capsys.readouterr().out
+    check_scene(str(path), repair=True)
+    assert "repaired left: turned 192 faces around" in capsys.readouterr().out
+
+
 def test_only_yaml_files_are_repaired() -> None:
     with pytest.raises(ValueError, match="'rope' is none"):
         check_scene("rope", repair=True)

@@ -132,7 +132,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     Args:
         volume: the labels; those without a name count as empty space.
         names: of the values; several may share one.
-        cells: of the grid along the longest side; a cell is never finer than a voxel.
+        cells: of the grid along the longest side, roughly: a cell is a whole number of voxels.
 
     Raises ``ValueError`` for a value that does not occur, and for a segment too thin for the grid.
     """
@@ -182,12 +182,12 @@ class _Grid:
 
     @classmethod
     def around(cls, mask: Bool[np.ndarray, "x y z"], transform: Float[np.ndarray, "4 4"], cells: int) -> "_Grid":
-        """Over all that is set, with ``cells`` along the longest side, or fewer where a cell would be below a voxel."""
+        """Over all that is set, with about ``cells`` along the longest side; a cell is a whole number of voxels."""
         sides = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
         first, end = np.array([side[0] for side in sides]), np.array([side[-1] + 1 for side in sides])
         voxel = np.linalg.norm(transform[:3, :3], axis=0)
         wanted = ((end - first) * voxel).max() / cells
-        block = np.maximum(np.floor(wanted / voxel + 1e-9).astype(np.int64), 1)
+        block = np.maximum(np.rint(wanted / voxel).astype(np.int64), 1)
         return cls(first, -(-(end - first) // block), block, transform)
 
     def share(self, mask: Bool[np.ndarray, "x y z"]) -> Float32[np.ndarray, "a b c"]:

@@ -75,18 +75,16 @@ def _report(mesh: SegmentedMesh, unit: str) -> int:
     """Print each segment and each overlap; returns the number of faults."""
     faults = 0
     health = [examine(segment) for segment in mesh.segments]
-    volumes = mesh.owned_volumes
+    usable = not any(found.hopeless for found in health)
+    volumes = mesh.owned_volumes if usable else [np.nan] * len(health)
     for segment, found, volume in zip(mesh.segments, health, volumes, strict=True):
-        if found.hopeless:
-            amount = "no volume"
-        else:
-            inside = volume if found.sound else grid_volume(replace(segment, solid=False))
-            amount = f"volume {inside:.4g} {unit}"
-        print(f"{segment.name:<20} {len(segment.faces):>7} faces   {amount}")
+        inside = volume if found.sound or found.hopeless else grid_volume(replace(segment, solid=False))
+        amount = f"   volume {inside:.4g} {unit}" if np.isfinite(inside) else ""
+        print(f"{segment.name:<20} {len(segment.faces):>7} faces{amount}")
         for fault in (*found.hopeless, *found.dirty):
             faults += 1
             print(f"  fault: it {fault}")
-    if not any(found.hopeless for found in health):
+    if usable:
         for overlap in overlaps(_marked(mesh)):
             faults += 1
             print(f"  fault: {overlap}")

@@ -29,7 +29,7 @@ ROOM = 1.15
 
 MOST_VIEW_RAD = float(np.deg2rad(60.0))
 
-LABEL_CELLS = 96
+LABEL_CELLS = 64
 
 
 @dataclass(frozen=True, eq=False)

@@ -219,7 +219,7 @@ class SceneFile(Block):
     parts: Annotated[list[ModelPart], Field(min_length=1)] | None = None
     labels: str | None = None
     names: Annotated[dict[Annotated[int, Field(ge=1)], Name], Field(min_length=1)] | None = None
-    cells: Annotated[int, Field(ge=16, le=400)] = 96
+    cells: Annotated[int, Field(ge=16, le=400)] = 64
     size: Positive = 20.0
     camera: Camera = Camera()
     deformations: Annotated[list[Annotated[Deformation, Field(discriminator="type")]], Field(min_length=1)] | None = (
