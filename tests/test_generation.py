@@ -16,7 +16,7 @@ import pytest
 from safetensors.numpy import load_file
 from toy_scene import toy_scene
 
-from mereo import progress
+from mereo import generation, progress
 from mereo.config import TEST_SEED_START, GenerateConfig, SamplingConfig
 from mereo.dataset import Dataset
 from mereo.generation import example_bytes, generate

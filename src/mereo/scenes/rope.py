@@ -1,11 +1,16 @@
-"""Rope: a base and a rope of eight identical segments in random curves; modelled here, needs no download.
+"""Rope: it hangs from a base, in random curves and coils; modelled here, needs no download.
+
+Source: modelled in mereo's own code, MIT licence. The x axis points down: the base is fixed above, the rope hangs from
+it, and the camera looks across, from a cone about z.
 
 Segments: `base` (a rounded block) and `segment_1` (at the base) to `segment_8` (the free end), each a piece of one
 round rope, 8 units long and 3.6 thick.
 
-Degrees of freedom: heading and elevation of the rope's centreline are smooth random functions of arc length (four
-harmonics each), so it bends at most 0.22 per unit (radius of curvature 4.5), turns up to full loops, rises and droops.
-The base stays. Curves in which the rope would touch itself or the base are drawn again.
+Degrees of freedom: the base stays. Two ropes in three swing: heading and elevation of the centreline are smooth random
+functions of arc length (four harmonics each), up to full loops. One in three coils: from somewhere in its upper part on
+it winds about an axis across it, 0.13 to 0.2 radians per unit, which is up to 1.8 turns, each 5 to 9 units beside the
+last. Nothing bends more than 0.22 per unit (radius of curvature 4.5). Curves in which the rope would touch itself or
+the base are drawn again.
 
 What makes it hard: the segments are identical, so a segment's name follows only from its place along the rope, which
 may be hidden where the rope crosses itself in the image. The paper's own Rope reaches mIoU 0.375 (or 0.422).
@@ -100,25 +105,52 @@ def rest_mesh() -> SegmentedMesh:
 
 NODES = np.linspace(0.0, LENGTH, 97)
 
+COILS = 1 / 3
+"""The share of ropes that coil."""
+
+COIL_PITCH = (5.0, 9.0)
+"""Between neighbouring turns; the rope is 3.6 thick."""
+
+COIL_BEGINS = 10.0
+"""Over this length straight becomes coiled: the turn out of the plane, at most 0.03 per unit, bends little more."""
+
 
 def sample_centerline(rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
-    """Tangents' heading and elevation as random harmonics, scaled to a random share of the largest bend."""
-    k = np.arange(1, HARMONICS + 1)
-    phases = rng.uniform(0, 2 * np.pi, size=(2, HARMONICS, 1))
-    amplitudes = rng.normal(size=(2, HARMONICS, 1)) / np.sqrt(k)[:, None]
-    rates = (amplitudes * np.cos(np.pi * k[:, None] * NODES / LENGTH + phases)).sum(axis=1)
-    rates[1] *= 0.5  # the rope mostly lies or hangs in sweeps sideways; elevation changes less
-    rates *= rng.uniform(0.15, 1.0) * MAX_BEND / np.linalg.norm(rates, axis=0).max()
-    rates *= np.clip(NODES / 6.0, 0.0, 1.0)  # leaves the base straight
-    step = NODES[1]
-    heading, elevation = (np.cumsum(rates, axis=1) - rates / 2) * step
-    elevation = 1.2 * np.tanh(elevation / 1.2)
+    """Places at ``NODES`` along a random rope that starts along x."""
+    heading, elevation = coil(rng) if rng.random() < COILS else swing(rng)
     tangents = np.stack(
         [np.cos(elevation) * np.cos(heading), np.cos(elevation) * np.sin(heading), np.sin(elevation)], axis=1
     )
     middle = (tangents[1:] + tangents[:-1]) / 2
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(middle * step, axis=0)])
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(middle * NODES[1], axis=0)])
+
+
+Angles = tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]
+"""Heading and elevation of the tangent at ``NODES``."""
+
+
+def swing(rng: np.random.Generator) -> Angles:
+    """Random harmonics, scaled to a random share of the largest bend."""
+    k = np.arange(1, HARMONICS + 1)
+    phases = rng.uniform(0, 2 * np.pi, size=(2, HARMONICS, 1))
+    amplitudes = rng.normal(size=(2, HARMONICS, 1)) / np.sqrt(k)[:, None]
+    rates = (amplitudes * np.cos(np.pi * k[:, None] * NODES / LENGTH + phases)).sum(axis=1)
+    rates[1] *= 0.5  # the camera sees sweeps sideways better
+    rates *= rng.uniform(0.15, 1.0) * MAX_BEND / np.linalg.norm(rates, axis=0).max()
+    rates *= np.clip(NODES / 6.0, 0.0, 1.0)  # leaves the base straight
+    heading, elevation = (np.cumsum(rates, axis=1) - rates / 2) * NODES[1]
+    return heading, 1.2 * np.tanh(elevation / 1.2)
+
+
+def coil(rng: np.random.Generator) -> Angles:
+    """A helix from a random place on; its axis is z and its pitch keeps the turns apart."""
+    start, rate, pitch = rng.uniform(0.05, 0.4) * LENGTH, rng.uniform(0.13, 0.2), rng.uniform(*COIL_PITCH)
+    begun = np.clip((NODES - start) / COIL_BEGINS, 0.0, 1.0)
+    heading = rng.choice([-1.0, 1.0]) * np.cumsum(rate * begun) * NODES[1]
+    # one turn takes an arc of 2 pi / rate, of which the sine of the elevation is pitch
+    elevation = rng.choice([-1.0, 1.0]) * np.arcsin(pitch * rate / (2 * np.pi)) * begun
+    return heading, elevation
 
 
 def is_clear(center: Float[np.ndarray, "m 3"]) -> bool:
