@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from mereo.config import GenerateConfig, TrainConfig
 
-Preset = Literal["paper", "base", "large", "tiny"]
+Preset = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,8 @@ class Train:
     Attributes:
         dataset: folder written by `mereo generate`.
         output: folder of the run.
-        preset: what the options below start from: as published, recommended, the same for a GPU, a two-minute trial.
+        preset: what the options below start from: as published, as published for --network.encoder autodecoder,
+            recommended, the same for a GPU, a two-minute trial.
         config: the recipe; defaults are the chosen preset's.
     """
 
