@@ -148,7 +148,10 @@ def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, lo
     model = load_model(training.train(dataset, tmp_path / "run", config))
     cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 50.0), size=(80, 3))
     answer = model.query(model.encode(cloud), cloud[:7])
-    assert answer.label.shape == (7,) and np.isfinite(answer.distance).all()
+    assert answer.label.shape == (7,) and answer.probability.shape[1] == (2 if loss == "l1" else 3)
+    # what was not trained is not answered
+    assert np.isfinite(answer.distance).all() == ("l1" in loss) != np.isnan(answer.distance).all()
+    assert np.isfinite(answer.direction).all() == ("cd" in loss) != np.isnan(answer.direction).all()
 
 
 def test_bfloat16_trains(dataset: Path, tmp_path: Path) -> None:

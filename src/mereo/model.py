@@ -57,20 +57,24 @@ class Network(nn.Module):
             # the search needs gradients, which tensors of inference mode cannot give
             with torch.inference_mode(False), torch.no_grad():
                 return self._search(self.encoder, cloud.clone(), viewpoint.clone())
-        alignment = self._align(cloud)
-        return self.decoder.prepare(self._encode(cloud, alignment, None), cloud, viewpoint, alignment)
+        return self._encode(cloud, viewpoint, self._align(cloud))
 
     def _align(self, cloud: Float[Tensor, "b n 3"]) -> Alignment | None:
         return None if self.aligner is None else self.aligner(cloud).alignment
 
     def _encode(
-        self, cloud: Float[Tensor, "b n 3"], alignment: Alignment | None, index: Int[Tensor, " b"] | None
-    ) -> Encoding:
+        self,
+        cloud: Float[Tensor, "b n 3"],
+        viewpoint: Float[Tensor, "b 3"],
+        alignment: Alignment | None,
+        index: Int[Tensor, " b"] | None = None,
+    ) -> Code:
         if isinstance(self.encoder, Autodecoder):
-            assert index is not None, "an autodecoder knows its training examples by number"
-            return Encoding(self.encoder.code(index), ())
-        encoding: Encoding = self.encoder(cloud if alignment is None else alignment.apply(cloud))
-        return encoding
+            assert index is not None, "an autodecoder has codes of its training examples only"
+            encoding = Encoding(self.encoder.code(index), ())
+        else:
+            encoding = self.encoder(cloud if alignment is None else alignment.apply(cloud))
+        return self.decoder.prepare(encoding, cloud, viewpoint, alignment)
 
     def _search(self, encoder: Autodecoder, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
         alignment = self._align(cloud)
@@ -106,8 +110,7 @@ class Network(nn.Module):
         alignment, coarse = None, None
         if self.aligner is not None:
             alignment, coarse = self.aligner(cloud, points[:, :ALIGNED_QUERIES])
-        code = self.decoder.prepare(self._encode(cloud, alignment, index), cloud, viewpoint, alignment)
-        prediction = self.query(code, points)
+        prediction = self.query(self._encode(cloud, viewpoint, alignment, index), points)
         return prediction.logits, prediction.distance, prediction.direction, prediction.rest, coarse
 
 

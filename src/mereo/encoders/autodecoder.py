@@ -37,12 +37,13 @@ class Autodecoder(nn.Module):
         self.register_buffer("mean", torch.zeros(config.latent))
 
     def add_codes(self, examples: int) -> None:
-        """Random codes of length about one, for training."""
+        """Random codes for training, about one away from the mean (which is zero in a new network)."""
         width = len(self.mean)
-        self.codes = nn.Parameter(torch.randn(examples, width) / math.sqrt(width))
+        self.codes = nn.Parameter(self.mean + torch.randn(examples, width) / math.sqrt(width))
 
     @torch.no_grad()
     def update_mean(self) -> None:
+        """Take the mean of the codes as they are now."""
         if self.codes is not None:
             self.mean.copy_(self.codes.mean(dim=0))
 
