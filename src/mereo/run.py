@@ -117,7 +117,7 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
     settings = json.loads(json.dumps({"dataset": dataset, "train": asdict(config)}))
     path = run_dir / "config.json"
     if path.is_file():
-        before = json.loads(path.read_text())
+        before = _with_defaults(json.loads(path.read_text()))
         if before != settings:
             odd = _first_difference(before, settings)
             raise ValueError(
@@ -131,6 +131,13 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
         write_json(path, settings)
     if process.world > 1:
         dist.barrier()
+
+
+def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
+    """A run's settings; those that an older mereo did not have are as they were then, which is their default."""
+    default = json.loads(json.dumps(asdict(TrainConfig())))
+    train = default | settings.get("train", {})
+    return settings | {"train": train | {"network": default["network"] | train["network"]}}
 
 
 def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:
