@@ -7,7 +7,14 @@ from mereo.encoders.pointnet2 import PointNet2
 
 
 def make_encoder(config: NetworkConfig) -> PointNet2 | PointTransformer | Autodecoder:
-    """The encoder that the settings name; ``ValueError`` where they do not go together."""
+    """The encoder that the settings name; ``ValueError`` where they do not go together or are out of range."""
+    for name in ("transformer_neighbors", "code_steps"):
+        if getattr(config, name) < 1:
+            raise ValueError(f"{name} is {getattr(config, name)}; it must be at least 1: leave it out for the paper's")
+    if not 0 <= config.dropout < 1:
+        raise ValueError(
+            f"dropout is {config.dropout}; it is a share from 0 to below 1: the paper's autodecoder has 0.2"
+        )
     if config.encoder == "autodecoder":
         if config.local_neighbors:
             raise ValueError(
