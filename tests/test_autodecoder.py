@@ -39,8 +39,9 @@ SMALL = TrainConfig(
         depth=4,
         skip_after=2,
         highest_exponent=1,
-        code_rate=5e-3,
+        search_rate=5e-3,
     ),
+    code_rate=5e-3,
     batch=12,
     epochs=250,
     learning_rate=4e-3,
@@ -152,7 +153,7 @@ def test_the_search_is_deterministic_and_by_cloud(model: Model, data: Dataset) -
 
 
 def test_the_search_works_beside_alignment_sight_and_template() -> None:
-    config = replace(PRESETS["tiny"].network, encoder="autodecoder", local_neighbors=0, code_steps=2)
+    config = replace(PRESETS["tiny"].network, encoder="autodecoder", local_neighbors=0, search_steps=2)
     torch.manual_seed(0)
     network = Network(config, 2).eval().requires_grad_(False)
     unmoved = network.encoder.mean.clone()
@@ -171,7 +172,7 @@ def test_weights_hold_the_mean_code_only(run: Path) -> None:
 
 def test_only_the_codes_of_a_batch_move_and_at_their_own_rate(dataset: Path, data: Dataset, tmp_path: Path) -> None:
     """Adam's first step moves every coordinate by the rate."""
-    config = replace(SMALL, batch=5, network=replace(SMALL.network, code_rate=0.01), learning_rate=1e-5)
+    config = replace(SMALL, batch=5, code_rate=0.01, learning_rate=1e-5)
     network = start_network(config, data)
     trainer = training.Trainer(config, data, network, tmp_path, training.Process(), torch.device("cpu"))
     before = network.encoder.codes.detach().clone()
@@ -208,7 +209,7 @@ def test_killed_and_resumed_equals_uninterrupted(
 ) -> None:
     """Codes, their momentum, the dropout masks and the averaged codes included."""
     config = replace(SMALL, batch=5, epochs=1.2, ema_decay=0.9, holdout=1)
-    config = replace(config, network=replace(config.network, dropout=0.2, code_steps=3))
+    config = replace(config, network=replace(config.network, dropout=0.2, search_steps=3))
     training.train(dataset, tmp_path / "whole", config, checkpoint_every_s=0.0)
     with monkeypatch.context() as patch, pytest.raises(Killed):
         kill_after(patch, 2)
@@ -252,8 +253,8 @@ def test_the_curve_shows_a_few_held_out_examples(data: Dataset, monkeypatch: pyt
 
 def test_the_papers_recipe() -> None:
     recipe, paper = PRESETS["paper-autodecoder"], PRESETS["paper"]
-    assert (recipe.batch, recipe.learning_rate, recipe.epochs) == (64, 5e-4, 1000)
-    assert (recipe.network.dropout, recipe.network.code_rate, recipe.network.code_steps) == (0.2, 1e-3, 75)
+    assert (recipe.batch, recipe.learning_rate, recipe.code_rate, recipe.epochs) == (64, 5e-4, 1e-3, 1000)
+    assert (recipe.network.dropout, recipe.network.search_steps, recipe.network.search_rate) == (0.2, 75, 1e-3)
     network = replace(recipe.network, encoder="pointnet2", dropout=0.0)
     assert replace(recipe, batch=40, epochs=300.0, network=network) == paper
 

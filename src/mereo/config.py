@@ -72,8 +72,7 @@ class NetworkConfig:
         mlp_global: layer widths before the global max pool; the last one is the latent size of every encoder.
         transformer_widths: Point Transformer: one block per width; from one to the next a quarter of the points stay.
         transformer_neighbors: Point Transformer: nearest points that a point attends to; half as many in block one.
-        code_steps: autodecoder: steps of the search for a cloud's code.
-        code_rate: autodecoder: learning rate of the codes, in training and in that search.
+        search_steps, search_rate: autodecoder: steps and learning rate of the search for a cloud's code.
         code_penalty: autodecoder: weight of a code's squared length beside the L1 distance.
         width, depth, skip_after: the decoder's layer width, layer count, and after which layer the query returns.
         dropout: share of each decoder layer's outputs set to zero in training.
@@ -98,8 +97,8 @@ class NetworkConfig:
     mlp_global: tuple[int, ...] = (256, 512, 1024)
     transformer_widths: tuple[int, ...] = (32, 64, 128, 256, 512)
     transformer_neighbors: int = 16
-    code_steps: int = 75
-    code_rate: float = 1e-3
+    search_steps: int = 75
+    search_rate: float = 1e-3
     code_penalty: float = 1e-4
     width: int = 512
     depth: int = 7
@@ -162,6 +161,7 @@ class TrainConfig:
         queries: query points per example and step, a random subset; 0 means all of them.
         epochs: passes over the dataset.
         learning_rate: peak rate.
+        code_rate: peak rate of an autodecoder's codes.
         weight_decay: decoupled (AdamW); 0 is the paper's Adam.
         schedule: constant, or linear warm-up followed by a half cosine to zero.
         warmup: fraction of all steps spent warming up.
@@ -183,6 +183,7 @@ class TrainConfig:
     queries: int = 0
     epochs: float = 300.0
     learning_rate: float = 5e-4
+    code_rate: float = 1e-3
     weight_decay: float = 0.0
     schedule: Literal["constant", "cosine"] = "constant"
     warmup: float = 0.0

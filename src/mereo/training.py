@@ -279,7 +279,7 @@ def _parameter_groups(network: nn.Module, config: TrainConfig) -> list[dict[str,
         {"params": others, "weight_decay": 0.0, "peak": peak},
     ]
     if codes:
-        groups.append({"params": codes, "weight_decay": 0.0, "peak": config.network.code_rate})
+        groups.append({"params": codes, "weight_decay": 0.0, "peak": config.code_rate})
     return groups
 
 

@@ -8,7 +8,7 @@ from mereo.encoders.pointnet2 import PointNet2
 
 def make_encoder(config: NetworkConfig) -> PointNet2 | PointTransformer | Autodecoder:
     """The encoder that the settings name; ``ValueError`` where they do not go together or are out of range."""
-    for name in ("transformer_neighbors", "code_steps"):
+    for name in ("transformer_neighbors", "search_steps"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name} is {getattr(config, name)}; it must be at least 1: leave it out for the paper's")
     if not 0 <= config.dropout < 1:

@@ -30,7 +30,7 @@ class Autodecoder(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.steps, self.rate, self.penalty = config.code_steps, config.code_rate, config.code_penalty
+        self.steps, self.rate, self.penalty = config.search_steps, config.search_rate, config.code_penalty
         self.codes: nn.Parameter | None
         self.register_parameter("codes", None)
         self.mean: Tensor
