@@ -141,6 +141,9 @@ def test_a_model_of_distances_is_scored_on_the_whole() -> None:
     model = AnalyticModel(base.network, NAMES, base.colors, loss="l1", field=lambda p: 5.0 * np.eye(2)[solids.label(p)])
     result = score_cases(model, lambda _: TestCase("x", cloud(), truth_grid(two_cuboids(), 20)), 1, progress=False)
     assert result.names == ("object",) and result.scores.iou == 1.0
+    assert np.isnan(result.scores.miou) and np.isnan(result.example_mean[1]) and result.example_mean[0] == 1.0
+    assert "| whole set | 1.000 | - | 1.000 |" in markdown_table(result)
+    assert np.isnan(grid_scores(model, cloud(), two_cuboids(), cells=20).miou)
 
 
 # --- synthetic test sets ---------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mereo.config import PRESETS, NetworkConfig
+from mereo.config import PRESETS, Loss, NetworkConfig
 from mereo.decoder import FrequencyEncoding, Prediction
 from mereo.encoders.pointnet2 import PointNet2
 from mereo.losses import occupancy_loss
@@ -128,6 +128,37 @@ def test_negative_exponents_tell_far_points_apart() -> None:
     assert not torch.allclose(FrequencyEncoding(-4, 5)(a), FrequencyEncoding(-4, 5)(b), atol=0.1)
 
 
+def test_without_encoding_the_query_is_its_three_coordinates() -> None:
+    """The paper's ablation: a network of one layer is then piecewise linear in the position."""
+    plain = NetworkConfig(points=64, width=16, depth=1, skip_after=1, mlp_global=(8,), encode_positions=False)
+    network = settled(plain)
+    assert network.decoder.query1.in_features == 3
+    step = torch.tensor([1e-3, 2e-3, -1e-3])
+    line = torch.stack([0.3 + i * step for i in range(3)])[None].repeat(2, 1, 1)
+    with torch.inference_mode():
+        code = network.encode(cloud_of(plain), viewpoint_of())
+        a, b, c = network.query(code, line).logits.unbind(dim=1)
+        far = network.query(code, line + 2.0).logits[:, 0]
+    assert torch.allclose(c - b, b - a, atol=1e-6) and not torch.allclose(a, far, atol=1e-2)
+
+
+def test_dropout_clears_its_share_and_only_in_training() -> None:
+    plain = NetworkConfig(points=64, width=512, depth=1, skip_after=1, mlp_global=(8,))
+    networks = [settled(replace(plain, dropout=share)) for share in (0.0, 0.2)]
+    networks[1].load_state_dict(networks[0].state_dict())
+    queries, seen = torch.randn(2, 40, 3), []
+    for network in networks:
+        network.decoder.head.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].detach()))
+        network.query(network.encode(cloud_of(plain), viewpoint_of()), queries)
+        network.decoder.train()
+        network.query(network.encode(cloud_of(plain), viewpoint_of()), queries)
+    in_use, whole, in_use_too, thinned = seen
+    assert torch.equal(in_use, in_use_too)
+    kept = thinned > 0
+    assert torch.allclose(thinned[kept], whole[kept] / 0.8)
+    assert kept.sum() / (whole > 0).sum() == pytest.approx(0.8, abs=0.02)
+
+
 def example_prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor, torch.Tensor]:
     torch.manual_seed(0)
     prediction = Prediction(torch.randn(2, 5, 4), torch.randn(2, 5), torch.randn(2, 5, 3))
@@ -149,3 +180,23 @@ def test_cosine_term_is_minus_one_for_the_right_direction_of_any_length() -> Non
     right = Prediction(prediction.logits, prediction.distance, 7.0 * directions)
     _, terms = occupancy_loss(right, labels, distances, directions, "ce+l1+cd", 100.0)
     assert torch.isclose(terms["cd"], torch.tensor(-1.0))
+
+
+def test_each_term_is_the_papers() -> None:
+    """Against the formulas of equation 1, written out."""
+    prediction, labels, distances, directions = example_prediction()
+    _, terms = occupancy_loss(prediction, labels, distances, directions, "ce+l1+cd", 100.0)
+    probability = prediction.logits.exp() / prediction.logits.exp().sum(dim=-1, keepdim=True)
+    assert torch.isclose(terms["ce"], -probability.gather(-1, labels[..., None]).log().mean())
+    assert torch.isclose(terms["l1"], (prediction.distance - distances).abs().mean())
+    cosine = (prediction.direction * directions).sum(dim=-1) / prediction.direction.norm(dim=-1)
+    assert torch.isclose(terms["cd"], -cosine.mean())
+
+
+@pytest.mark.parametrize("loss, rows", [("ce", [0, 1, 2, 3]), ("l1", [4]), ("ce+l1", [0, 1, 2, 3, 4])])
+def test_a_loss_trains_its_own_heads_only(loss: Loss, rows: list[int]) -> None:
+    network = settled(replace(TINY, align_points=0), segments=3).train()
+    logits, distance, direction, _, _ = network(cloud_of(TINY), viewpoint_of(), torch.randn(2, 5, 3))
+    _, labels, distances, directions = example_prediction()
+    occupancy_loss(Prediction(logits, distance, direction), labels, distances, directions, loss, 100.0)[0].backward()
+    assert network.decoder.head.weight.grad.abs().amax(dim=1).nonzero().flatten().tolist() == rows

@@ -82,6 +82,19 @@ def test_other_settings_do_not_continue_a_run(dataset: Path, tmp_path: Path) -> 
         training.train(dataset, tmp_path / "run", replace(SMALL, learning_rate=0.1))
 
 
+def test_a_run_of_an_older_mereo_is_continued(dataset: Path, tmp_path: Path) -> None:
+    """It does not state the settings that came later, and their defaults are what it did."""
+    first = training.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes()
+    path = tmp_path / "run" / "config.json"
+    settings = json.loads(path.read_text())
+    del settings["train"]["network"]["encoder"], settings["train"]["network"]["dropout"], settings["train"]["init"]
+    path.write_text(json.dumps(settings))
+    assert training.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes() == first
+    with pytest.raises(ValueError, match="another train setting network"):
+        other = replace(SMALL.network, encoder="point-transformer")
+        training.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2, network=other))
+
+
 def test_a_directory_with_other_things_is_not_a_run(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(FileExistsError, match="exists and is not a training run"):
@@ -148,7 +161,10 @@ def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, lo
     model = load_model(training.train(dataset, tmp_path / "run", config))
     cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 50.0), size=(80, 3))
     answer = model.query(model.encode(cloud), cloud[:7])
-    assert answer.label.shape == (7,) and np.isfinite(answer.distance).all()
+    assert answer.label.shape == (7,) and answer.probability.shape[1] == (2 if loss == "l1" else 3)
+    # what was not trained is not answered
+    assert np.isfinite(answer.distance).all() == ("l1" in loss) != np.isnan(answer.distance).all()
+    assert np.isfinite(answer.direction).all() == ("cd" in loss) != np.isnan(answer.direction).all()
 
 
 def test_bfloat16_trains(dataset: Path, tmp_path: Path) -> None:

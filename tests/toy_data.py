@@ -5,6 +5,7 @@ needs no renderer and no sampler, so the tests of learning stand on their own.
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,18 @@ NAMES = ("left", "right")
 SHARD = 32
 
 
-def write_toy_dataset(directory: Path, examples: int = 64, points: int = 96, queries: int = 128) -> Path:
-    """Write the dataset and return its directory."""
+def write_toy_dataset(
+    directory: Path,
+    examples: int = 64,
+    points: int = 96,
+    queries: int = 128,
+    example: Callable[[np.random.Generator, int, int], dict[str, np.ndarray]] | None = None,
+) -> Path:
+    """Write the dataset and return its directory; ``example(rng, points, queries)`` makes one of another kind."""
     directory.mkdir(parents=True)
     rng = np.random.default_rng(5)
     for number in range(0, examples, SHARD):
-        rows = [_example(rng, points, queries) for _ in range(min(SHARD, examples - number))]
+        rows = [(example or half_balls)(rng, points, queries) for _ in range(min(SHARD, examples - number))]
         tensors = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
         save_file(tensors, directory / f"shard-{number // SHARD:05d}.safetensors")
     manifest = {
@@ -47,7 +54,7 @@ def _template() -> np.ndarray:
     return np.stack([np.maximum(ball, x), np.maximum(ball, -x)]).astype(np.float16)
 
 
-def _example(rng: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
+def half_balls(rng: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
     radius, center = rng.uniform(5.0, 10.0), np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), rng.uniform(100, 200)])
     front = rng.normal(size=(points, 3))
     front /= np.linalg.norm(front, axis=1, keepdims=True)

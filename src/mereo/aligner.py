@@ -39,7 +39,14 @@ class AlignmentNet(nn.Module):
         super().__init__()
         self.points = config.align_points
         small = replace(
-            config, neighbors=min(config.neighbors, 16), ratio1=0.5, depth=3, skip_after=2, sight_neighbors=0
+            config,
+            encoder="pointnet2",  # whatever the network's own is: a small cloud needs no other
+            neighbors=min(config.neighbors, 16),
+            ratio1=0.5,
+            depth=3,
+            skip_after=2,
+            sight_neighbors=0,
+            dropout=0.0,
         )
         self.encoder = PointNet2(small)
         self.decoder = ConditionedMLP(small, outputs=3)

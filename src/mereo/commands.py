@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from mereo.config import GenerateConfig, Sensor, SensorConfig, TrainConfig
 
-Preset = Literal["paper", "base", "large", "tiny"]
+Preset = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,8 @@ class Train:
     Attributes:
         dataset: folder written by `mereo generate`.
         output: folder of the run.
-        preset: what the options below start from: as published, recommended, the same for a GPU, a two-minute trial.
+        preset: what the options below start from: as published, as published for --network.encoder autodecoder,
+            recommended, the same for a GPU, a two-minute trial.
         config: the recipe; defaults are the chosen preset's.
     """
 

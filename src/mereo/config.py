@@ -21,6 +21,7 @@ MIN_POINTS = 32
 TEMPLATE = "template.safetensors"
 """A dataset's file with the segments at rest (``rest_pose``)."""
 
+Encoder = Literal["pointnet2", "point-transformer", "autodecoder"]
 Sampler = Literal["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"]
 
 
@@ -72,12 +73,18 @@ class NetworkConfig:
     """Encoder and decoder (paper, section 3.1 and appendix B; PointNet++ sizes from its reference implementation).
 
     Attributes:
+        encoder: what makes the latent vector of a cloud (docs/design/0009-encoders.md).
         points: the network sees at most this many points, the first in farthest-point order.
         neighbors: largest number of neighbours in a ball, the first in farthest-point order.
         ratio1, radius1, mlp1: first set abstraction: share of points kept as centres, ball radius, layer widths.
         ratio2, radius2, mlp2: second set abstraction, the ratio relative to the first level's centres.
-        mlp_global: layer widths before the global max pool; the last one is the latent size.
+        mlp_global: layer widths before the global max pool; the last one is the latent size of every encoder.
+        transformer_widths: Point Transformer: one block per width; from one to the next a quarter of the points stay.
+        transformer_neighbors: Point Transformer: nearest points that a point attends to; half as many in block one.
+        search_steps, search_rate: autodecoder: steps and learning rate of the search for a cloud's code.
+        code_penalty: autodecoder: weight of a code's squared length beside the L1 distance.
         width, depth, skip_after: the decoder's layer width, layer count, and after which layer the query returns.
+        dropout: share of each decoder layer's outputs set to zero in training.
         encode_positions: frequency encoding of the query position; off means the three coordinates themselves.
         lowest_exponent, highest_exponent: of the frequencies 2^e * pi, both included.
         local_neighbors: set-abstraction centres per level that a query attends to; 0 switches local features off.
@@ -87,6 +94,7 @@ class NetworkConfig:
         rest_template: look queries up in the rest pose's model, at predicted rest coordinates.
     """
 
+    encoder: Encoder = "pointnet2"
     points: int = 1024
     neighbors: int = 64
     ratio1: float = 0.5
@@ -96,9 +104,15 @@ class NetworkConfig:
     radius2: float = 0.4
     mlp2: tuple[int, ...] = (128, 128, 256)
     mlp_global: tuple[int, ...] = (256, 512, 1024)
+    transformer_widths: tuple[int, ...] = (32, 64, 128, 256, 512)
+    transformer_neighbors: int = 16
+    search_steps: int = 75
+    search_rate: float = 1e-3
+    code_penalty: float = 1e-4
     width: int = 512
     depth: int = 7
     skip_after: int = 4
+    dropout: float = 0.0
     encode_positions: bool = True
     lowest_exponent: int = -4
     highest_exponent: int = 5
@@ -111,6 +125,13 @@ class NetworkConfig:
     @property
     def latent(self) -> int:
         return self.mlp_global[-1]
+
+    @property
+    def level_widths(self) -> tuple[int, ...]:
+        """Channels of the encoder's levels that queries can attend to."""
+        if self.encoder == "autodecoder":
+            return ()
+        return self.transformer_widths[1:3] if self.encoder == "point-transformer" else (self.mlp1[-1], self.mlp2[-1])
 
 
 Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
@@ -149,6 +170,7 @@ class TrainConfig:
         queries: query points per example and step, a random subset; 0 means all of them.
         epochs: passes over the dataset.
         learning_rate: peak rate.
+        code_rate: peak rate of an autodecoder's codes.
         weight_decay: decoupled (AdamW); 0 is the paper's Adam.
         schedule: constant, or linear warm-up followed by a half cosine to zero.
         warmup: fraction of all steps spent warming up.
@@ -170,6 +192,7 @@ class TrainConfig:
     queries: int = 0
     epochs: float = 300.0
     learning_rate: float = 5e-4
+    code_rate: float = 1e-3
     weight_decay: float = 0.0
     schedule: Literal["constant", "cosine"] = "constant"
     warmup: float = 0.0
@@ -231,6 +254,8 @@ _MODERN_RECIPE = _Recipe(
 PRESETS: dict[str, TrainConfig] = {
     # as published
     "paper": TrainConfig(),
+    # the same for the autodecoder, whose hyperparameters the paper lists apart (appendix B)
+    "paper-autodecoder": TrainConfig(network=NetworkConfig(encoder="autodecoder", dropout=0.2), batch=64, epochs=1000),
     # what to train for real, also on a CPU: the paper's network at half its widths, local features at the query, and a
     # modern schedule (docs/design/0002-learning.md)
     "base": TrainConfig(network=_HALF, epochs=60, **_MODERN_RECIPE),

@@ -2,12 +2,13 @@
 
 import csv
 import io
+import math
 from pathlib import Path
 from typing import Any
 
 from mereo.output import atomic_file
 
-FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "val_iou", "val_miou")
+FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "code", "val_iou", "val_miou")
 Row = dict[str, float]
 
 
@@ -27,9 +28,10 @@ class MetricsLog:
         self._add({"step": step, "rate": rate, **losses})
 
     def add_validation(self, step: int, iou: float, miou: float) -> None:
-        """Validation of the state after ``step``: joins the row of that step."""
-        self.rows[-1] |= {"val_iou": iou, "val_miou": miou}
-        self._to_board({"step": step, "val_iou": iou, "val_miou": miou})
+        """Validation of the state after ``step``: joins the row of that step. An undefined mIoU (NaN) is left out."""
+        scores = {name: value for name, value in (("val_iou", iou), ("val_miou", miou)) if not math.isnan(value)}
+        self.rows[-1] |= scores
+        self._to_board({"step": step, **scores})
 
     def _add(self, row: Row) -> None:
         self.rows.append(row)

@@ -21,9 +21,11 @@ from mereo.config import MIN_POINTS, TEMPLATE, AugmentConfig
 class Batch:
     """What one training step reads; all normalized by the (augmented) cloud.
 
-    ``rest`` are rest-pose coordinates (``synthesis.LabelledPoints``); NaN outside.
+    ``index`` says which of the dataset's examples they are; ``rest`` are rest-pose coordinates
+    (``synthesis.LabelledPoints``), NaN outside.
     """
 
+    index: Int[Tensor, " b"]
     cloud: Float[Tensor, "b n 3"]
     viewpoint: Float[Tensor, "b 3"]
     positions: Float[Tensor, "b q 3"]
@@ -125,6 +127,7 @@ class Dataset:
             rows = index
         cloud = choose_points(self.cloud[index], self.count[index], points, augment, rng)
         batch = Batch(
+            index=index,
             cloud=cloud,
             viewpoint=self.viewpoint[index],
             positions=self.positions[rows, chosen],
@@ -214,6 +217,7 @@ def augment_batch(batch: Batch, augment: AugmentConfig, rng: torch.Generator) ->
     low, high = cloud.amin(dim=1), cloud.amax(dim=1)
     center, scale = (low + high) / 2, 2 / (high - low).amax(dim=1)
     return Batch(
+        index=batch.index,
         cloud=(cloud - center[:, None]) * scale[:, None, None],
         viewpoint=-center * scale[:, None],
         positions=(positions - center[:, None]) * scale[:, None, None],

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mereo.alignment import Alignment
 from mereo.config import NetworkConfig
-from mereo.encoders.pointnet2 import Encoding, Level
+from mereo.encoders.encoding import Encoding, Level
 from mereo.neighbors import gather, nearest
 from mereo.template import RestLookup
 
@@ -132,10 +132,9 @@ class ConditionedMLP(nn.Module):
         self.local = nn.ModuleList()
         if config.local_neighbors:
             self.local.extend(
-                LocalAttention(widths[-1], config.local_width, config.local_neighbors)
-                for widths in (config.mlp1, config.mlp2)
+                LocalAttention(channels, config.local_width, config.local_neighbors) for channels in config.level_widths
             )
-            self.local1 = nn.Linear(2 * config.local_width, width, bias=False)
+            self.local1 = nn.Linear(len(self.local) * config.local_width, width, bias=False)
         if config.sight_neighbors:
             self.sight1 = nn.Linear(6 * config.sight_neighbors, width, bias=False)
         self.head = nn.Linear(width, outputs)
@@ -178,6 +177,7 @@ class ConditionedMLP(nn.Module):
                     rest, known = self.lookup(before, placed)
                     hidden = hidden + known
             hidden = torch.relu(norm(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
+            hidden = nn.functional.dropout(hidden, self.config.dropout, self.training)
         return self.head(hidden).float(), rest
 
 

@@ -104,7 +104,9 @@ def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
     )
     written_s = time.perf_counter() - started
     predicted = predict_grid(model, case.camera_cloud, case.truth)
-    scores = intersection_over_union(grid_confusion(case.truth, predicted, len(segment_names(model)[0])))
+    scores = intersection_over_union(
+        grid_confusion(case.truth, predicted, len(segment_names(model)[0])), model.segmented
+    )
     console.print(_table(case, result, scores))
     stages = {**result.timings_s, "write": written_s}
     seconds = ", ".join(f"{stage} {value:.1f} s" for stage, value in stages.items())

@@ -58,23 +58,26 @@ class Evaluation:
         confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
         examples: scores of each test case by its name.
         cases: the first few with their labels, for pictures.
+        segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
     """
 
     names: tuple[str, ...]
     confusion: Int[np.ndarray, "c c"]
     examples: dict[str, Scores]
     cases: tuple[ErrorCase, ...] = field(default=())
+    segmented: bool = True
 
     @property
     def scores(self) -> Scores:
         """Over the whole set."""
-        return intersection_over_union(self.confusion)
+        return intersection_over_union(self.confusion, self.segmented)
 
     @property
     def example_mean(self) -> tuple[float, float]:
         """IoU and mIoU averaged over the examples."""
         each = self.examples.values()
-        return float(np.mean([s.iou for s in each])), float(np.nanmean([s.miou for s in each]))
+        mious = [s.miou for s in each if not np.isnan(s.miou)]
+        return float(np.mean([s.iou for s in each])), float(np.mean(mious)) if mious else float("nan")
 
 
 # --- one cloud -------------------------------------------------------------------------------------------------------
@@ -99,7 +102,7 @@ def grid_scores(model: Model, cloud: PointCloud, truth: SegmentedMesh, cells: in
     check_names(model, truth.names)
     grid = truth_grid(truth, cells)
     segments = len(segment_names(model)[0])
-    return intersection_over_union(grid_confusion(grid, predict_grid(model, cloud, grid), segments))
+    return intersection_over_union(grid_confusion(grid, predict_grid(model, cloud, grid), segments), model.segmented)
 
 
 def check_names(model: Model, names: Sequence[str]) -> None:
@@ -194,10 +197,10 @@ def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progr
     for one, predicted in _predictions(model, case, count, progress):
         confusion = grid_confusion(one.truth, predicted, len(names))
         total += confusion
-        examples[one.name] = intersection_over_union(confusion)
+        examples[one.name] = intersection_over_union(confusion, model.segmented)
         if len(pictures) < PICTURES:
             pictures.append(_picture_case(one, predicted, colors))
-    return Evaluation(names, total, examples, tuple(pictures))
+    return Evaluation(names, total, examples, tuple(pictures), model.segmented)
 
 
 def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> ErrorCase:
@@ -276,14 +279,18 @@ def _floats(values: Float[np.ndarray, " n"]) -> list[float]:
 
 
 def markdown_table(evaluation: Evaluation) -> str:
-    """The whole set and the mean over its examples."""
+    """The whole set and the mean over its examples; a dash where a score is undefined."""
     scores, (iou, miou) = evaluation.scores, evaluation.example_mean
     names = " | ".join(evaluation.names)
-    values = " | ".join(f"{value:.3f}" for value in scores.per_segment)
+    values = " | ".join(_rounded(value) for value in scores.per_segment)
     blank = " | ".join("" for _ in evaluation.names)
     return (
         f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
         f"|---|---|---|{'---|' * len(evaluation.names)}\n"
-        f"| whole set | {scores.iou:.3f} | {scores.miou:.3f} | {values} |\n"
-        f"| mean over examples | {iou:.3f} | {miou:.3f} | {blank} |\n"
+        f"| whole set | {_rounded(scores.iou)} | {_rounded(scores.miou)} | {values} |\n"
+        f"| mean over examples | {_rounded(iou)} | {_rounded(miou)} | {blank} |\n"
     )
+
+
+def _rounded(score: float) -> str:
+    return "-" if np.isnan(score) else f"{score:.3f}"

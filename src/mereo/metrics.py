@@ -12,7 +12,7 @@ class Scores:
 
     Attributes:
         iou: all segments as one class, against empty space.
-        miou: mean over the segments, empty space left out.
+        miou: mean over the segments, empty space left out; NaN where the model tells no segments apart.
         per_segment: one value per segment.
     """
 
@@ -29,8 +29,11 @@ def confusion_matrix(
     return np.bincount(index, minlength=classes * classes).reshape(classes, classes)
 
 
-def intersection_over_union(confusion: Int[np.ndarray, "c c"]) -> Scores:
-    """``TP / (TP + FP + FN)``; class 0 is empty space, whose false positives count against the segments."""
+def intersection_over_union(confusion: Int[np.ndarray, "c c"], segmented: bool = True) -> Scores:
+    """``TP / (TP + FP + FN)``; class 0 is empty space, whose false positives count against the segments.
+
+    Not ``segmented`` means that class 1 is the whole object: then there is no mIoU, as for the paper's L1 loss.
+    """
     with np.errstate(invalid="ignore"):
         hit = np.diag(confusion)[1:].astype(float)
         union = confusion[1:].sum(axis=1) + confusion[:, 1:].sum(axis=0) - hit
@@ -38,4 +41,5 @@ def intersection_over_union(confusion: Int[np.ndarray, "c c"]) -> Scores:
         occupied = confusion[1:, 1:].sum().astype(float)
         iou = occupied / (confusion.sum() - confusion[0, 0])
     present = per_segment[~np.isnan(per_segment)]
-    return Scores(float(iou), float(present.mean()) if len(present) else float("nan"), per_segment)
+    miou = float(present.mean()) if segmented and len(present) else float("nan")
+    return Scores(float(iou), miou, per_segment)

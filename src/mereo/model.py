@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from mereo.aligner import AlignmentNet
@@ -17,7 +17,9 @@ from mereo.alignment import Alignment
 from mereo.camera import PointCloud
 from mereo.config import MIN_POINTS, NetworkConfig
 from mereo.decoder import Code, Decoder, Prediction
-from mereo.encoders.pointnet2 import PointNet2
+from mereo.encoders import make_encoder
+from mereo.encoders.autodecoder import Autodecoder
+from mereo.encoders.encoding import Encoding
 from mereo.frame import Normalizer
 from mereo.mesh import Color
 from mereo.ordering import farthest_point_order
@@ -45,26 +47,53 @@ class Network(nn.Module):
     def __init__(self, config: NetworkConfig, segments: int) -> None:
         super().__init__()
         self.config, self.segments = config, segments
-        self.encoder = PointNet2(config)
+        self.encoder = make_encoder(config)
         self.decoder = Decoder(config, segments + 1)
         self.aligner = AlignmentNet(config) if config.align_points else None
 
     def encode(self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
-        """``cloud`` in farthest-point order."""
-        return self._encode(cloud, viewpoint, None if self.aligner is None else self.aligner(cloud).alignment)
+        """``cloud`` in farthest-point order. An autodecoder searches for its code, in evaluation mode."""
+        if isinstance(self.encoder, Autodecoder):
+            # the search needs gradients, which tensors of inference mode cannot give
+            with torch.inference_mode(False), torch.no_grad():
+                return self._search(self.encoder, cloud.clone(), viewpoint.clone())
+        return self._encode(cloud, viewpoint, self._align(cloud))
+
+    def _align(self, cloud: Float[Tensor, "b n 3"]) -> Alignment | None:
+        return None if self.aligner is None else self.aligner(cloud).alignment
 
     def _encode(
-        self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], alignment: Alignment | None
+        self,
+        cloud: Float[Tensor, "b n 3"],
+        viewpoint: Float[Tensor, "b 3"],
+        alignment: Alignment | None,
+        index: Int[Tensor, " b"] | None = None,
     ) -> Code:
-        encoding = self.encoder(cloud if alignment is None else alignment.apply(cloud))
+        if isinstance(self.encoder, Autodecoder):
+            assert index is not None, "an autodecoder has codes of its training examples only"
+            encoding = Encoding(self.encoder.code(index), ())
+        else:
+            encoding = self.encoder(cloud if alignment is None else alignment.apply(cloud))
         return self.decoder.prepare(encoding, cloud, viewpoint, alignment)
+
+    def _search(self, encoder: Autodecoder, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
+        alignment = self._align(cloud)
+
+        def prepare(latent: Float[Tensor, "b z"]) -> Code:
+            return self.decoder.prepare(Encoding(latent, ()), cloud, viewpoint, alignment)
+
+        return prepare(encoder.search(lambda latent: self.query(prepare(latent), cloud).distance, len(cloud)))
 
     def query(self, code: Code, points: Float[Tensor, "b q 3"]) -> Prediction:
         prediction: Prediction = self.decoder(code, points)
         return prediction
 
     def forward(
-        self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], points: Float[Tensor, "b q 3"]
+        self,
+        cloud: Float[Tensor, "b n 3"],
+        viewpoint: Float[Tensor, "b 3"],
+        points: Float[Tensor, "b q 3"],
+        index: Int[Tensor, " b"] | None = None,
     ) -> tuple[
         Float[Tensor, "b q c"],
         Float[Tensor, "b q"],
@@ -75,12 +104,13 @@ class Network(nn.Module):
         """What training needs: logits, distance, direction, and rest coordinates twice.
 
         First those of the template lookup, then those that the alignment is made from, at the first
-        ``ALIGNED_QUERIES``; None where the network has no such part.
+        ``ALIGNED_QUERIES``; None where the network has no such part. ``index`` says which training examples the clouds
+        are: an autodecoder takes their codes.
         """
         alignment, coarse = None, None
         if self.aligner is not None:
             alignment, coarse = self.aligner(cloud, points[:, :ALIGNED_QUERIES])
-        prediction = self.query(self._encode(cloud, viewpoint, alignment), points)
+        prediction = self.query(self._encode(cloud, viewpoint, alignment, index), points)
         return prediction.logits, prediction.distance, prediction.direction, prediction.rest, coarse
 
 
@@ -106,8 +136,8 @@ class Answer:
     Attributes:
         label: 0 for empty space, i + 1 for the model's segment i.
         probability: of empty space and each segment; rows sum to one.
-        distance: to the nearest segment surface, negative inside.
-        direction: unit vector towards it.
+        distance: to the nearest segment surface, negative inside; NaN from a model that was not trained on distances.
+        direction: unit vector towards it; NaN from a model that was not trained on directions.
     """
 
     label: UInt8[np.ndarray, " n"]
@@ -124,7 +154,7 @@ class Model:
         network: in evaluation mode.
         names, colors: of the segments; label i + 1 is names[i].
         provenance: how it was trained: scene, seeds, dataset, recipe, versions.
-        loss: the terms it was trained with; "l1" alone knows inside from outside but no segments.
+        loss: the terms it was trained with; what none of them taught is not answered.
         domain: normalized box outside which everything is answered as empty: nothing was ever there in training, and
             a network may say anything where it was never corrected. None means no limit.
         nested: pairs of names (inner, outer), see ``SegmentedMesh``.
@@ -137,6 +167,11 @@ class Model:
     provenance: dict[str, object] = field(default_factory=dict)
     domain: Box | None = None
     nested: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def segmented(self) -> bool:
+        """Whether it tells segments apart; one trained on distances alone only knows inside from outside."""
+        return "ce" in self.loss
 
     @property
     def device(self) -> torch.device:
@@ -162,8 +197,13 @@ class Model:
 
         def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             logits = self._class_logits(prediction, queries)
-            direction = nn.functional.normalize(prediction.direction, dim=-1)
-            return logits.softmax(dim=-1), prediction.distance, direction
+            distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
+            # a head that no term of the loss has trained says nothing
+            if "l1" not in self.loss:
+                distance = torch.full_like(distance, torch.nan)
+            if "cd" not in self.loss:
+                direction = torch.full_like(direction, torch.nan)
+            return logits.softmax(dim=-1), distance, direction
 
         probability, distance, direction = self._chunked(code, points, answer)
         return Answer(
@@ -179,7 +219,7 @@ class Model:
 
     def _class_logits(self, prediction: Prediction, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q c"]:
         logits = prediction.logits
-        if "ce" not in self.loss:
+        if not self.segmented:
             # trained on distances alone: inside is one class, and -distance its margin (paper, section 4.4)
             logits = torch.stack([prediction.distance, -prediction.distance], dim=-1)
         if self.domain is None:

@@ -52,3 +52,14 @@ def gather(values: Float[Tensor, "b n c"], index: Int[Tensor, "b m k"]) -> Float
     offset = torch.arange(batch, device=values.device).view(-1, 1, 1) * count
     flat = (index + offset).reshape(-1)
     return values.reshape(batch * count, channels).index_select(0, flat).reshape(*index.shape, channels)
+
+
+@torch.no_grad()
+def distinct_distances(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n n"]:
+    """Squared distances among points; infinite in the columns of points that repeat an earlier one.
+
+    A cloud with too few points repeats them. Repetitions must not take the places of real neighbours.
+    """
+    distances = squared_distances(points, points)
+    repeated = (distances == 0).tril(diagonal=-1).any(dim=2)
+    return distances.masked_fill(repeated[:, None], torch.inf)

@@ -103,7 +103,7 @@ def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
 
 def segment_names(model: Model) -> tuple[tuple[str, ...], tuple[Color, ...]]:
     """Names and colours of the classes that the model tells apart; one trained on distances knows only the whole."""
-    return (model.names, model.colors) if "ce" in model.loss else (("object",), PALETTE[:1])
+    return (model.names, model.colors) if model.segmented else (("object",), PALETTE[:1])
 
 
 def _turned_back(result: Reconstruction, T_scanner_camera: Float[np.ndarray, "4 4"]) -> Reconstruction:

@@ -9,8 +9,9 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from mereo.config import TEMPLATE, TrainConfig
+from mereo.config import TEMPLATE, AugmentConfig, TrainConfig
 from mereo.dataset import Dataset
+from mereo.encoders.autodecoder import Autodecoder
 from mereo.model import Network
 from mereo.output import write_json
 from mereo.weights import load_model
@@ -29,16 +30,35 @@ class Process:
 
 
 def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
-    """Settings that the dataset decides: how much can be held out, and whether a roll keeps a view plausible."""
+    """Settings that the dataset decides: how much can be held out, and whether a roll keeps a view plausible.
+
+    Raises ``ValueError`` for settings with which an autodecoder cannot be trained.
+    """
+    if config.network.encoder == "autodecoder":
+        _check_autodecoder(config)
     holdout = min(config.holdout, len(data) // 10)
     augment = replace(config.augment, roll=config.augment.roll and bool(data.manifest["any_roll"]))
     return replace(config, holdout=holdout, augment=augment)
 
 
+def _check_autodecoder(config: TrainConfig) -> None:
+    if "l1" not in config.loss:
+        raise ValueError(
+            f"the loss is {config.loss!r}, but an autodecoder finds the code of a cloud by its distances, which only "
+            "the L1 term trains; take --loss l1, ce+l1 or ce+l1+cd"
+        )
+    if config.augment != AugmentConfig():
+        raise ValueError(
+            "an autodecoder has one code per training example, and augmentation makes another example of it each "
+            "time; train without, as the preset paper-autodecoder does"
+        )
+
+
 def start_network(config: TrainConfig, data: Dataset) -> Network:
     """A network to train: random from the seed, or with the weights that ``config.init`` names.
 
-    Raises ``ValueError`` when those weights are of another architecture or know other segments.
+    An autodecoder gets a random code for each example that is not held out. Raises ``ValueError`` when the weights are
+    of another architecture or know other segments.
     """
     names = tuple(segment["name"] for segment in data.manifest["segments"])
     torch.manual_seed(config.seed)
@@ -52,6 +72,8 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
                 "start from other weights, or without --init"
             )
         _copy_weights(start.network, network, config.init)
+    if isinstance(network.encoder, Autodecoder):
+        network.encoder.add_codes(len(data) - config.holdout)
     lookup = network.decoder.lookup
     if lookup is not None:
         if data.template is None:
@@ -95,7 +117,7 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
     settings = json.loads(json.dumps({"dataset": dataset, "train": asdict(config)}))
     path = run_dir / "config.json"
     if path.is_file():
-        before = json.loads(path.read_text())
+        before = _with_defaults(json.loads(path.read_text()))
         if before != settings:
             odd = _first_difference(before, settings)
             raise ValueError(
@@ -109,6 +131,13 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
         write_json(path, settings)
     if process.world > 1:
         dist.barrier()
+
+
+def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
+    """A run's settings; those that an older mereo did not have are as they were then, which is their default."""
+    default = json.loads(json.dumps(asdict(TrainConfig())))
+    train = default | settings.get("train", {})
+    return settings | {"train": train | {"network": default["network"] | train["network"]}}
 
 
 def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:

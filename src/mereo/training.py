@@ -17,17 +17,17 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from mereo.calibration import class_offsets
 from mereo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mereo.config import TrainConfig
 from mereo.curves import MetricsLog
 from mereo.dataset import Batch, Dataset
 from mereo.decoder import Prediction
+from mereo.encoders.autodecoder import CODES, Autodecoder
 from mereo.hardware import compiling_pays, keep_freed_memory, pick_device, pick_precision
 from mereo.losses import REST_WEIGHT, occupancy_loss, rest_loss
-from mereo.metrics import confusion_matrix, intersection_over_union
 from mereo.model import Model, Network
 from mereo.run import Process, claim_run, fit_config, join_processes, start_network
+from mereo.validation import choose_offsets, held_out, validate
 from mereo.weights import save_model
 
 
@@ -45,6 +45,9 @@ def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_e
     claim_run(run_dir, config, data, process)
     keep_freed_memory()
     trainer = Trainer(config, data, network, run_dir, process, device)
+    if isinstance(network.encoder, Autodecoder):
+        shown = len(held_out(data, config))
+        trainer.say(f"the validation curve shows {shown} held-out examples, with codes found from their clouds")
     if trainer.resume():
         trainer.say(f"continuing from step {trainer.step} of {trainer.total}")
     last_save = time.monotonic()
@@ -130,9 +133,10 @@ class Trainer:
     def train_step(self, batch: Batch) -> None:
         """One optimizer step."""
         self.network.train()
-        rate = self._learning_rate()
+        part = self._schedule()
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = group["peak"] * part
+        torch.manual_seed(_seed(self.config.seed, self.step, self.process.rank))  # for dropout
         loss, terms = self._loss(batch)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -142,13 +146,13 @@ class Trainer:
         self.step += 1
         self._update_average()
         if self.log is not None:
-            self.unread.append((self.step, rate, {"loss": loss.detach(), **terms}))
+            self.unread.append((self.step, self.config.learning_rate * part, {"loss": loss.detach(), **terms}))
             if self.step % REPORT_EVERY == 0 or self.step == self.total:
                 self._report_progress()
 
     def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         with torch.autocast(self.device.type, self.autocast) if self.autocast else nullcontext():
-            *outputs, coarse = self.module(batch.cloud, batch.viewpoint, batch.positions)
+            *outputs, coarse = self.module(batch.cloud, batch.viewpoint, batch.positions, batch.index)
         prediction = Prediction(*outputs)
         loss, terms = occupancy_loss(
             prediction,
@@ -164,16 +168,20 @@ class Trainer:
         if prediction.rest is not None:
             terms["rest"] = rest_loss(prediction.rest, batch.rest)
             loss = loss + REST_WEIGHT * terms["rest"]
+        if isinstance(self.network.encoder, Autodecoder):
+            terms["code"] = self.network.encoder.length_penalty(self.network.encoder.code(batch.index)).mean()
+            loss = loss + self.config.l1_weight * terms["code"]
         return loss, {name: value.detach() for name, value in terms.items()}
 
-    def _learning_rate(self) -> float:
+    def _schedule(self) -> float:
+        """The share of its peak that each learning rate has in this step."""
         config = self.config
         progress = self.step / self.total
         if progress < config.warmup:
-            return config.learning_rate * (self.step + 1) / math.ceil(config.warmup * self.total)
+            return (self.step + 1) / math.ceil(config.warmup * self.total)
         if config.schedule == "constant":
-            return config.learning_rate
-        return 0.5 * config.learning_rate * (1 + math.cos(math.pi * (progress - config.warmup) / (1 - config.warmup)))
+            return 1.0
+        return 0.5 * (1 + math.cos(math.pi * (progress - config.warmup) / (1 - config.warmup)))
 
     @torch.no_grad()
     def _update_average(self) -> None:
@@ -205,46 +213,19 @@ class Trainer:
             f"{left_s / 60:.1f} min left"
         )
 
-    @torch.no_grad()
-    def validate(self) -> tuple[float, float]:
-        """IoU and mIoU of the averaged weights on the held-out examples' queries (not the paper's grid metric)."""
-        classes = self.network.segments + 1
-        total = torch.zeros(classes, classes, dtype=torch.long)
-        for batch, logits, distance in self._answers(range(self.examples, len(self.data))):
-            guess = logits.argmax(-1) if "ce" in self.config.loss else (distance < 0).long()
-            truth = batch.labels if "ce" in self.config.loss else (batch.labels > 0).long()
-            total += torch.from_numpy(confusion_matrix(truth.cpu().numpy(), guess.cpu().numpy(), classes))
-        scores = intersection_over_union(total.numpy())
-        return scores.iou, scores.miou
-
-    def _answers(self, examples: range) -> Iterator[tuple[Batch, Tensor, Tensor]]:
-        """Logits and distances of the averaged network at all queries of stored examples, batch by batch."""
-        self.average.eval()
-        quiet = TrainConfig().augment
-        for start in examples[:: self.config.batch]:
-            index = torch.arange(start, min(start + self.config.batch, examples.stop))
-            batch = self.data.batch(index, self.config.network.points, 0, quiet, torch.Generator().manual_seed(0))
-            logits, distance, *_ = self.average(batch.cloud, batch.viewpoint, batch.positions)
-            yield batch, logits, distance
-
-    @torch.no_grad()
-    def offsets(self) -> Tensor | None:
-        """Class offsets (``calibration``) of the averaged network from the first training examples; None when off."""
-        count, uniform = min(self.config.offset_examples, self.examples), self.data.uniform_queries
-        if not (count and uniform and "ce" in self.config.loss):
-            return None
-        found = [(logits[:, -uniform:], b.labels[:, -uniform:]) for b, logits, _ in self._answers(range(count))]
-        return class_offsets(*(torch.cat(part).flatten(0, 1).cpu() for part in zip(*found, strict=True)))
-
     def validate_and_save(self, finished: bool) -> None:
         """Write metrics, curves, the checkpoint and the weights; every file atomically."""
         if self.log is not None:
             self._read_losses()
+            if isinstance(self.average.encoder, Autodecoder):
+                self.average.encoder.update_mean()
             if self.config.holdout:
-                self.log.add_validation(self.step, *self.validate())
+                scores = validate(self.average, self.data, self.config)
+                self.log.add_validation(self.step, scores.iou, scores.miou)
             self.log.write()
             save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
-            save_model(self.model(self.offsets() if finished else None), self.run_dir / "weights.safetensors")
+            offsets = choose_offsets(self.average, self.data, self.config) if finished else None
+            save_model(self.model(offsets), self.run_dir / "weights.safetensors")
             self.say(f"saved at step {self.step}: {self.log.summary()}")
         if self.process.world > 1:
             dist.barrier()
@@ -288,10 +269,19 @@ class Trainer:
 
 
 def _parameter_groups(network: nn.Module, config: TrainConfig) -> list[dict[str, object]]:
-    """Weight decay acts on matrices only: shrinking biases and norms would only slow them."""
-    matrices = [p for p in network.parameters() if p.ndim >= 2]
-    others = [p for p in network.parameters() if p.ndim < 2]
-    return [{"params": matrices, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
+    """Weight decay acts on matrices only: it would only slow biases and norms. Codes have a rate of their own."""
+    named = dict(network.named_parameters())
+    codes = [named.pop(CODES)] if CODES in named else []
+    matrices = [p for p in named.values() if p.ndim >= 2]
+    others = [p for p in named.values() if p.ndim < 2]
+    peak = config.learning_rate
+    groups: list[dict[str, object]] = [
+        {"params": matrices, "weight_decay": config.weight_decay, "peak": peak},
+        {"params": others, "weight_decay": 0.0, "peak": peak},
+    ]
+    if codes:
+        groups.append({"params": codes, "weight_decay": 0.0, "peak": config.code_rate})
+    return groups
 
 
 def _seed(*numbers: int) -> int:

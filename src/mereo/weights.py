@@ -8,6 +8,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from mereo.encoders.autodecoder import CODES
 from mereo.model import Model, Network, config_from_dict
 from mereo.output import atomic_file
 
@@ -16,7 +17,10 @@ SHIPPED = Path(__file__).parent / "weights"
 
 
 def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> None:
-    """Write weights and header atomically; ``float16`` halves the file and is read back as float32."""
+    """Write weights and header atomically; ``float16`` halves the file and is read back as float32.
+
+    An autodecoder's codes of training examples are left out: using a network needs their mean only.
+    """
     header = {
         "version": FORMAT_VERSION,
         "network": asdict(model.network.config),
@@ -31,6 +35,7 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
     tensors = {
         name: (value.to(dtype) if value.is_floating_point() else value).contiguous()
         for name, value in model.network.state_dict().items()
+        if name != CODES
     }
     with atomic_file(path) as partial:
         partial.write_bytes(save(tensors, metadata={"mereo": json.dumps(header)}))

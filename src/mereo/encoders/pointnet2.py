@@ -3,47 +3,13 @@
 Notation: b clouds, n points, m centres, k neighbours, c channels.
 """
 
-from dataclasses import dataclass
-from itertools import pairwise
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from mereo.config import NetworkConfig
+from mereo.encoders.encoding import Encoding, Level, SharedMLP
 from mereo.neighbors import ball_query, gather
-
-
-@dataclass(frozen=True, eq=False)
-class Level:
-    """Set-abstraction centres (a prefix of the cloud) with their features."""
-
-    centers: Float[Tensor, "b m 3"]
-    features: Float[Tensor, "b m c"]
-
-
-@dataclass(frozen=True, eq=False)
-class Encoding:
-    """What the encoder knows of a cloud: the paper's latent vector, and the levels it was pooled from."""
-
-    latent: Float[Tensor, "b z"]
-    levels: tuple[Level, ...]
-
-
-class SharedMLP(nn.Module):
-    """Linear, batch normalization and ReLU per layer, shared by all rows."""
-
-    def __init__(self, widths: tuple[int, ...]) -> None:
-        super().__init__()
-        layers: list[nn.Module] = []
-        for before, after in pairwise(widths):
-            # the bias would be removed by the batch mean
-            layers += [nn.Linear(before, after, bias=False), nn.BatchNorm1d(after), nn.ReLU()]
-        self.layers = nn.Sequential(*layers)
-
-    def forward(self, rows: Float[Tensor, "*r i"]) -> Float[Tensor, "*r o"]:
-        flat = self.layers(rows.reshape(-1, rows.shape[-1]))
-        return flat.reshape(*rows.shape[:-1], -1)
 
 
 class SetAbstraction(nn.Module):

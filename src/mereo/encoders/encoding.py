@@ -1,0 +1,42 @@
+"""What every encoder gives, and the layer that all of them are made of.
+
+Notation: b clouds, m points of a level, c channels, z latent channels.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Points of a coarser level (a prefix of the cloud) with their features."""
+
+    centers: Float[Tensor, "b m 3"]
+    features: Float[Tensor, "b m c"]
+
+
+@dataclass(frozen=True, eq=False)
+class Encoding:
+    """What the encoder knows of a cloud: the paper's latent vector, and levels on the way to it for local features."""
+
+    latent: Float[Tensor, "b z"]
+    levels: tuple[Level, ...]
+
+
+class SharedMLP(nn.Module):
+    """Linear, batch normalization and ReLU per layer, shared by all rows."""
+
+    def __init__(self, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for before, after in pairwise(widths):
+            # the bias would be removed by the batch mean
+            layers += [nn.Linear(before, after, bias=False), nn.BatchNorm1d(after), nn.ReLU()]
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, rows: Float[Tensor, "*r i"]) -> Float[Tensor, "*r o"]:
+        flat = self.layers(rows.reshape(-1, rows.shape[-1]))
+        return flat.reshape(*rows.shape[:-1], -1)

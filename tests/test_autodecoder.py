@@ -1,0 +1,296 @@
+"""The autodecoder: codes of training examples, the search for that of a new cloud, and what it refuses."""
+
+import csv
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from shapes import ball
+from test_training import Killed, kill_after
+from toy_data import write_toy_dataset
+
+from mereo import training, validation
+from mereo.camera import PointCloud
+from mereo.config import PRESETS, AugmentConfig, NetworkConfig, TrainConfig
+from mereo.dataset import Dataset
+from mereo.decoder import Code
+from mereo.encoders.autodecoder import Autodecoder
+from mereo.encoders.encoding import Encoding
+from mereo.evaluation import TestCase, score_cases
+from mereo.frames import truth_grid
+from mereo.mesh import SegmentedMesh
+from mereo.model import Model, Network
+from mereo.reconstruction import reconstruct
+from mereo.run import start_network
+from mereo.weights import load_model
+
+SMALL = TrainConfig(
+    network=NetworkConfig(
+        encoder="autodecoder",
+        points=64,
+        mlp_global=(32,),
+        width=64,
+        depth=4,
+        skip_after=2,
+        highest_exponent=1,
+        search_rate=5e-3,
+    ),
+    code_rate=5e-3,
+    batch=12,
+    epochs=250,
+    learning_rate=4e-3,
+    l1_weight=10.0,
+    holdout=0,
+    precision="float32",
+    compile="off",
+)
+
+
+def ball_pair(rng: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
+    """Two touching balls seen from the front, the second of 0.3 to 1 times the radius of the first."""
+    radii = np.array([1.0, rng.uniform(0.3, 1.0)])
+    centers = np.array([[0.0, 0.0, 20.0], [radii.sum(), 0.0, 20.0]])
+    front = rng.normal(size=(points, 3))
+    front /= np.linalg.norm(front, axis=1, keepdims=True)
+    front[:, 2] = -np.abs(front[:, 2])
+    which = rng.integers(0, 2, size=points)
+    cloud = centers[which] + radii[which, None] * front
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    middle, scale = (low + high) / 2, 2 / (high - low).max()
+    places = rng.uniform([-1.4, -1.4, 18.6], [1.4 + 2 * radii[1], 1.4, 21.4], size=(queries, 3))
+    to_center = centers - places[:, None]
+    reach = np.linalg.norm(to_center, axis=2)
+    each = reach - radii
+    nearest = each.argmin(axis=1)
+    rows = np.arange(queries)
+    distance = each[rows, nearest]
+    outward = np.where(distance < 0, -1, 1)[:, None]
+    return {
+        "cloud": ((cloud - middle) * scale).astype(np.float32),
+        "cloud_count": np.array(points, dtype=np.int32),
+        "center": middle,
+        "scale": np.array(scale),
+        "positions": ((places - middle) * scale).astype(np.float32),
+        "labels": np.where(distance < 0, nearest + 1, 0).astype(np.uint8),
+        "distances": (distance * scale).astype(np.float32),
+        "directions": (outward * (to_center / reach[..., None])[rows, nearest]).astype(np.float16),
+        "rest": np.full((queries, 3), np.nan, dtype=np.float16),
+    }
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_dataset(tmp_path_factory.mktemp("pairs") / "data", 12, 64, 192, ball_pair)
+
+
+@pytest.fixture(scope="module")
+def run(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """250 passes over twelve examples."""
+    run = tmp_path_factory.mktemp("pairs") / "run"
+    training.train(dataset, run, SMALL)
+    return run
+
+
+@pytest.fixture(scope="module")
+def model(run: Path) -> Model:
+    return load_model(run / "weights.safetensors")
+
+
+@pytest.fixture(scope="module")
+def data(dataset: Path) -> Dataset:
+    return Dataset.load(dataset)
+
+
+def seen(dataset: Path, number: int) -> np.ndarray:
+    """The cloud of an example as a camera saw it."""
+    shard = load_file(dataset / "shard-00000.safetensors")
+    return (shard["cloud"][number] / shard["scale"][number] + shard["center"][number]).double().numpy()
+
+
+def truth(dataset: Path, number: int) -> SegmentedMesh:
+    ratio = 0.5 * np.ptp(seen(dataset, number)[:, 0]) - 1.0  # the pair is 2 (1 + ratio) long
+    return SegmentedMesh((ball((0, 0, 20), 1.0, "left"), ball((1 + ratio, 0, 20), ratio, "right", 1)))
+
+
+# --- codes ------------------------------------------------------------------------------------------------------------
+
+
+def error(network: Network, data: Dataset, code: Code) -> float:
+    with torch.inference_mode():
+        return float((network.query(code, data.positions).distance - data.distances).abs().mean())
+
+
+def prepare(network: Network, data: Dataset, latent: torch.Tensor) -> Code:
+    return network.decoder.prepare(Encoding(latent, ()), data.cloud, data.viewpoint)
+
+
+def test_a_code_found_from_the_cloud_explains_the_shape(run: Path, model: Model, data: Dataset) -> None:
+    """From the visible half alone: far better than the mean code, short of the code trained with the whole shape."""
+    network = model.network
+    codes = load_file(run / "checkpoint.safetensors")["network/encoder.codes"]
+    trained = error(network, data, prepare(network, data, codes))
+    average = error(network, data, prepare(network, data, codes.mean(dim=0).repeat(len(data), 1)))
+    found = error(network, data, network.encode(data.cloud, data.viewpoint))
+    assert trained < 0.02 and trained < found < 0.8 * average
+
+
+def test_the_search_is_deterministic_and_by_cloud(model: Model, data: Dataset) -> None:
+    network = model.network
+    together = network.encode(data.cloud, data.viewpoint).latent1
+    with torch.inference_mode():
+        again = network.encode(data.cloud.clone(), data.viewpoint.clone()).latent1
+        alone = network.encode(data.cloud[3:4].clone(), data.viewpoint[3:4].clone()).latent1
+    assert torch.equal(together, again)
+    assert torch.allclose(together[3:4], alone, atol=1e-2)  # 75 steps along signs let rounding grow
+    assert not together.requires_grad and all(p.grad is None for p in network.parameters())
+    assert (together[3] - together[4]).abs().max() > 0.1
+
+
+def test_the_search_works_beside_alignment_sight_and_template() -> None:
+    config = replace(PRESETS["tiny"].network, encoder="autodecoder", local_neighbors=0, search_steps=2)
+    torch.manual_seed(0)
+    network = Network(config, 2).eval().requires_grad_(False)
+    unmoved = network.encoder.mean.clone()
+    cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 9.0), size=(300, 3))
+    answer = Model(network, ("a", "b"), ((1, 2, 3), (4, 5, 6)), loss="ce+l1+cd")
+    assert np.isfinite(answer.query(answer.encode(cloud), cloud[:5]).direction).all()
+    assert torch.equal(network.encoder.mean, unmoved)
+
+
+def test_weights_hold_the_mean_code_only(run: Path) -> None:
+    weights, state = load_file(run / "weights.safetensors"), load_file(run / "checkpoint.safetensors")
+    assert state["average/encoder.codes"].shape == (12, 32)
+    assert "encoder.codes" not in weights
+    assert torch.equal(weights["encoder.mean"], state["average/encoder.codes"].mean(dim=0))
+
+
+def test_only_the_codes_of_a_batch_move_and_at_their_own_rate(dataset: Path, data: Dataset, tmp_path: Path) -> None:
+    """Adam's first step moves every coordinate by the rate."""
+    config = replace(SMALL, batch=5, code_rate=0.01, learning_rate=1e-5)
+    network = start_network(config, data)
+    trainer = training.Trainer(config, data, network, tmp_path, training.Process(), torch.device("cpu"))
+    before = network.encoder.codes.detach().clone()
+    batch = next(trainer.batches())
+    trainer.train_step(batch)
+    moved = (network.encoder.codes.detach() - before).abs()
+    assert torch.allclose(moved[batch.index], torch.tensor(0.01), rtol=1e-2)
+    others = [i for i in range(12) if i not in batch.index.tolist()]
+    assert len(others) == 7 and not moved[others].any()
+
+
+def test_gradient_reaches_every_parameter(data: Dataset) -> None:
+    network = start_network(SMALL, data).train()
+    index = torch.arange(12)
+    outputs = network(data.cloud, data.viewpoint, data.positions, index)
+    sum(output.square().sum() for output in outputs if output is not None).backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().max() > 1e-7, name
+    assert (network.encoder.codes.grad.abs().amax(dim=1) > 1e-7).all()
+
+
+def test_the_prior_is_the_codes_squared_length() -> None:
+    encoder = Autodecoder(NetworkConfig(encoder="autodecoder", mlp_global=(4,), code_penalty=0.5))
+    assert torch.equal(
+        encoder.length_penalty(torch.tensor([[1.0, 2.0, 0.0, 2.0], [0.0, 0, 0, 0]])), torch.tensor([4.5, 0])
+    )
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def test_killed_and_resumed_equals_uninterrupted(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Codes, their momentum, the dropout masks and the averaged codes included."""
+    config = replace(SMALL, batch=5, epochs=1.2, ema_decay=0.9, holdout=1)
+    config = replace(config, network=replace(config.network, dropout=0.2, search_steps=3))
+    training.train(dataset, tmp_path / "whole", config, checkpoint_every_s=0.0)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        kill_after(patch, 2)
+        training.train(dataset, tmp_path / "parts", config, checkpoint_every_s=0.0)
+    training.train(dataset, tmp_path / "parts", config, checkpoint_every_s=0.0)
+    whole, parts = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("whole", "parts"))
+    assert whole.keys() == parts.keys()
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    assert (tmp_path / "whole" / "metrics.csv").read_text() == (tmp_path / "parts" / "metrics.csv").read_text()
+
+
+@pytest.mark.slow
+def test_two_processes_train_each_others_codes(dataset: Path, data: Dataset, tmp_path: Path) -> None:
+    """After one pass every code has moved, in the one copy that is saved."""
+    script = tmp_path / "run.py"
+    script.write_text(
+        "import sys\nfrom dataclasses import replace\nfrom pathlib import Path\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "from test_autodecoder import SMALL\nfrom mereo.training import train\n"
+        "train(Path(sys.argv[1]), Path(sys.argv[2]), replace(SMALL, batch=6, epochs=1))\n"
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
+    done = subprocess.run(
+        [*command, str(dataset), str(tmp_path / "run")], env=environment, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    codes = load_file(tmp_path / "run" / "checkpoint.safetensors")["network/encoder.codes"]
+    moved = (codes - start_network(SMALL, data).encoder.codes).abs()
+    assert torch.isfinite(codes).all() and (moved.amin(dim=1) > 1e-4).all()
+
+
+def test_the_curve_shows_a_few_held_out_examples(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Never those with a trained code."""
+    monkeypatch.setattr(validation, "SEARCHED", 2)
+    config = replace(SMALL, holdout=5)
+    assert validation.held_out(data, config) == range(7, 9)
+    assert validation.held_out(data, replace(config, network=NetworkConfig())) == range(7, 12)
+    assert validation.held_out(data, replace(config, holdout=1)) == range(11, 12)
+
+
+def test_the_papers_recipe() -> None:
+    recipe, paper = PRESETS["paper-autodecoder"], PRESETS["paper"]
+    assert (recipe.batch, recipe.learning_rate, recipe.code_rate, recipe.epochs) == (64, 5e-4, 1e-3, 1000)
+    assert (recipe.network.dropout, recipe.network.search_steps, recipe.network.search_rate) == (0.2, 75, 1e-3)
+    network = replace(recipe.network, encoder="pointnet2", dropout=0.0)
+    assert replace(recipe, batch=40, epochs=300.0, network=network) == paper
+
+
+def test_what_cannot_train_an_autodecoder_is_refused(data: Dataset, dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="the loss is 'ce', but an autodecoder finds the code .* take --loss l1, ce"):
+        training.train(dataset, tmp_path / "run", replace(SMALL, loss="ce"))
+    with pytest.raises(ValueError, match="one code per training example, and augmentation .* train without"):
+        training.train(dataset, tmp_path / "run", replace(SMALL, augment=AugmentConfig(roll=True)))
+    with pytest.raises(ValueError, match="local_neighbors is 6, but an autodecoder has no features .*-neighbors 0"):
+        training.train(dataset, tmp_path / "run", replace(SMALL, network=replace(SMALL.network, local_neighbors=6)))
+    assert not (tmp_path / "run").exists()
+
+
+# --- the whole path ---------------------------------------------------------------------------------------------------
+
+
+def test_reconstruct_and_evaluate(dataset: Path, model: Model) -> None:
+    case = TestCase("pair", PointCloud(seen(dataset, 2)), truth_grid(truth(dataset, 2), 24))
+    scores = score_cases(model, lambda _: case, 1, progress=False).scores
+    assert scores.iou > 0.6 and scores.miou > 0.55
+    found = reconstruct(case.cloud, model, resolution=24)
+    assert [segment.name for segment in found.segments] == ["left", "right"]
+    for segment, true in zip(found.segments, truth(dataset, 2).segments, strict=True):
+        assert np.linalg.norm(segment.centroid - true.vertices.mean(axis=0)) < 0.25
+    assert 0 < found.segments[1].volume < 0.5 * found.segments[0].volume
+
+
+def test_distances_alone_give_one_object_and_no_miou(dataset: Path, tmp_path: Path) -> None:
+    """The paper's "DeepSDF with L1"."""
+    config = replace(SMALL, loss="l1", epochs=100, holdout=1)
+    model = load_model(training.train(dataset, tmp_path / "run", config))
+    case = TestCase("pair", PointCloud(seen(dataset, 2)), truth_grid(truth(dataset, 2), 24))
+    result = score_cases(model, lambda _: case, 1, progress=False)
+    assert result.names == ("object",) and result.scores.iou > 0.6 and np.isnan(result.scores.miou)
+    assert [segment.name for segment in reconstruct(case.cloud, model, resolution=16).segments] == ["object"]
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        last = list(csv.DictReader(file))[-1]
+    assert float(last["val_iou"]) > 0.3 and last["val_miou"] == "" and last["ce"] == ""

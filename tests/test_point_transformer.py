@@ -1,0 +1,241 @@
+"""Point Transformer: its attention against the paper's equation, and what the encoder must ignore."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import manifold3d
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file
+from test_training import SMALL, Killed, kill_after
+from torch import Tensor
+from toy_data import NAMES, write_toy_dataset
+
+from mereo import training
+from mereo.camera import PointCloud
+from mereo.config import PRESETS, AugmentConfig, NetworkConfig
+from mereo.encoders.point_transformer import PointTransformer, TransitionDown, VectorAttention
+from mereo.evaluation import TestCase, score_cases
+from mereo.frames import truth_grid
+from mereo.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.model import Network
+from mereo.neighbors import distinct_distances, nearest
+from mereo.reconstruction import reconstruct
+from mereo.weights import load_model
+
+TINY = NetworkConfig(
+    encoder="point-transformer",
+    points=128,
+    transformer_widths=(8, 12, 16, 20, 24),
+    transformer_neighbors=6,
+    mlp_global=(40,),
+)
+
+
+def cloud_of(points: int = TINY.points, batch: int = 2, seed: int = 0) -> Tensor:
+    return F.normalize(torch.randn(batch, points, 3, generator=torch.Generator().manual_seed(seed)), dim=-1)
+
+
+def settled(config: NetworkConfig = TINY) -> PointTransformer:
+    """In evaluation mode, with batch statistics that are not the trivial initial ones."""
+    torch.manual_seed(1)
+    encoder = PointTransformer(config).train()
+    encoder(cloud_of(config.points, batch=4))
+    return encoder.eval()
+
+
+# --- attention --------------------------------------------------------------------------------------------------------
+
+
+def attended(layer: VectorAttention, p: Tensor, x: Tensor, neighbors: list[int], i: int) -> Tensor:
+    """Equation 3 of Zhao et al. for one point, term by term."""
+
+    def two_layers(mlp: torch.nn.Sequential, v: Tensor) -> Tensor:
+        hidden = torch.clamp(mlp[0].weight @ v + mlp[0].bias, min=0)
+        out = mlp[2].weight @ hidden
+        return out if mlp[2].bias is None else out + mlp[2].bias
+
+    exponents, values = [], []
+    for j in neighbors:
+        delta = two_layers(layer.theta, p[i] - p[j])
+        relation = layer.phi.weight @ x[i] - layer.psi.weight @ x[j] + delta
+        exponents.append(two_layers(layer.gamma, relation).exp())
+        values.append(layer.alpha.weight @ x[j] + delta)
+    total = sum(exponents[1:], exponents[0])
+    return sum((e / total * v for e, v in zip(exponents, values, strict=True)), torch.zeros_like(values[0]))
+
+
+def test_vector_attention_is_equation_3() -> None:
+    torch.manual_seed(0)
+    layer = VectorAttention(6)
+    points, features = torch.randn(2, 10, 3), torch.randn(2, 10, 6)
+    index = nearest(points, points, 4)
+    with torch.no_grad():
+        fast = layer(points, features, index)
+        for b in range(2):
+            slow = [attended(layer, points[b], features[b], index[b, i].tolist(), i) for i in range(10)]
+            assert torch.allclose(fast[b], torch.stack(slow), atol=1e-5)
+
+
+def test_attention_sees_relative_places_only() -> None:
+    layer = VectorAttention(6)
+    points, features = torch.randn(2, 10, 3), torch.randn(2, 10, 6)
+    index = nearest(points, points, 4)
+    with torch.no_grad():
+        here, there = layer(points, features, index), layer(points + 3.0, features, index)
+        assert torch.allclose(here, there, atol=1e-4)
+        assert not torch.allclose(here, layer(2 * points, features, index), atol=1e-2)
+
+
+def test_transition_down_takes_the_largest_of_each_neighbourhood() -> None:
+    torch.manual_seed(0)
+    down = TransitionDown(5, 7).eval()
+    features, points = torch.randn(2, 20, 5), torch.randn(2, 20, 3)
+    index = nearest(points[:, :5], points, 4)
+    with torch.no_grad():
+        found = down(features, index)
+        for b, m in ((0, 0), (1, 4)):
+            each = torch.stack([down.mlp(features[b, j]) for j in index[b, m].tolist()])
+            assert torch.allclose(found[b, m], each.amax(dim=0), atol=1e-6)
+
+
+# --- the encoder ------------------------------------------------------------------------------------------------------
+
+
+def test_repeated_points_are_nobodys_neighbours() -> None:
+    """Against a slow reference: the nearest of the points that do not repeat an earlier one."""
+    cloud = cloud_of(12)
+    cloud = torch.cat([cloud, cloud[:, [3, 0, 7, 3]]], dim=1)
+    index = distinct_distances(cloud).topk(5, dim=2, largest=False).indices
+    for b in range(2):
+        for i in range(16):
+            reach = (cloud[b, :12] - cloud[b, i]).square().sum(dim=1)
+            assert index[b, i].tolist() == reach.argsort()[:5].tolist()
+
+
+def test_encoder_ignores_which_points_fill_up_a_cloud() -> None:
+    encoder, cloud = settled(), cloud_of()
+    front, again = cloud[:, :80], torch.randperm(80, generator=torch.Generator().manual_seed(2))[:48]
+    with torch.inference_mode():
+        one = encoder(torch.cat([front, front[:, :48]], dim=1)).latent
+        other = encoder(torch.cat([front, front[:, again]], dim=1)).latent
+        assert torch.allclose(one, other, atol=1e-5)
+
+
+def test_encoder_ignores_the_order_of_what_is_not_kept() -> None:
+    """The first quarter are the points of the second level; the rest is a set."""
+    encoder, cloud = settled(), cloud_of()
+    first = TINY.points // 4
+    order = torch.randperm(TINY.points - first, generator=torch.Generator().manual_seed(2))
+    shuffled = torch.cat([cloud[:, :first], cloud[:, first:][:, order]], dim=1)
+    with torch.inference_mode():
+        assert torch.allclose(encoder(cloud).latent, encoder(shuffled).latent, atol=1e-5)
+        assert not torch.allclose(encoder(cloud).latent, encoder(cloud.flip(2)).latent, atol=1e-3)
+
+
+def test_its_levels_are_prefixes_of_the_cloud() -> None:
+    encoding, cloud = settled()(cloud_of()), cloud_of()
+    assert [level.features.shape for level in encoding.levels] == [(2, 32, 12), (2, 8, 16)]
+    for level in encoding.levels:
+        assert torch.equal(level.centers, cloud[:, : level.centers.shape[1]])
+
+
+def test_gradient_reaches_every_parameter() -> None:
+    """With two points or more in the last block: one alone has nothing to weigh."""
+    torch.manual_seed(0)
+    network = Network(replace(TINY, points=512, width=24, local_neighbors=3, local_width=8), segments=3).train()
+    outputs = network(cloud_of(512, batch=4), torch.tensor([[0.0, 0.0, -8.0]] * 4), torch.randn(4, 30, 3))
+    sum(output.square().sum() for output in outputs if output is not None).backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().max() > 1e-7, name
+
+
+def test_paper_sizes() -> None:
+    """Five blocks and 1024 numbers; with local features, as many centres and channels as the levels of `base`."""
+    network = Network(replace(PRESETS["paper"].network, encoder="point-transformer"), 5)
+    assert isinstance(network.encoder, PointTransformer)
+    assert [block.leave.in_features for block in network.encoder.blocks] == [32, 64, 128, 256, 512]
+    assert network.decoder.latent1.in_features == 1024
+    base = PRESETS["base"].network
+    cloud = cloud_of(base.points)
+    networks = [
+        Network(replace(base, encoder=name, align_points=0), 2).eval() for name in ("pointnet2", "point-transformer")
+    ]
+    with torch.inference_mode():
+        ours, theirs = ([level.features.shape for level in each.encoder(cloud).levels] for each in networks)
+    assert ours == theirs
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    with pytest.raises(ValueError, match="transformer_neighbors is 0; it must be at least 1"):
+        Network(replace(TINY, transformer_neighbors=0), 2)
+    with pytest.raises(ValueError, match="search_steps is -1; it must be at least 1"):
+        Network(replace(TINY, search_steps=-1), 2)
+    with pytest.raises(ValueError, match="dropout is 1.0; it is a share from 0 to below 1"):
+        Network(replace(TINY, dropout=1.0), 2)
+    with pytest.raises(ValueError, match=r"transformer_widths are \(8, 16\); a Point Transformer needs at least three"):
+        Network(replace(TINY, transformer_widths=(8, 16)), 2)
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+CONFIG = replace(
+    SMALL,
+    network=replace(
+        SMALL.network,
+        encoder="point-transformer",
+        transformer_widths=(8, 12, 16),
+        transformer_neighbors=6,
+        align_points=0,
+        rest_template=False,
+        sight_neighbors=0,
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_dataset(tmp_path_factory.mktemp("toy") / "data")
+
+
+def test_killed_and_resumed_equals_uninterrupted(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(CONFIG, epochs=0.4)
+    training.train(dataset, tmp_path / "whole", config, checkpoint_every_s=0.0)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        kill_after(patch, 2)
+        training.train(dataset, tmp_path / "parts", config, checkpoint_every_s=0.0)
+    training.train(dataset, tmp_path / "parts", config, checkpoint_every_s=0.0)
+    whole, parts = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("whole", "parts"))
+    assert whole.keys() == parts.keys()
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def half_balls(center: np.ndarray, radius: float) -> SegmentedMesh:
+    whole = manifold3d.Manifold.sphere(radius, 48)
+    parts = []
+    for number, (name, side) in enumerate(zip(NAMES, (-1.0, 1.0), strict=True)):
+        mesh = whole.trim_by_plane((side, 0.0, 0.0), 0.0).to_mesh()
+        parts.append(
+            Segment(name, PALETTE[number], center + mesh.vert_properties[:, :3], mesh.tri_verts.astype(np.int64))
+        )
+    return SegmentedMesh(tuple(parts))
+
+
+def test_it_learns_and_goes_the_whole_path(dataset: Path, tmp_path: Path) -> None:
+    """Train, evaluate, reconstruct: the two halves of a ball, from its front."""
+    config = replace(CONFIG, epochs=12, augment=AugmentConfig())
+    model = load_model(training.train(dataset, tmp_path / "run", config))
+    center, rng = np.array([3.0, -2.0, 150.0]), np.random.default_rng(0)
+    front = rng.normal(size=(300, 3))
+    front *= 8.0 / np.linalg.norm(front, axis=1, keepdims=True)
+    front[:, 2] = -np.abs(front[:, 2])
+    case = TestCase("ball", PointCloud(center + front), truth_grid(half_balls(center, 8.0), 24))
+    scores = score_cases(model, lambda _: case, 1, progress=False).scores
+    assert scores.iou > 0.7 and scores.miou > 0.7
+    found = reconstruct(case.cloud, model, resolution=24).segments
+    assert [segment.name for segment in found] == list(NAMES)
+    assert [np.sign(segment.centroid[0] - center[0]) for segment in found] == [-1, 1]
