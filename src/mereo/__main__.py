@@ -12,6 +12,7 @@ from tyro.conf import arg, subcommand
 
 from mereo import commands
 from mereo.config import PRESETS, TrainConfig
+from mereo.experiment_command import Experiment
 
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 USER_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
@@ -96,6 +97,7 @@ def _syntax(preset: str) -> Any:
         | Annotated[_train_from(preset), subcommand("train")]
         | Annotated[commands.Evaluate, subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
+        | Annotated[Experiment, subcommand("experiment")]
     )
 
 
