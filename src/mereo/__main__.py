@@ -14,6 +14,7 @@ from tyro.conf import subcommand
 
 from mereo import commands, scene_commands
 from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
+from mereo.experiment_command import Experiment
 
 Choice = TypeVar("Choice")
 
@@ -110,6 +111,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
+        | Annotated[Experiment, subcommand("experiment")]
     )
 
 

@@ -1,0 +1,52 @@
+"""How large an experiment is: in minutes to prove that it runs, in hours on two cores, or as published."""
+
+from dataclasses import dataclass, replace
+
+from mereo.config import PRESETS, TrainConfig
+
+TRAINING_SEED = 1
+"""Of all datasets; test views come from ``config.TEST_SEED_START``."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A budget.
+
+    Attributes:
+        name: as on the command line.
+        recipe: training settings, from which an experiment changes what it compares.
+        rival: a second recipe to report beside it where an experiment compares whole recipes; None for one only.
+        examples, test_examples: of each dataset, and of each evaluation.
+        cells: of the evaluation's grid along each axis; the paper's is 100.
+        objects: the most objects that an experiment takes, in its own order; None means all.
+        downloads: whether objects are taken whose meshes are downloaded.
+    """
+
+    name: str
+    recipe: TrainConfig
+    rival: TrainConfig | None
+    examples: int
+    test_examples: int
+    cells: int
+    objects: int | None
+    downloads: bool
+
+    def choose(self, objects: tuple[str, ...]) -> tuple[str, ...]:
+        """Those of an experiment's objects that fit the budget."""
+        known = objects if self.downloads else tuple(name for name in objects if name not in DOWNLOADED)
+        return known[: self.objects]
+
+
+DOWNLOADED = ("human", "bunny", "skull", "liver", "tumor")
+
+_TINY, _BASE, _PAPER = PRESETS["tiny"], PRESETS["base"], PRESETS["paper"]
+
+# Without alignment and template: every variant of the paper can be switched on its own in what is left, which learns in
+# minutes what the paper's network without local features does not learn in hours (docs/design/0002-learning.md).
+_SHORT = replace(_BASE, network=replace(_BASE.network, align_points=0, rest_template=False), epochs=10, holdout=64)
+
+SCALES = {
+    "smoke": Scale("smoke", replace(_TINY, epochs=1, holdout=4), None, 64, 2, 24, 1, False),
+    "cpu": Scale("cpu", _SHORT, None, 2560, 32, 64, 2, True),
+    "paper": Scale("paper", _PAPER, PRESETS["large"], 28_800, 128, 100, None, True),
+}

@@ -1,0 +1,118 @@
+"""Experiments: what is shared, what is written, and that a claim can fail."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mereo.config import GenerateConfig
+from mereo.experiments.registry import EXPERIMENTS, run_experiment
+from mereo.experiments.result import Claim, Result, Row, better, markdown, published, write_result
+from mereo.experiments.scales import SCALES
+from mereo.experiments.store import Score, Store, content_key, read_score
+
+NAN = float("nan")
+
+
+def score(iou: float, miou: float) -> Score:
+    return Score(iou, miou, iou, miou, {"a": miou})
+
+
+def test_published_figures_are_the_papers() -> None:
+    figures = published()
+    assert set(EXPERIMENTS) <= set(figures)
+    assert len(figures["reconstruction"]) == 10
+    assert figures["reconstruction"]["rope"] == {"iou": 0.815, "miou": 0.375}
+    assert figures["noise"]["0.1"]["2.0"] == {"iou": 0.346, "miou": 0.289}
+    assert figures["sampling"]["lizard"]["label-uniform"] == {"iou": 0.679, "miou": 0.681}
+    bars = figures["encoders-losses"]
+    assert bars["rope"]["pointnet2"]["ce+l1"] == {"iou": 0.841, "miou": 0.422}
+    assert "miou" not in bars["rope"]["pointnet2"]["l1"]
+    assert all(0 < value <= 1 for value in leaves({k: v for k, v in figures.items() if k != "source"}))
+
+
+def leaves(value: object) -> list[float]:
+    if isinstance(value, dict):
+        return [leaf for item in value.values() for leaf in leaves(item)]
+    assert isinstance(value, float)
+    return [value]
+
+
+def test_the_table_shows_both_figures_and_the_verdict() -> None:
+    rows = (Row("rope", "on", score(0.8, 0.6), {"miou": 0.375}), Row("rope", "off", score(0.7, NAN)))
+    claim = Claim("On is better.", {"rope": True, "shapes": False})
+    text = markdown(Result("positional-encoding", "Positional encoding", "smoke", rows, (claim,)))
+    assert "| rope | on | 0.800 | 0.600 | 0.800 | 0.600 |  | 0.375 |" in text
+    assert "| rope | off | 0.700 |  | 0.700 |  |  |  |" in text
+    assert "- On is better. We agree for rope, not for shapes." in text
+
+
+def test_verdicts() -> None:
+    assert Claim("", {"a": True}).verdict == "We agree (a)."
+    assert Claim("", {"a": False, "b": False}).verdict == "We do not agree (a, b)."
+    assert Claim("", {}).verdict == "Not tried here."
+
+
+def test_better_is_by_segments_where_both_know_them() -> None:
+    assert better(score(0.5, 0.4), score(0.9, 0.3))
+    assert better(score(0.9, NAN), score(0.5, 0.4)) and not better(score(0.4, NAN), score(0.5, 0.1))
+
+
+def test_results_are_three_files(tmp_path: Path) -> None:
+    result = Result("noise", "Noise", "cpu", (Row("rope", "x", score(0.5, NAN)),), (Claim("c", {"rope": True}),))
+    write_result(result, tmp_path / "noise")
+    write_result(result, tmp_path / "noise")  # again, over the old ones
+    assert {path.name for path in (tmp_path / "noise").iterdir()} == {"table.md", "results.json", "figure.png"}
+    found = json.loads((tmp_path / "noise" / "results.json").read_text())
+    assert found["rows"][0]["score"]["miou"] is None
+    assert found["claims"][0]["verdict"] == "We agree (rope)."
+
+
+def test_scores_are_read_back_with_what_they_lack(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    metrics = {"iou": 0.5, "miou": None, "example_mean": {"iou": 0.4, "miou": None}, "per_segment": {"object": 0.5}}
+    path.write_text(json.dumps(metrics))
+    found = read_score(path)
+    assert (found.iou, found.example_iou, found.per_segment) == (0.5, 0.4, {"object": 0.5})
+    assert found.miou != found.miou
+
+
+def test_keys_follow_content_not_order() -> None:
+    assert content_key({"a": 1, "b": 2}) == content_key({"b": 2, "a": 1})
+    assert content_key({"a": 1}) != content_key({"a": 2})
+
+
+def test_small_scales_need_no_download() -> None:
+    assert SCALES["smoke"].choose(("human", "rope", "shapes")) == ("rope",)
+    assert SCALES["cpu"].choose(("human", "rope", "shapes")) == ("human", "rope")
+    assert SCALES["paper"].choose(("human", "rope", "shapes")) == ("human", "rope", "shapes")
+
+
+@pytest.mark.parametrize("name, scale", [("nose", "smoke"), ("noise", "huge")])
+def test_unknown_names_are_refused(name: str, scale: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="is unknown; it must be one of"):
+        run_experiment(name, scale, tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_store_makes_each_thing_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store, recipe = Store(tmp_path), replace(SCALES["smoke"].recipe, epochs=0.1)
+    settings = replace(GenerateConfig(), noise_std=0.5)
+    for _ in range(2):
+        dataset = store.dataset("rope", settings, 64)
+        weights = store.run(dataset, recipe)
+        found = store.score(weights, settings, 1, 16)
+        assert 0 <= found.iou <= 1
+        other = store.run(dataset, replace(recipe, loss="l1"))
+    assert weights != other
+    assert [len(list((tmp_path / kind).iterdir())) for kind in ("datasets", "runs", "scores")] == [1, 2, 1]
+    assert capsys.readouterr().out.count("64 examples made") == 1
+
+
+@pytest.mark.slow
+def test_an_experiment_runs_and_runs_again_from_its_store(tmp_path: Path) -> None:
+    first = (run_experiment("positional-encoding", "smoke", tmp_path) / "table.md").read_text()
+    again = (run_experiment("positional-encoding", "smoke", tmp_path) / "table.md").read_text()
+    assert first == again and "| rope | off |" in first
