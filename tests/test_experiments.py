@@ -116,3 +116,4 @@ def test_an_experiment_runs_and_runs_again_from_its_store(tmp_path: Path) -> Non
     first = (run_experiment("positional-encoding", "smoke", tmp_path) / "table.md").read_text()
     again = (run_experiment("positional-encoding", "smoke", tmp_path) / "table.md").read_text()
     assert first == again and "| rope | off |" in first
+    assert "We agree" not in first and "Not tried here." in first

@@ -20,6 +20,7 @@ class Scale:
         cells: of the evaluation's grid along each axis; the paper's is 100.
         objects: the most objects that an experiment takes, in its own order; None means all.
         downloads: whether objects are taken whose meshes are downloaded.
+        decides: whether networks learn enough for claims to be judged.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Scale:
     cells: int
     objects: int | None
     downloads: bool
+    decides: bool = True
 
     def choose(self, objects: tuple[str, ...]) -> tuple[str, ...]:
         """Those of an experiment's objects that fit the budget."""
@@ -46,7 +48,7 @@ _TINY, _BASE, _PAPER = PRESETS["tiny"], PRESETS["base"], PRESETS["paper"]
 _SHORT = replace(_BASE, network=replace(_BASE.network, align_points=0, rest_template=False), epochs=10, holdout=64)
 
 SCALES = {
-    "smoke": Scale("smoke", replace(_TINY, epochs=1, holdout=4), None, 64, 2, 24, 1, False),
-    "cpu": Scale("cpu", _SHORT, None, 2560, 32, 64, 2, True),
-    "paper": Scale("paper", _PAPER, PRESETS["large"], 28_800, 128, 100, None, True),
+    "smoke": Scale("smoke", replace(_TINY, epochs=1, holdout=4), None, 64, 2, 24, 1, downloads=False, decides=False),
+    "cpu": Scale("cpu", _SHORT, None, 2560, 32, 64, 2, downloads=True),
+    "paper": Scale("paper", _PAPER, PRESETS["large"], 28_800, 128, 100, None, downloads=True),
 }
