@@ -227,7 +227,7 @@ def half_balls(center: np.ndarray, radius: float) -> SegmentedMesh:
 
 def test_it_learns_and_goes_the_whole_path(dataset: Path, tmp_path: Path) -> None:
     """Train, evaluate, reconstruct: the two halves of a ball, from its front."""
-    config = replace(CONFIG, epochs=12, augment=AugmentConfig())
+    config = replace(CONFIG, epochs=24, augment=AugmentConfig())
     model = load_model(training.train(dataset, tmp_path / "run", config))
     center, rng = np.array([3.0, -2.0, 150.0]), np.random.default_rng(0)
     front = rng.normal(size=(300, 3))
