@@ -233,6 +233,21 @@ def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:
         assert len(list(csv.DictReader(file))) == 8
 
 
+def test_only_the_first_process_claims_the_directory(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that comes while the first one writes the settings waits instead of refusing the directory."""
+    data, waited = training.Dataset.load(dataset), []
+    monkeypatch.setattr(torch.distributed, "barrier", lambda: waited.append(True))
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / ".config.json.partial").touch()  # what the first one is writing
+    claim_run(run, SMALL, data, training.Process(1, 2))
+    assert waited and not (run / "config.json").exists()
+    with pytest.raises(FileExistsError, match="is not a training run"):
+        claim_run(run, SMALL, data, training.Process(0, 2))
+
+
 def test_batch_must_be_divisible(dataset: Path, tmp_path: Path) -> None:
     data = training.Dataset.load(dataset)
     with pytest.raises(ValueError, match="batch of 8 cannot be shared by 3 processes"):

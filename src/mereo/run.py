@@ -107,14 +107,24 @@ def join_processes() -> Process:
 
 
 def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Process) -> None:
-    """Create the run directory, or check that it belongs to the same settings and dataset."""
+    """Create the run directory, or check that it belongs to the same settings and dataset.
+
+    Process 0 does so alone: another one would find the directory that it is just creating, without its settings yet.
+    The others wait; where process 0 refuses, torchrun ends them.
+    """
     if config.batch % process.world:
         raise ValueError(
             f"the batch of {config.batch} cannot be shared by {process.world} processes; it must be a multiple: "
             "change --batch or the number of processes"
         )
-    dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
-    settings = json.loads(json.dumps({"dataset": dataset, "train": asdict(config)}))
+    if process.is_main:
+        dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
+        _claim_directory(run_dir, json.loads(json.dumps({"dataset": dataset, "train": asdict(config)})))
+    if process.world > 1:
+        dist.barrier()
+
+
+def _claim_directory(run_dir: Path, settings: dict[str, Any]) -> None:
     path = run_dir / "config.json"
     if path.is_file():
         before = _with_defaults(json.loads(path.read_text()))
@@ -126,11 +136,9 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
             )
     elif run_dir.exists() and any(run_dir.iterdir()):
         raise FileExistsError(f"{run_dir} exists and is not a training run; choose another --output")
-    elif process.is_main:
+    else:
         run_dir.mkdir(parents=True, exist_ok=True)
         write_json(path, settings)
-    if process.world > 1:
-        dist.barrier()
 
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
