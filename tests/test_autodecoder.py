@@ -1,9 +1,6 @@
 """The autodecoder: codes of training examples, the search for that of a new cloud, and what it refuses."""
 
 import csv
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +9,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from shapes import ball
-from test_training import Killed, kill_after
 from toy_data import write_toy_dataset
+from training_runs import assert_resumes_exactly, train_in_two_processes
 
 from mereo import training, validation
 from mereo.camera import PointCloud
@@ -204,40 +201,18 @@ def test_the_prior_is_the_codes_squared_length() -> None:
 # --- training ---------------------------------------------------------------------------------------------------------
 
 
-def test_killed_and_resumed_equals_uninterrupted(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_and_resumed_equals_uninterrupted(dataset: Path, tmp_path: Path) -> None:
     """Codes, their momentum, the dropout masks and the averaged codes included."""
     config = replace(SMALL, batch=5, epochs=1.2, ema_decay=0.9, holdout=1)
     config = replace(config, network=replace(config.network, dropout=0.2, search_steps=3))
-    training.train(dataset, tmp_path / "whole", config, checkpoint_every_s=0.0)
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        kill_after(patch, 2)
-        training.train(dataset, tmp_path / "parts", config, checkpoint_every_s=0.0)
-    training.train(dataset, tmp_path / "parts", config, checkpoint_every_s=0.0)
-    whole, parts = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("whole", "parts"))
-    assert whole.keys() == parts.keys()
-    assert all(torch.equal(whole[name], parts[name]) for name in whole)
-    assert (tmp_path / "whole" / "metrics.csv").read_text() == (tmp_path / "parts" / "metrics.csv").read_text()
+    assert_resumes_exactly(dataset, tmp_path, config, steps=2)
 
 
 @pytest.mark.slow
 def test_two_processes_train_each_others_codes(dataset: Path, data: Dataset, tmp_path: Path) -> None:
     """After one pass every code has moved, in the one copy that is saved."""
-    script = tmp_path / "run.py"
-    script.write_text(
-        "import sys\nfrom dataclasses import replace\nfrom pathlib import Path\n"
-        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        "from test_autodecoder import SMALL\nfrom mereo.training import train\n"
-        "train(Path(sys.argv[1]), Path(sys.argv[2]), replace(SMALL, batch=6, epochs=1))\n"
-    )
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
-    done = subprocess.run(
-        [*command, str(dataset), str(tmp_path / "run")], env=environment, capture_output=True, text=True, timeout=240
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    codes = load_file(tmp_path / "run" / "checkpoint.safetensors")["network/encoder.codes"]
+    run = train_in_two_processes(dataset, tmp_path, "test_autodecoder", "replace(SMALL, batch=6, epochs=1)")
+    codes = load_file(run / "checkpoint.safetensors")["network/encoder.codes"]
     moved = (codes - start_network(SMALL, data).encoder.codes).abs()
     assert torch.isfinite(codes).all() and (moved.amin(dim=1) > 1e-4).all()
 

@@ -4,8 +4,6 @@ import csv
 import json
 import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from toy_data import NAMES, write_toy_dataset
+from training_runs import assert_resumes_exactly, train_in_two_processes
 
 from mereo import training
 from mereo.config import PRESETS, AugmentConfig, TrainConfig
@@ -36,39 +35,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_toy_dataset(tmp_path_factory.mktemp("toy") / "data")
 
 
-class Killed(Exception):
-    pass
-
-
-def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
-    original = training.Trainer.train_step
-
-    def step(self: training.Trainer, batch: object) -> None:
-        if self.step == steps:
-            raise Killed
-        original(self, batch)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(training.Trainer, "train_step", step)
-
-
-def without_wall_clock(run: Path) -> dict[str, torch.Tensor]:
-    return load_file(run / "checkpoint.safetensors")
-
-
-def test_killed_and_resumed_equals_uninterrupted(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = replace(SMALL, epochs=1)
-    training.train(dataset, tmp_path / "whole", config, checkpoint_every_s=0.0)
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        kill_after(patch, 5)
-        training.train(dataset, tmp_path / "parts", config, checkpoint_every_s=0.0)
-    assert not list((tmp_path / "parts").glob(".*"))  # a file being written has a hidden name
-    training.train(dataset, tmp_path / "parts", config, checkpoint_every_s=0.0)
-    whole, parts = without_wall_clock(tmp_path / "whole"), without_wall_clock(tmp_path / "parts")
-    assert whole.keys() == parts.keys()
-    assert all(torch.equal(whole[name], parts[name]) for name in whole)
-    assert (tmp_path / "whole" / "metrics.csv").read_text() == (tmp_path / "parts" / "metrics.csv").read_text()
+def test_killed_and_resumed_equals_uninterrupted(dataset: Path, tmp_path: Path) -> None:
+    assert_resumes_exactly(dataset, tmp_path, replace(SMALL, epochs=1), steps=5)
 
 
 def test_a_finished_run_is_left_alone(dataset: Path, tmp_path: Path) -> None:
@@ -214,22 +182,10 @@ def test_a_dataset_without_template_is_refused(dataset: Path, tmp_path: Path) ->
 
 def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:
     """Under torchrun, both halves of every batch count: the result is finite, complete, and resumable."""
-    script = tmp_path / "run.py"
-    script.write_text(
-        "import sys\nfrom dataclasses import replace\nfrom pathlib import Path\n"
-        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        "from test_training import SMALL\nfrom mereo.training import train\n"
-        "train(Path(sys.argv[1]), Path(sys.argv[2]), replace(SMALL, epochs=1))\n"
-    )
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
-    done = subprocess.run(
-        [*command, str(dataset), str(tmp_path / "run")], env=environment, capture_output=True, text=True, timeout=240
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    tensors = load_file(tmp_path / "run" / "checkpoint.safetensors")
+    run = train_in_two_processes(dataset, tmp_path, "test_training", "replace(SMALL, epochs=1)")
+    tensors = load_file(run / "checkpoint.safetensors")
     assert all(torch.isfinite(value).all() for value in tensors.values())
-    with (tmp_path / "run" / "metrics.csv").open() as file:
+    with (run / "metrics.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 8
 
 

@@ -1,0 +1,60 @@
+"""Training runs that are stopped or shared, for the tests of every encoder."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from mereo import training
+from mereo.config import TrainConfig
+
+
+class _Killed(Exception):
+    pass
+
+
+def _kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    original = training.Trainer.train_step
+
+    def step(self: training.Trainer, batch: object) -> None:
+        if self.step == steps:
+            raise _Killed
+        original(self, batch)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(training.Trainer, "train_step", step)
+
+
+def assert_resumes_exactly(dataset: Path, folder: Path, config: TrainConfig, steps: int) -> None:
+    """A run that is killed after ``steps`` and started again ends with the same bits as an uninterrupted one."""
+    training.train(dataset, folder / "whole", config, checkpoint_every_s=0.0)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(_Killed):
+        _kill_after(patch, steps)
+        training.train(dataset, folder / "parts", config, checkpoint_every_s=0.0)
+    assert not list((folder / "parts").glob(".*"))  # a file being written has a hidden name
+    training.train(dataset, folder / "parts", config, checkpoint_every_s=0.0)
+    whole, parts = (load_file(folder / name / "checkpoint.safetensors") for name in ("whole", "parts"))
+    assert whole.keys() == parts.keys()
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    assert (folder / "whole" / "metrics.csv").read_text() == (folder / "parts" / "metrics.csv").read_text()
+
+
+def train_in_two_processes(dataset: Path, folder: Path, module: str, config: str) -> Path:
+    """Train under torchrun with ``config``, an expression of the test module's ``SMALL``; returns the run."""
+    script = folder / "run.py"
+    script.write_text(
+        "import sys\nfrom dataclasses import replace\nfrom pathlib import Path\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        f"from {module} import SMALL\nfrom mereo.training import train\n"
+        f"train(Path(sys.argv[1]), Path(sys.argv[2]), {config})\n"
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
+    done = subprocess.run(
+        [*command, str(dataset), str(folder / "run")], env=environment, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return folder / "run"
