@@ -3,11 +3,10 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from tyro.conf import Positional
 
-Name = Literal["reconstruction", "encoders-losses", "sampling", "positional-encoding", "noise", "real-world"]
+from mereo.experiments.scales import ExperimentName, ScaleName
 
 
 @dataclass(frozen=True)
@@ -21,8 +20,8 @@ class Experiment:
         workers: processes that make datasets; 0 means one per core.
     """
 
-    name: Positional[Name]
-    scale: Literal["smoke", "cpu", "paper"] = "smoke"
+    name: Positional[ExperimentName]
+    scale: ScaleName = "smoke"
     output: Path = Path("out/experiments")
     workers: int = 0
 

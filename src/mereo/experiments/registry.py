@@ -4,12 +4,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import get_args
 
 from mereo.experiments.result import Result, write_result
-from mereo.experiments.scales import SCALES, Scale
+from mereo.experiments.scales import SCALES, ExperimentName, Scale
 from mereo.experiments.store import Store
 
-EXPERIMENTS = ("reconstruction", "encoders-losses", "sampling", "positional-encoding", "noise", "real-world")
+EXPERIMENTS = get_args(ExperimentName)
 
 
 def run_experiment(name: str, scale: str, root: Path, workers: int = 1) -> Path:

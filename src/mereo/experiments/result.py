@@ -149,7 +149,8 @@ def draw_bars(result: Result, path: Path) -> None:
     variants = list(dict.fromkeys(row.variant for row in result.rows))
     colors = matplotlib.colormaps["viridis"](np.linspace(0.05, 0.9, len(variants)))
     width = 0.8 / len(variants)
-    figure, axes = plt.subplots(figsize=(max(5.0, 0.45 * len(result.rows) + 1.5), 3.6), layout="constrained")
+    inches = max(6.5, 0.45 * len(result.rows) + 1.5)
+    figure, axes = plt.subplots(figsize=(inches, 4.2), layout="constrained")
     for row in result.rows:
         number = variants.index(row.variant)
         x = objects.index(row.object) + (number - (len(variants) - 1) / 2) * width
@@ -159,9 +160,8 @@ def draw_bars(result: Result, path: Path) -> None:
         for value in (row.paper or {}).values():
             axes.plot([x - width * 0.45, x + width * 0.45], [value, value], color="black", linewidth=1.2)
     handles = [Patch(color=color) for color in colors]
-    axes.legend(
-        handles, variants, fontsize=8, ncols=min(4, len(variants)), loc="upper center", bbox_to_anchor=(0.5, -0.1)
-    )
+    columns = max(1, int(inches * 12) // (max(map(len, variants)) + 6))  # about twelve letters to an inch
+    figure.legend(handles, variants, fontsize=8, ncols=columns, loc="outside lower center")
     axes.set_xticks(range(len(objects)), objects)
     axes.set_ylim(0, 1)
     axes.set_ylabel("IoU (pale), mIoU (full), paper (line)")

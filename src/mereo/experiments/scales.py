@@ -1,8 +1,12 @@
 """How large an experiment is: in minutes to prove that it runs, in hours on two cores, or as published."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from mereo.config import PRESETS, TrainConfig
+
+ExperimentName = Literal["reconstruction", "encoders-losses", "sampling", "positional-encoding", "noise", "real-world"]
+ScaleName = Literal["smoke", "cpu", "paper"]
 
 TRAINING_SEED = 1
 """Of all datasets; test views come from ``config.TEST_SEED_START``."""
@@ -13,7 +17,7 @@ class Scale:
     """A budget.
 
     Attributes:
-        name: as on the command line.
+        name: its own.
         recipe: training settings, from which an experiment changes what it compares.
         rival: a second recipe to report beside it where an experiment compares whole recipes; None for one only.
         examples, test_examples: of each dataset, and of each evaluation.
@@ -23,7 +27,7 @@ class Scale:
         decides: whether networks learn enough for claims to be judged.
     """
 
-    name: str
+    name: ScaleName
     recipe: TrainConfig
     rival: TrainConfig | None
     examples: int
@@ -39,7 +43,7 @@ class Scale:
         return known[: self.objects]
 
 
-DOWNLOADED = ("human", "bunny", "skull", "liver", "tumor")
+DOWNLOADED = ("human", "bunny", "skull", "liver", "tumor", "liver-simulated")
 
 _TINY, _BASE, _PAPER = PRESETS["tiny"], PRESETS["base"], PRESETS["paper"]
 
@@ -47,8 +51,10 @@ _TINY, _BASE, _PAPER = PRESETS["tiny"], PRESETS["base"], PRESETS["paper"]
 # minutes what the paper's network without local features does not learn in hours (docs/design/0002-learning.md).
 _SHORT = replace(_BASE, network=replace(_BASE.network, align_points=0, rest_template=False), epochs=10, holdout=64)
 
-SCALES = {
-    "smoke": Scale("smoke", replace(_TINY, epochs=1, holdout=4), None, 64, 2, 24, 1, downloads=False, decides=False),
-    "cpu": Scale("cpu", _SHORT, None, 2560, 32, 64, 2, downloads=True),
-    "paper": Scale("paper", _PAPER, PRESETS["large"], 28_800, 128, 100, None, downloads=True),
-}
+_ALL = (
+    Scale("smoke", replace(_TINY, epochs=1, holdout=4), None, 64, 2, 24, 1, downloads=False, decides=False),
+    Scale("cpu", _SHORT, None, 2560, 32, 64, 2, downloads=True),
+    Scale("paper", _PAPER, PRESETS["large"], 28_800, 128, 100, None, downloads=True),
+)
+
+SCALES = {str(scale.name): scale for scale in _ALL}
