@@ -29,18 +29,14 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
     from mereo.label_volume import read_label_volume, segment_surfaces
 
     assert file.labels is not None and file.names is not None, "the schema asks for both"
-    try:
+    with document.named_at(("labels",)):
         return segment_surfaces(read_label_volume(folder / file.labels), file.names, file.cells)
-    except (ValueError, FileNotFoundError) as error:
-        raise type(error)(f"{document.at(('labels',))}: {error}") from error
 
 
 def _read(document: Document, place: Sequence[int | str], path: Path) -> SegmentedMesh:
     """A mesh file; errors say which line names it."""
-    try:
+    with document.named_at(place):
         return read_segmented_mesh(path)
-    except (ValueError, FileNotFoundError) as error:
-        raise type(error)(f"{document.at(place)}: {error}") from error
 
 
 def _from_files(document: Document, parts: Sequence[FilePart]) -> list[Segment]:

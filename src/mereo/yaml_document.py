@@ -1,6 +1,7 @@
 """A YAML file with its line numbers: what is wrong in it is said as file, line, value, rule and cure."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -79,6 +80,14 @@ class Document:
     def at(self, place: Place) -> str:
         """``file:line`` of a place, or of the innermost block around it."""
         return f"{self.path}:{self.pair(place)[0].start_mark.line + 1}"
+
+    @contextmanager
+    def named_at(self, place: Place) -> Iterator[None]:
+        """Errors on what a place names, such as a file, begin with the place's line."""
+        try:
+            yield
+        except (ValueError, FileNotFoundError) as error:
+            raise type(error)(f"{self.at(place)}: {error}") from error
 
     def error(self, place: Place, message: str) -> ValueError:
         """An error at a place, to be raised."""
