@@ -14,7 +14,7 @@ from mereo import __main__ as command_line
 from mereo.config import PRESETS
 from mereo.mesh import Segment, SegmentedMesh, check_segment
 from mereo.model import Model, Network
-from mereo.solid import check_overlap
+from mereo.overlap import check_overlap
 from mereo.weights import load_model, save_model
 
 

@@ -8,8 +8,9 @@ from jaxtyping import Int
 
 from mereo.label_volume import is_volume, read_label_volume, segment_surfaces
 from mereo.mesh import SegmentedMesh
+from mereo.overlap import check_overlap
 from mereo.scene import load_scene
-from mereo.solid import Solids, check_overlap
+from mereo.solid import Solids
 
 nibabel = pytest.importorskip("nibabel")
 nrrd = pytest.importorskip("nrrd")

@@ -10,9 +10,10 @@ import pytest
 from mereo.deformation import jacobian_determinant
 from mereo.manifold import mesh_of, solid_of
 from mereo.mesh_repair import close_holes, largest_piece
+from mereo.overlap import check_overlap
 from mereo.scene import load_scene
 from mereo.scenes import _liver_parts, skull, tumor
-from mereo.solid import Solids, check_overlap
+from mereo.solid import Solids
 
 Require = Callable[[str], Path]
 

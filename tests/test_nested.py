@@ -16,12 +16,13 @@ from mereo.extraction import extract, extract_dense
 from mereo.frame import rigid, transform_points
 from mereo.generation import make_manifest
 from mereo.mesh import SegmentedMesh
+from mereo.overlap import check_overlap
 from mereo.ownership import owner_labels
 from mereo.query_sampling import label_uniform, nested_sort_sample, sample_queries, sort_sample, volume_uniform
 from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
 from mereo.scene import Scene
 from mereo.shading import Viewpoint, shade
-from mereo.solid import Solids, check_overlap, label_grid, signed_distance_and_direction
+from mereo.solid import Solids, label_grid, signed_distance_and_direction
 from mereo.synthesis import example_rng, sample_view, synthesize
 
 CORE, ORGAN = ((2.0, 0.0, 0.0), 2.6), ((0.0, 0.0, 0.0), 5.0)

@@ -19,9 +19,10 @@ from toy_data import write_toy_dataset
 
 from mereo.camera import PointCloud
 from mereo.output import OUTER_OPACITY
+from mereo.overlap import check_overlap
 from mereo.pictures import render_cloud_and_segments
 from mereo.reconstruction import Reconstruction, reconstruct, write_reconstruction
-from mereo.solid import Solids, check_overlap
+from mereo.solid import Solids
 from mereo.training import train
 from mereo.weights import load_model, save_model
 

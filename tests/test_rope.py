@@ -7,9 +7,10 @@ import pytest
 
 from mereo.deformation import jacobian_determinant
 from mereo.mesh import SegmentedMesh
+from mereo.overlap import check_overlap
 from mereo.scene import load_scene
 from mereo.scenes import rope
-from mereo.solid import Solids, check_overlap
+from mereo.solid import Solids
 
 STATES = 100
 

@@ -14,9 +14,10 @@ from mereo.config import MIN_POINTS, GenerateConfig
 from mereo.deformation import invert, jacobian_determinant
 from mereo.frame import inverse_rigid, transform_points
 from mereo.mesh import SegmentedMesh
+from mereo.overlap import check_overlap
 from mereo.rendering import render_depth
 from mereo.scene import SCENES, Scene, State, Workspace, load_scene, look_at
-from mereo.solid import Solids, check_overlap, label_grid
+from mereo.solid import Solids, label_grid
 
 STATES, MANY_STATES, CAMERAS = 12, 200, 50
 

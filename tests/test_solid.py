@@ -8,7 +8,8 @@ import trimesh
 from shapes import ball, box, knobbly_torus, one, segment
 
 from mereo.mesh import Segment, SegmentedMesh
-from mereo.solid import Solids, check_overlap, label_grid, signed_distance_and_direction
+from mereo.overlap import check_overlap
+from mereo.solid import Solids, label_grid, signed_distance_and_direction
 
 
 def convex_polyhedron(seed: int) -> tuple[Segment, np.ndarray, np.ndarray]:

@@ -1,31 +1,24 @@
-"""What is wrong with a user's meshes: each segment by itself, segments with each other, and at random states."""
+"""What is wrong with a user's meshes, each segment by itself; for segments with each other see ``overlap``."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
 
 import igl
 import numpy as np
 from jaxtyping import Float, Int
 
-from mereo.mesh import Segment, SegmentedMesh
-from mereo.solid import Filled
+from mereo.mesh import Segment
 
 BESIDE = 1e-4
 """How far beside a face the winding number is asked, in diagonals of the box; libigl's is in single precision."""
 
 NEGLIGIBLE = 1e-3
-"""Share of a segment's volume that may lie in another one, and of its surface that may face inwards."""
+"""Share of a segment's surface that may face inwards."""
 
 MOST_BURIED = 5e-3
 """Share of a segment's surface that may lie within itself, as lips and eyelids do: two rays are compared anyway."""
 
 MOST_BACKWARDS = 0.05
 """Share of the surface that may face inwards before the winding number has no meaning."""
-
-
-CELLS = 40
-"""Along each side of a segment's box, where volumes are measured: fast also for meshes with holes."""
 
 
 @dataclass(frozen=True)
@@ -92,56 +85,6 @@ def _wrong_shares(segment: Segment) -> tuple[float, float]:
     winding = igl.fast_winding_number(vertices, segment.faces.astype(np.int64), front)
     share = area[proper] / area.sum()
     return float(share[winding > 0.5].sum()), float(share[winding < -0.5].sum())
-
-
-# --- segments together ------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Overlap:
-    """Volume that two segments share without being declared nested, or that a nested one has outside.
-
-    Attributes:
-        small, large: names; the smaller one, or the inner one, first.
-        share: of the smaller segment's volume.
-        nested: whether the pair is declared nested; then ``share`` lies outside of the outer one.
-    """
-
-    small: str
-    large: str
-    share: float
-    nested: bool = False
-
-    def __str__(self) -> str:
-        if self.nested:
-            return f"{self.small} is nested in {self.large}, but {self.share:.2%} of it lies outside"
-        return f"{self.small} and {self.large} overlap in {self.share:.2%} of {self.small}"
-
-
-def overlaps(mesh: SegmentedMesh, tolerance: float = NEGLIGIBLE, cells: int = CELLS) -> tuple[Overlap, ...]:
-    """All pairs that ``solid.check_overlap`` would refuse, measured in the same way."""
-    return tuple(found for found in _overlaps(mesh, cells) if found.share > tolerance)
-
-
-def _overlaps(mesh: SegmentedMesh, cells: int) -> Iterator[Overlap]:
-    nesting = set(mesh.nesting)
-    order = sorted(range(len(mesh.segments)), key=lambda index: _box_volume(mesh.segments[index]))
-    grids = {index: Filled(mesh.segments[index], cells) for index in order}
-    for small, large in combinations(order, 2):
-        first, second = sorted((small, large))
-        inner, outer = (first, second) if (first, second) in nesting else (small, large)
-        share = grids[inner].share_in(mesh.segments[outer])
-        nested = (inner, outer) in nesting
-        yield Overlap(mesh.names[inner], mesh.names[outer], 1 - share if nested else share, nested)
-
-
-def _box_volume(segment: Segment) -> float:
-    return float(np.prod(segment.bounds[1] - segment.bounds[0]))
-
-
-def grid_volume(segment: Segment, cells: int = CELLS) -> float:
-    """The volume inside a mesh, also of one with holes, measured on a grid: within a percent or so."""
-    return Filled(segment, cells).volume
 
 
 # --- units ------------------------------------------------------------------------------------------------------------

@@ -18,7 +18,8 @@ from skimage.measure import marching_cubes
 
 from mereo.manifold import Faces, Vertices, mesh_of, solid_of
 from mereo.mesh import Segment, SegmentedMesh
-from mereo.mesh_check import examine, faces_astray, overlaps
+from mereo.mesh_check import examine, faces_astray
+from mereo.overlap import overlaps
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""

@@ -9,9 +9,10 @@ import trimesh
 from mereo.camera import Camera
 from mereo.frame import inverse_rigid, transform_points
 from mereo.mesh import Segment, SegmentedMesh
-from mereo.mesh_check import PLAUSIBLE_M, Overlap, examine, grid_volume, likely_unit, overlaps
+from mereo.mesh_check import PLAUSIBLE_M, Health, examine, likely_unit
 from mereo.mesh_repair import repaired, without_overlaps
 from mereo.output import atomic_file
+from mereo.overlap import Overlap, grid_volume, overlaps
 from mereo.scene import SCENES, Scene, is_yaml, load_scene
 from mereo.scene_file import build, read
 from mereo.scene_parts import read_segments
@@ -41,22 +42,23 @@ def check_scene(name: str, repair: bool = False) -> None:
         if repair:
             raise ValueError(f"--repair works on YAML scene files, and {name!r} is none: repair its meshes where it is")
         scene = load_scene(name)
-        faults = _report(scene.rest, "cubic units")
+        faults = _report(scene.rest, _examined(scene.rest), "cubic units")
     else:
         document = Document(Path(name))
         file = read(document)
         mesh = read_segments(document, file)
+        health = _examined(mesh)
         unit = next((key for key, value in UNITS.items() if value == file.units), "unit")
-        faults = _report(mesh, f"{unit}³")
+        faults = _report(mesh, health, f"{unit}³")
         _report_size(mesh, file.units, unit)
         if faults and repair:
-            _check_repaired(document, mesh)
+            _check_repaired(document, mesh, health)
             return
         if repair:
             print("nothing to repair")
-        if any(examine(segment).hopeless for segment in mesh.segments):
+        if any(found.hopeless for found in health):
             raise _refusal(name, faults)
-        scene = build(document, file, _marked(mesh))
+        scene = build(document, file, _marked(mesh, health))
     if name not in SCENES:
         faults += _report_states(scene)
     if faults:
@@ -71,10 +73,13 @@ def _refusal(name: str, faults: int) -> ValueError:
     return ValueError(f"{name} has {faults} {'fault' if faults == 1 else 'faults'}, listed above: {cure}")
 
 
-def _report(mesh: SegmentedMesh, unit: str) -> int:
+def _examined(mesh: SegmentedMesh) -> list[Health]:
+    return [examine(segment) for segment in mesh.segments]
+
+
+def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
     """Print each segment and each overlap; returns the number of faults."""
     faults = 0
-    health = [examine(segment) for segment in mesh.segments]
     usable = not any(found.hopeless for found in health)
     volumes = mesh.owned_volumes if usable else [np.nan] * len(health)
     for segment, found, volume in zip(mesh.segments, health, volumes, strict=True):
@@ -85,15 +90,16 @@ def _report(mesh: SegmentedMesh, unit: str) -> int:
             faults += 1
             print(f"  fault: it {fault}")
     if usable:
-        for overlap in overlaps(_marked(mesh)):
+        for overlap in overlaps(_marked(mesh, health)):
             faults += 1
             print(f"  fault: {overlap}")
     return faults
 
 
-def _marked(mesh: SegmentedMesh) -> SegmentedMesh:
+def _marked(mesh: SegmentedMesh, health: list[Health]) -> SegmentedMesh:
     """With segments that are no solids marked so."""
-    return replace(mesh, segments=tuple(replace(s, solid=examine(s).sound) for s in mesh.segments))
+    marked = (replace(s, solid=found.sound) for s, found in zip(mesh.segments, health, strict=True))
+    return replace(mesh, segments=tuple(marked))
 
 
 def _report_size(mesh: SegmentedMesh, unit_m: float, unit: str) -> None:
@@ -132,7 +138,7 @@ def _report_states(scene: Scene) -> int:
 # --- repairs ----------------------------------------------------------------------------------------------------------
 
 
-def _check_repaired(document: Document, mesh: SegmentedMesh) -> None:
+def _check_repaired(document: Document, mesh: SegmentedMesh, health: list[Health]) -> None:
     """Repair, say what was changed, write it, and check what was written."""
     fixed = [repaired(segment) for segment in mesh.segments]
     changes = {fix.segment.name: list(fix.changes) for fix in fixed}
@@ -141,18 +147,19 @@ def _check_repaired(document: Document, mesh: SegmentedMesh) -> None:
         changes[name] += cut
     changed = [segment for segment in whole.segments if changes[segment.name]]
     for segment in changed:
-        before = mesh.segments[mesh.names.index(segment.name)]
-        print(f"repaired {segment.name}: {'; '.join(changes[segment.name])} ({_difference(before, segment)})")
+        index = mesh.names.index(segment.name)
+        difference = _difference(mesh.segments[index], health[index], segment)
+        print(f"repaired {segment.name}: {'; '.join(changes[segment.name])} ({difference})")
     path = _write(document, whole, {segment.name for segment in changed})
     print(f"wrote {path} and the meshes that it names; checked again:")
     check_scene(str(path))
 
 
-def _difference(before: Segment, after: Segment) -> str:
+def _difference(before: Segment, health: Health, after: Segment) -> str:
     faces = f"{len(before.faces)} faces before, {len(after.faces)} now"
-    if examine(before).hopeless:
+    if health.hopeless:
         return faces
-    was = before.volume if examine(before).sound else grid_volume(replace(before, solid=False))
+    was = before.volume if health.sound else grid_volume(replace(before, solid=False))
     return f"{faces}; volume {100 * (after.volume / was - 1) if was else np.inf:+.2g} %"
 
 
