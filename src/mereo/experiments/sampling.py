@@ -7,7 +7,7 @@ from mereo.experiments.result import Claim, Result, Row, better, published
 from mereo.experiments.scales import Scale
 from mereo.experiments.store import Score, Store
 
-OBJECTS = ("lizard", "engine", "human")
+OBJECTS = ("lizard", "human", "engine")
 
 SETTINGS: dict[str, SamplingConfig] = {
     "volume-uniform": SamplingConfig(sampler="volume-uniform"),
