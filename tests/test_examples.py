@@ -12,7 +12,6 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 EXPECTED = {
     "query_points.py": "to the nearest surface",
     "reconstruct_cloud.py": "report.html",
-    "sampling_2d.py": "",
     "sensors.py": "wrote",
     "simulate_liver.py": "3 states of 98 nodes",
 }

@@ -1,7 +1,8 @@
 """What an experiment found, beside what the paper says: as Markdown, JSON and a bar chart."""
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import resources
 from math import isnan
@@ -10,6 +11,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 
 from mereo.error_pictures import ErrorCase, error_picture
 from mereo.experiments.store import Score
@@ -81,6 +83,7 @@ class Result:
         claims: of the paper.
         notes: sentences on what differs from the paper's experiment.
         cases: rows of the paper's figure of reconstructions.
+        figures: further pictures by the names of their files.
     """
 
     name: str
@@ -90,6 +93,7 @@ class Result:
     claims: tuple[Claim, ...]
     notes: tuple[str, ...] = ()
     cases: tuple[ErrorCase, ...] = ()
+    figures: Mapping[str, Figure] = field(default_factory=dict)
 
 
 def better(score: Score, other: Score) -> bool:
@@ -100,7 +104,7 @@ def better(score: Score, other: Score) -> bool:
 
 
 def write_result(result: Result, directory: Path, force: bool = True) -> None:
-    """table.md, results.json, figure.png and perhaps reconstructions.png in a new directory, whole or not at all."""
+    """table.md, results.json, figure.png and what other pictures there are in a new directory, whole or not at all."""
     with new_directory(directory, force=force) as partial:
         with atomic_file(partial / "table.md") as path:
             path.write_text(markdown(result), encoding="utf-8")
@@ -108,6 +112,8 @@ def write_result(result: Result, directory: Path, force: bool = True) -> None:
         draw_bars(result, partial / "figure.png")
         if result.cases:
             error_picture(partial / "reconstructions.png", result.cases)
+        for name, figure in result.figures.items():
+            _save(figure, partial / name)
 
 
 def markdown(result: Result) -> str:
@@ -166,6 +172,10 @@ def draw_bars(result: Result, path: Path) -> None:
     axes.set_ylim(0, 1)
     axes.set_ylabel("IoU (pale), mIoU (full), paper (line)")
     axes.set_title(f"{result.title} ({result.scale})", fontsize=10)
+    _save(figure, path)
+    plt.close(figure)
+
+
+def _save(figure: Figure, path: Path) -> None:
     with atomic_file(path) as partial:
         figure.savefig(partial, dpi=130, format="png")
-    plt.close(figure)

@@ -2,8 +2,11 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from mereo.config import GenerateConfig, Sampler, SamplingConfig
 from mereo.experiments.result import Claim, Result, Row, better, published
+from mereo.experiments.sampling_figure import draw_figure
 from mereo.experiments.scales import Scale
 from mereo.experiments.store import Score, Store
 
@@ -29,7 +32,10 @@ def run(store: Store, scale: Scale) -> Result:
             weights = store.run(store.dataset(scene, settings, scale.examples), scale.recipe)
             score = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
             rows.append(Row(scene, variant, score, paper.get(variant)))
-    return Result("sampling", "Where training queries are drawn", scale.name, tuple(rows), _claims(rows))
+    figures = {"sampling_2d.png": draw_figure(np.random.default_rng(0))}
+    return Result(
+        "sampling", "Where training queries are drawn", scale.name, tuple(rows), _claims(rows), figures=figures
+    )
 
 
 def _claims(rows: list[Row]) -> tuple[Claim, ...]:

@@ -1,15 +1,12 @@
-"""The paper's sampling figure in two dimensions: where each sampler puts its points on three toy shapes.
+"""The paper's sampling figure: where each sampler puts its points on three toy shapes in two dimensions.
 
-    python examples/sampling_2d.py --output sampling_2d.png
-
-The samplers of ``mereo.query_sampling`` ask an object five things (``Shape``); this file shows how little it takes to
-make one of your own. The outlines are in ``data/toy2d.json``, with the square the paper draws candidates from.
+The samplers of ``mereo.query_sampling`` ask an object five things (``Shape``); ``Polygons2D`` shows how little it takes
+to make one. The outlines are in ``toy2d.json``, with the square from which the paper draws candidates.
 """
 
-import argparse
 import json
 from collections.abc import Callable
-from pathlib import Path
+from importlib import resources
 
 import matplotlib
 import numpy as np
@@ -22,7 +19,6 @@ from matplotlib.figure import Figure
 
 from mereo.query_sampling import Samples, label_uniform, sort_sample, volume_uniform
 
-DATA = Path(__file__).parent / "data" / "toy2d.json"
 KEEP = 256
 """Points per side, the k of the paper's figure."""
 
@@ -68,9 +64,9 @@ def _edges(outline: Polygon) -> tuple[Polygon, Polygon]:
     return outline, np.roll(outline, -1, axis=0) - outline
 
 
-def read_outlines(path: Path = DATA) -> tuple[dict[str, Polygon], Float[np.ndarray, "2 2"]]:
+def read_outlines() -> tuple[dict[str, Polygon], Float[np.ndarray, "2 2"]]:
     """The toy shapes by name, and the square from which the figure's candidates are drawn."""
-    data = json.loads(path.read_text(encoding="utf-8"))
+    data = json.loads(resources.files("mereo.experiments").joinpath("toy2d.json").read_text("utf-8"))
     return {name: np.array(corners) for name, corners in data["shapes"].items()}, np.array(data["candidates_box"])
 
 
@@ -130,16 +126,3 @@ def draw_figure(rng: np.random.Generator) -> Figure:
     draw_bar(left, INSIDE, "inside")
     draw_bar(right, OUTSIDE, "outside")
     return figure
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description="Draw where each sampler puts its points on three 2-D toy shapes.")
-    parser.add_argument("--output", type=Path, default=Path("sampling_2d.png"), help="the PNG to write")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(arguments)
-    draw_figure(np.random.default_rng(options.seed)).savefig(options.output, dpi=200)
-    print(f"wrote {options.output}")
-
-
-if __name__ == "__main__":
-    main()
