@@ -1,5 +1,6 @@
 """Ball query and nearest neighbours against slow references."""
 
+import pytest
 import torch
 
 from mereo.neighbors import ball_query, gather, nearest, squared_distances
@@ -47,3 +48,12 @@ def test_gather_equals_indexing() -> None:
     values, index = random_points(3, 20), torch.randint(0, 20, (3, 5, 4), generator=torch.Generator().manual_seed(1))
     expected = torch.stack([values[b][index[b]] for b in range(3)])
     assert torch.equal(gather(values, index), expected)
+
+
+def test_nearest_finds_the_same_where_the_graph_is_traced(monkeypatch: pytest.MonkeyPatch) -> None:
+    queries, points = random_points(2, 40, 3), random_points(2, 30, 4)
+    by_tree = nearest(queries, points, 40)
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    assert by_tree.shape == (2, 40, 30)
+    assert torch.equal(nearest(queries, points, 40), by_tree)
+    assert nearest(queries[..., :2], points[..., :2], 1).shape == (2, 40, 1)

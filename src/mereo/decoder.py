@@ -6,6 +6,7 @@ cloud and broadcast over its queries, which is exact and removes the (queries x 
 Notation: b clouds, q queries, k neighbours, z latent channels, h hidden channels.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -139,6 +140,16 @@ class ConditionedMLP(nn.Module):
             self.sight1 = nn.Linear(6 * config.sight_neighbors, width, bias=False)
         self.head = nn.Linear(width, outputs)
 
+    def summands(self, number: int) -> list[nn.Linear]:
+        """The layers whose sum is normalized in layer ``number``, counted from 0."""
+        if number == 0:
+            extra = ("local1",) * bool(self.config.local_neighbors) + ("sight1",) * bool(self.config.sight_neighbors)
+            return [self.latent1, self.query1, *(getattr(self, name) for name in extra)]
+        summands: list[nn.Linear] = [self.hidden[number - 1]]  # type: ignore[list-item]
+        if number == self.config.skip_after:
+            summands += [self.latent2, self.query2, *(() if self.lookup is None else (self.lookup.read,))]
+        return summands
+
     def prepare(
         self,
         encoding: Encoding,
@@ -159,26 +170,46 @@ class ConditionedMLP(nn.Module):
         """The last layer's outputs, and the rest coordinates of the lookup on the way, if there is one."""
         placed = queries if code.alignment is None else code.alignment.apply(queries)
         encoded = self.encode(placed) if self.config.encode_positions else placed
-        hidden = self.query1(encoded) + code.latent1[:, None]
+        rows = [encoded]
         if self.config.local_neighbors:
-            local = [layer(level, placed) for layer, level in zip(self.local, code.levels, strict=True)]
-            hidden = hidden + self.local1(torch.cat(local, dim=-1))
+            rows += [layer(level, placed) for layer, level in zip(self.local, code.levels, strict=True)]
         if self.config.sight_neighbors:
-            sight = line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors)
-            hidden = hidden + self.sight1(sight)
+            rows.append(line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors))
+        hidden = self._activate(0, joint_linear(self.summands(0)[1:], rows, code.latent1))
         rest = None
-        for number, norm in enumerate(self.norms):  # layer `number` is counted from 0
-            before = hidden
-            if number > 0:
-                hidden = self.hidden[number - 1](hidden)
+        for number in range(1, len(self.norms)):
+            rows, latent = [hidden], None
             if number == self.config.skip_after:
-                hidden = hidden + self.query2(encoded) + code.latent2[:, None]
+                rows, latent = [hidden, encoded], code.latent2
                 if self.lookup is not None:
-                    rest, known = self.lookup(before, placed)
-                    hidden = hidden + known
-            hidden = torch.relu(norm(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
-            hidden = nn.functional.dropout(hidden, self.config.dropout, self.training)
+                    rest, seen = self.lookup(hidden, placed)
+                    rows.append(seen)
+            layers = [layer for layer in self.summands(number) if layer is not self.latent2]
+            hidden = self._activate(number, joint_linear(layers, rows, latent))
         return self.head(hidden).float(), rest
+
+    def _activate(self, number: int, hidden: Float[Tensor, "b q h"]) -> Float[Tensor, "b q h"]:
+        """Normalization, ReLU and dropout of layer ``number``, counted from 0."""
+        hidden = self.norms[number](hidden.flatten(0, 1)).relu_().unflatten(0, hidden.shape[:2])
+        return nn.functional.dropout(hidden, self.config.dropout, self.training)
+
+
+def joint_linear(
+    layers: Sequence[nn.Linear], rows: Sequence[Float[Tensor, "b q _"]], latent: Float[Tensor, "b h"] | None
+) -> Float[Tensor, "b q h"]:
+    """``sum_i W_i x_i`` (+ the cloud's ``latent``) as one product of joined rows: the sum is written once.
+
+    ``rows`` may be fewer, and wider, than ``layers``, as long as the channels match in order.
+    """
+    weight = torch.cat([layer.weight for layer in layers], dim=1) if len(layers) > 1 else layers[0].weight
+    joined = torch.cat(list(rows), dim=-1) if len(rows) > 1 else rows[0]
+    bias = layers[0].bias
+    if latent is None:
+        return nn.functional.linear(joined, weight, bias)
+    shift = latent if bias is None else latent + bias
+    if len(shift) == 1:
+        return nn.functional.linear(joined, weight, shift[0])
+    return nn.functional.linear(joined, weight) + shift[:, None]
 
 
 class Decoder(ConditionedMLP):

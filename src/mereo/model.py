@@ -6,6 +6,7 @@ in them. The code of a cloud is computed once and then queried as often as one l
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from mereo.decoder import Code, Decoder, Prediction
 from mereo.encoders import make_encoder
 from mereo.encoders.autodecoder import Autodecoder
 from mereo.encoders.encoding import Encoding
+from mereo.folding import fold_batch_norm
 from mereo.frame import Normalizer
 from mereo.mesh import Color
 from mereo.ordering import farthest_point_order
@@ -151,7 +153,7 @@ class Model:
     """A trained network with everything needed to use it.
 
     Attributes:
-        network: in evaluation mode.
+        network: in evaluation mode; not to be changed once the model has been asked.
         names, colors: of the segments; label i + 1 is names[i].
         provenance: how it was trained: scene, seeds, dataset, recipe, versions.
         loss: the terms it was trained with; what none of them taught is not answered.
@@ -173,6 +175,11 @@ class Model:
         """Whether it tells segments apart; one trained on distances alone only knows inside from outside."""
         return "ce" in self.loss
 
+    @cached_property
+    def _folded(self) -> Network:
+        """What answers: the network without normalization layers, made at the first question."""
+        return fold_batch_norm(self.network)
+
     @property
     def device(self) -> torch.device:
         return next(self.network.parameters()).device
@@ -189,7 +196,7 @@ class Model:
         padded = seen[np.arange(limit) % len(seen)]
         with torch.inference_mode():
             tensors = [torch.from_numpy(a[None].astype(np.float32)) for a in (padded, normalizer.viewpoint)]
-            code = self.network.encode(*(tensor.to(self.device) for tensor in tensors))
+            code = self._folded.encode(*(tensor.to(self.device) for tensor in tensors))
         return EncodedCloud(code, normalizer, normalizer.invert(seen.astype(np.float64)))
 
     def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
@@ -242,7 +249,7 @@ class Model:
         with torch.inference_mode():
             for start in range(0, max(len(normalized), 1), size):
                 queries = torch.from_numpy(normalized[start : start + size])[None].to(self.device)
-                chunks.append([part[0].cpu() for part in answer(self.network.query(code.code, queries), queries)])
+                chunks.append([part[0].cpu() for part in answer(self._folded.query(code.code, queries), queries)])
         return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
 
 

@@ -22,9 +22,10 @@ SCALES = (1.0, 8.0, 32.0)
 
 
 class RestLookup(nn.Module):
-    """Hidden features and place of a query -> its rest coordinates, and hidden features of what the model has there.
+    """Hidden features and place of a query -> its rest coordinates, and how far the model's surfaces are there.
 
     Attributes:
+        read: from those distances to the decoder's hidden features; the decoder applies it.
         distance: signed distances (``rest_pose.rest_distances``), a constant of the trained object.
     """
 
@@ -41,14 +42,16 @@ class RestLookup(nn.Module):
 
     def forward(
         self, hidden: Float[Tensor, "b q h"], placed: Float[Tensor, "b q 3"]
-    ) -> tuple[Float[Tensor, "b q 3"], Float[Tensor, "b q h"]]:
-        """``placed`` are the queries in the aligned frame; gradients reach the coordinates through what is read."""
+    ) -> tuple[Float[Tensor, "b q 3"], Float[Tensor, "b q r"]]:
+        """Rest coordinates, and the distances there as ``read`` takes them.
+
+        ``placed`` are the queries in the aligned frame; gradients reach the coordinates through the distances.
+        """
         with exact(hidden):
             offset = F.linear(hidden.float(), self.where.weight, self.where.bias)
             rest = placed.float() + offset
             distance = self.distances(rest)
-        seen = torch.cat([(scale * distance).clamp(-1.0, 1.0) for scale in SCALES], dim=-1)
-        return rest, self.read(seen)
+        return rest, torch.cat([(scale * distance).clamp(-1.0, 1.0) for scale in SCALES], dim=-1)
 
     def distances(self, rest: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q s"]:
         """Signed distance to each segment at rest coordinates, trilinear; beyond the grid that of its border."""
