@@ -17,7 +17,7 @@ import torch
 
 from mereo.config import PRESETS, Encoder, NetworkConfig
 from mereo.encoders.autodecoder import Autodecoder
-from mereo.model import Network
+from mereo.network import Network
 
 BATCH, QUERIES, SEGMENTS = 8, 1472, 5
 ENCODERS: tuple[Encoder, ...] = ("pointnet2", "point-transformer", "autodecoder")

@@ -9,7 +9,8 @@ from scipy.special import softmax
 
 from mereo.config import PRESETS
 from mereo.mesh import PALETTE
-from mereo.model import Answer, EncodedCloud, Model, Network
+from mereo.model import Answer, EncodedCloud, Model
+from mereo.network import Network
 
 Points = np.ndarray
 Distance = Callable[[Points], np.ndarray]

@@ -10,7 +10,7 @@ from mereo.aligner import AlignmentNet
 from mereo.alignment import Alignment, fit_rigid
 from mereo.config import PRESETS
 from mereo.losses import rest_loss
-from mereo.model import Network
+from mereo.network import Network
 
 TINY = PRESETS["tiny"].network
 

@@ -22,7 +22,8 @@ from mereo.encoders.encoding import Encoding
 from mereo.evaluation import TestCase, score_cases
 from mereo.frames import truth_grid
 from mereo.mesh import SegmentedMesh
-from mereo.model import Model, Network
+from mereo.model import Model
+from mereo.network import Network
 from mereo.reconstruction import reconstruct
 from mereo.run import start_network
 from mereo.weights import load_model

@@ -13,7 +13,8 @@ from safetensors.torch import save_file
 from mereo import __main__ as command_line
 from mereo.config import PRESETS
 from mereo.mesh import Segment, SegmentedMesh, check_segment
-from mereo.model import Model, Network
+from mereo.model import Model
+from mereo.network import Network
 from mereo.overlap import check_overlap
 from mereo.weights import load_model, save_model
 

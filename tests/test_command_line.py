@@ -15,7 +15,7 @@ import pytest
 
 import mereo.__main__ as command_line
 from mereo import commands
-from mereo.config import PRESETS, GenerateConfig, SamplingConfig
+from mereo.config import PRESETS, GenerateConfig, PresetName, SamplingConfig
 from mereo.scene import SCENES
 
 WITHOUT_NETWORK = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
@@ -119,7 +119,7 @@ def test_preset_sets_every_default_of_train(preset: str, form: str) -> None:
 
 
 def test_every_preset_is_an_option() -> None:
-    assert set(get_args(commands.Preset)) == set(PRESETS)
+    assert set(get_args(PresetName)) == set(PRESETS)
 
 
 def test_train_options_override_the_preset() -> None:

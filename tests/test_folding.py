@@ -8,7 +8,7 @@ from torch import nn
 
 from mereo.config import PRESETS, NetworkConfig
 from mereo.folding import fold_batch_norm
-from mereo.model import Network
+from mereo.network import Network
 
 SMALL = replace(PRESETS["tiny"].network, points=64)
 

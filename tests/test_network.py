@@ -10,7 +10,7 @@ from mereo.config import PRESETS, Loss, NetworkConfig
 from mereo.decoder import FrequencyEncoding, Prediction
 from mereo.encoders.pointnet2 import PointNet2
 from mereo.losses import occupancy_loss
-from mereo.model import Network
+from mereo.network import Network
 
 TINY = PRESETS["tiny"].network
 

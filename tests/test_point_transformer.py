@@ -20,8 +20,8 @@ from mereo.encoders.point_transformer import PointTransformer, TransitionDown, V
 from mereo.evaluation import TestCase, score_cases
 from mereo.frames import truth_grid
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.model import Network
 from mereo.neighbors import distinct_distances, nearest
+from mereo.network import Network
 from mereo.reconstruction import reconstruct
 from mereo.weights import load_model
 

@@ -12,7 +12,7 @@ from mereo.config import PRESETS, GenerateConfig, SamplingConfig
 from mereo.dataset import Dataset
 from mereo.generation import generate
 from mereo.mesh import SegmentedMesh
-from mereo.model import Network
+from mereo.network import Network
 from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
 from mereo.synthesis import example_rng, synthesize
 from mereo.template import RestLookup

@@ -13,6 +13,7 @@ import tyro
 from tyro.conf import subcommand
 
 from mereo import commands, scene_commands
+from mereo.bench_command import BenchCommand
 from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
 from mereo.experiment_command import Experiment
 
@@ -112,6 +113,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
         | Annotated[Experiment, subcommand("experiment")]
+        | Annotated[BenchCommand, subcommand("bench")]
     )
 
 

@@ -10,9 +10,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mereo.config import GenerateConfig, Sensor, SensorConfig, TrainConfig
-
-Preset = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
+from mereo.config import GenerateConfig, PresetName, Sensor, SensorConfig, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -128,7 +126,7 @@ class Train:
 
     dataset: Positional[Path]
     output: Path
-    preset: Preset = "base"
+    preset: PresetName = "base"
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:

@@ -251,6 +251,8 @@ _MODERN_RECIPE = _Recipe(
     offset_examples=1000,
 )
 
+PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
+
 PRESETS: dict[str, TrainConfig] = {
     # as published
     "paper": TrainConfig(),

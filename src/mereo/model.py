@@ -1,29 +1,27 @@
-"""The network, and the trained model that a user holds.
+"""The trained model that a user holds.
 
 ``Network`` works on normalized batches; ``Model`` takes clouds and points in the user's frame and units, and answers
 in them. The code of a cloud is computed once and then queried as often as one likes.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from mereo.aligner import AlignmentNet
-from mereo.alignment import Alignment
 from mereo.camera import PointCloud
-from mereo.config import MIN_POINTS, NetworkConfig
-from mereo.decoder import Code, Decoder, Prediction
-from mereo.encoders import make_encoder
-from mereo.encoders.autodecoder import Autodecoder
-from mereo.encoders.encoding import Encoding
+from mereo.config import MIN_POINTS, Precision
+from mereo.decoder import Code, Prediction
 from mereo.folding import fold_batch_norm
 from mereo.frame import Normalizer
+from mereo.hardware import pick_precision
 from mereo.mesh import Color
+from mereo.network import Network
 from mereo.ordering import farthest_point_order
 
 SURE_LOGIT = 20.0
@@ -35,85 +33,9 @@ DENSE_FACTOR = 8
 CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 4096, 65536
 """Queries evaluated at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
 
-ALIGNED_QUERIES = 128
-"""Queries per example that train the alignment: neighbours say much the same about a nearly rigid motion."""
-
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]
 """Lower and upper corner."""
-
-
-class Network(nn.Module):
-    """Encoder and decoder on normalized coordinates."""
-
-    def __init__(self, config: NetworkConfig, segments: int) -> None:
-        super().__init__()
-        self.config, self.segments = config, segments
-        self.encoder = make_encoder(config)
-        self.decoder = Decoder(config, segments + 1)
-        self.aligner = AlignmentNet(config) if config.align_points else None
-
-    def encode(self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
-        """``cloud`` in farthest-point order. An autodecoder searches for its code, in evaluation mode."""
-        if isinstance(self.encoder, Autodecoder):
-            # the search needs gradients, which tensors of inference mode cannot give
-            with torch.inference_mode(False), torch.no_grad():
-                return self._search(self.encoder, cloud.clone(), viewpoint.clone())
-        return self._encode(cloud, viewpoint, self._align(cloud))
-
-    def _align(self, cloud: Float[Tensor, "b n 3"]) -> Alignment | None:
-        return None if self.aligner is None else self.aligner(cloud).alignment
-
-    def _encode(
-        self,
-        cloud: Float[Tensor, "b n 3"],
-        viewpoint: Float[Tensor, "b 3"],
-        alignment: Alignment | None,
-        index: Int[Tensor, " b"] | None = None,
-    ) -> Code:
-        if isinstance(self.encoder, Autodecoder):
-            assert index is not None, "an autodecoder has codes of its training examples only"
-            encoding = Encoding(self.encoder.code(index), ())
-        else:
-            encoding = self.encoder(cloud if alignment is None else alignment.apply(cloud))
-        return self.decoder.prepare(encoding, cloud, viewpoint, alignment)
-
-    def _search(self, encoder: Autodecoder, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
-        alignment = self._align(cloud)
-
-        def prepare(latent: Float[Tensor, "b z"]) -> Code:
-            return self.decoder.prepare(Encoding(latent, ()), cloud, viewpoint, alignment)
-
-        return prepare(encoder.search(lambda latent: self.query(prepare(latent), cloud).distance, len(cloud)))
-
-    def query(self, code: Code, points: Float[Tensor, "b q 3"]) -> Prediction:
-        prediction: Prediction = self.decoder(code, points)
-        return prediction
-
-    def forward(
-        self,
-        cloud: Float[Tensor, "b n 3"],
-        viewpoint: Float[Tensor, "b 3"],
-        points: Float[Tensor, "b q 3"],
-        index: Int[Tensor, " b"] | None = None,
-    ) -> tuple[
-        Float[Tensor, "b q c"],
-        Float[Tensor, "b q"],
-        Float[Tensor, "b q 3"],
-        Float[Tensor, "b q 3"] | None,
-        Float[Tensor, "b a 3"] | None,
-    ]:
-        """What training needs: logits, distance, direction, and rest coordinates twice.
-
-        First those of the template lookup, then those that the alignment is made from, at the first
-        ``ALIGNED_QUERIES``; None where the network has no such part. ``index`` says which training examples the clouds
-        are: an autodecoder takes their codes.
-        """
-        alignment, coarse = None, None
-        if self.aligner is not None:
-            alignment, coarse = self.aligner(cloud, points[:, :ALIGNED_QUERIES])
-        prediction = self.query(self._encode(cloud, viewpoint, alignment, index), points)
-        return prediction.logits, prediction.distance, prediction.direction, prediction.rest, coarse
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +82,8 @@ class Model:
         domain: normalized box outside which everything is answered as empty: nothing was ever there in training, and
             a network may say anything where it was never corrected. None means no limit.
         nested: pairs of names (inner, outer), see ``SegmentedMesh``.
+        precision: of the products; float32 is exact, bfloat16 faster on GPUs and CPUs with AMX (`mereo bench` says what
+            it costs), auto takes bfloat16 there.
     """
 
     network: Network
@@ -169,6 +93,7 @@ class Model:
     provenance: dict[str, object] = field(default_factory=dict)
     domain: Box | None = None
     nested: tuple[tuple[str, str], ...] = ()
+    precision: Precision = "float32"
 
     @property
     def segmented(self) -> bool:
@@ -176,7 +101,7 @@ class Model:
         return "ce" in self.loss
 
     @cached_property
-    def _folded(self) -> Network:
+    def inference(self) -> Network:
         """What answers: the network without normalization layers, made at the first question."""
         return fold_batch_norm(self.network)
 
@@ -187,23 +112,30 @@ class Model:
     def encode(self, cloud: PointCloud | Float[np.ndarray, "n 3"]) -> EncodedCloud:
         """Points in a camera frame (z forward), any unit, any density. Raises ``ValueError`` on unusable clouds."""
         cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
+        ordered, normalizer = self.normalized_cloud(cloud)
+        seen = ordered[0, : len(cloud)].numpy().astype(np.float64)
+        with self._inference_mode():
+            viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32))
+            code = self.inference.encode(ordered.to(self.device), viewpoint.to(self.device))
+        return EncodedCloud(code, normalizer, normalizer.invert(seen))
+
+    def normalized_cloud(self, cloud: PointCloud) -> tuple[Float[Tensor, "1 n 3"], Normalizer]:
+        """What the network sees of a cloud, in farthest-point order; repeated where there are too few points.
+
+        Raises ``ValueError`` on unusable clouds.
+        """
         points = checked_points(cloud)
         normalizer = Normalizer.fit(points)
         limit = self.network.config.points
         normalized = normalizer.apply(thin(points, limit * DENSE_FACTOR)).astype(np.float32)
-        order = farthest_point_order(normalized, limit)
-        seen = normalized[order]
-        padded = seen[np.arange(limit) % len(seen)]
-        with torch.inference_mode():
-            tensors = [torch.from_numpy(a[None].astype(np.float32)) for a in (padded, normalizer.viewpoint)]
-            code = self._folded.encode(*(tensor.to(self.device) for tensor in tensors))
-        return EncodedCloud(code, normalizer, normalizer.invert(seen.astype(np.float64)))
+        seen = normalized[farthest_point_order(normalized, limit)]
+        return torch.from_numpy(seen[np.arange(limit) % len(seen)][None]), normalizer
 
     def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
         """Segment, probabilities, signed distance and direction at each point."""
 
         def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            logits = self._class_logits(prediction, queries)
+            logits = self.class_logits(prediction, queries)
             distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
             # a head that no term of the loss has trained says nothing
             if "l1" not in self.loss:
@@ -222,9 +154,10 @@ class Model:
 
     def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
         """Class logits only: what surface extraction needs."""
-        return self._chunked(code, points, lambda *found: (self._class_logits(*found),))[0]
+        return self._chunked(code, points, lambda *found: (self.class_logits(*found),))[0]
 
-    def _class_logits(self, prediction: Prediction, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q c"]:
+    def class_logits(self, prediction: Prediction, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q c"]:
+        """Logits of empty space and each segment; ``queries`` are normalized."""
         logits = prediction.logits
         if not self.segmented:
             # trained on distances alone: inside is one class, and -distance its margin (paper, section 4.4)
@@ -237,6 +170,12 @@ class Model:
         surely_empty[0] = SURE_LOGIT
         return torch.where(outside[..., None], surely_empty, logits)
 
+    @contextmanager
+    def _inference_mode(self) -> Iterator[None]:
+        dtype = pick_precision(self.precision, self.device)
+        with torch.inference_mode(), torch.autocast(self.device.type, dtype, enabled=dtype is not None):
+            yield
+
     def _chunked(
         self,
         code: EncodedCloud,
@@ -246,10 +185,10 @@ class Model:
         normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
         size = CUDA_QUERY_CHUNK if self.device.type == "cuda" else CPU_QUERY_CHUNK
         chunks = []
-        with torch.inference_mode():
+        with self._inference_mode():
             for start in range(0, max(len(normalized), 1), size):
                 queries = torch.from_numpy(normalized[start : start + size])[None].to(self.device)
-                chunks.append([part[0].cpu() for part in answer(self._folded.query(code.code, queries), queries)])
+                chunks.append([part[0].cpu() for part in answer(self.inference.query(code.code, queries), queries)])
         return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
 
 
@@ -274,14 +213,3 @@ def thin(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.ndarray, "m 3
     if len(points) <= limit:
         return points
     return points[np.random.default_rng(0).choice(len(points), limit, replace=False)]
-
-
-def config_from_dict(values: dict[str, object]) -> NetworkConfig:
-    """Inverse of ``dataclasses.asdict`` after a trip through JSON; unknown keys raise ``ValueError``.
-
-    Settings that older weights do not state have their defaults: what they switch on did not exist then.
-    """
-    odd = sorted(set(values) - {f.name for f in fields(NetworkConfig)})
-    if odd:
-        raise ValueError(f"the network settings differ in {odd[0]!r} from this version of mereo; train again")
-    return NetworkConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})  # type: ignore[arg-type]

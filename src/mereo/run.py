@@ -12,7 +12,7 @@ import torch.distributed as dist
 from mereo.config import TEMPLATE, AugmentConfig, TrainConfig
 from mereo.dataset import Dataset
 from mereo.encoders.autodecoder import Autodecoder
-from mereo.model import Network
+from mereo.network import Network
 from mereo.output import write_json
 from mereo.weights import load_model
 

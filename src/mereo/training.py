@@ -25,7 +25,8 @@ from mereo.decoder import Prediction
 from mereo.encoders.autodecoder import CODES, Autodecoder
 from mereo.hardware import compiling_pays, keep_freed_memory, pick_device, pick_precision
 from mereo.losses import REST_WEIGHT, occupancy_loss, rest_loss
-from mereo.model import Model, Network
+from mereo.model import Model
+from mereo.network import Network
 from mereo.run import Process, claim_run, fit_config, join_processes, start_network
 from mereo.validation import choose_offsets, held_out, validate
 from mereo.weights import save_model

@@ -13,7 +13,7 @@ from mereo.calibration import class_offsets
 from mereo.config import AugmentConfig, TrainConfig
 from mereo.dataset import Batch, Dataset
 from mereo.metrics import Scores, confusion_matrix, intersection_over_union
-from mereo.model import Network
+from mereo.network import Network
 
 SEARCHED = 16
 """Held-out examples of an autodecoder's curve: each one's code must be searched for first."""

@@ -9,7 +9,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from mereo.encoders.autodecoder import CODES
-from mereo.model import Model, Network, config_from_dict
+from mereo.model import Model
+from mereo.network import Network, config_from_dict
 from mereo.output import atomic_file
 
 FORMAT_VERSION = 1

@@ -1,0 +1,1 @@
+"""How fast, stage by stage: against the machine's floor, and against the straightforward implementation."""

@@ -1,0 +1,128 @@
+"""What ``mereo bench`` prints and writes."""
+
+import os
+import platform
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mereo.bench.fitting import fitted_model
+from mereo.bench.floor import Machine, measure_machine
+from mereo.bench.stages import Bench, Stage
+from mereo.config import Precision
+from mereo.frames import Frame, load_frame, shipped_frames
+from mereo.hardware import has_amx, pick_precision
+from mereo.model import Model
+from mereo.output import write_json
+from mereo.weights import load_model
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a lower precision changes at 40,000 points of the object's box.
+
+    Attributes:
+        labels: share of points with another label.
+        distance: mean change of the distance, as a share of half the longest visible side.
+    """
+
+    labels: float
+    distance: float
+
+
+def benchmark(
+    weights: str | None,
+    preset: str,
+    device: torch.device,
+    precision: Precision,
+    repeats: int,
+    rival: bool,
+    output: Path | None,
+) -> list[Stage]:
+    """Time all stages, print the table, and write it as JSON where ``output`` says so.
+
+    Weights are a shipped name or a file with a shipped frame of its object; without, the preset's network is fitted to
+    a frame first. Raises ``ValueError`` for weights of an object without a shipped frame.
+    """
+    model, frame = _subject(weights, preset)
+    model.network.to(device)
+    fast = replace(model, precision=precision)
+    dtype = pick_precision(precision, device) or torch.float32
+    machine = measure_machine(device, dtype)
+    stages = Bench(fast, frame, machine, repeats, rival).run()
+    facts = _facts(weights or f"preset {preset}, fitted to one frame", device, dtype, machine)
+    cost = _cost(model, fast, frame) if dtype is not torch.float32 else None
+    print(table(stages, facts, cost))
+    if output is not None:
+        rows = [{**asdict(stage), "ratio": stage.ratio} for stage in stages]
+        write_json(output, {**facts, "cost": None if cost is None else asdict(cost), "stages": rows})
+        print(f"wrote {output}")
+    return stages
+
+
+def _subject(weights: str | None, preset: str) -> tuple[Model, Frame]:
+    if weights is None:
+        frame = load_frame(shipped_frames()[0])
+        return fitted_model(preset, frame), frame
+    model = load_model(weights)
+    scene = str(model.provenance.get("scene"))
+    if scene not in shipped_frames():
+        raise ValueError(
+            f"the weights know {scene!r}, of which no frame is shipped; there are frames of "
+            f"{', '.join(shipped_frames())}: time the architecture instead, with --preset"
+        )
+    return model, load_frame(scene)
+
+
+def _facts(subject: str, device: torch.device, dtype: torch.dtype, machine: Machine) -> dict[str, Any]:
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
+    return {
+        "model": subject,
+        "device": f"{device.type}, {name}",
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "amx": has_amx(),
+        "precision": str(dtype).removeprefix("torch."),
+        "gigaflops": machine.operations / 1e9,
+        "gigabytes_per_second": machine.bandwidth / 1e9,
+    }
+
+
+def _cost(exact: Model, fast: Model, frame: Frame) -> Cost:
+    cloud = frame.depth.to_points()
+    grid = frame.truth.grid
+    points = grid.origin + np.random.default_rng(1).random((40_000, 3)) * grid.spacing * grid.labels.shape
+    code, other = exact.encode(cloud), fast.encode(cloud)
+    ask = partial(exact.query, code), partial(fast.query, other)
+    one, two = (query(points) for query in ask)
+    change = np.abs(one.distance - two.distance).mean() * code.normalizer.scale
+    return Cost(float((one.label != two.label).mean()), float(change))
+
+
+def table(stages: list[Stage], facts: dict[str, Any], cost: Cost | None = None) -> str:
+    """Markdown; times in milliseconds."""
+    lines = [
+        f"{facts['model']}; {facts['device']}, {facts['threads']} threads of {facts['cores']} cores, AMX "
+        f"{'yes' if facts['amx'] else 'no'}, {facts['precision']}; products {facts['gigaflops']:.0f} GFLOP/s, "
+        f"copies {facts['gigabytes_per_second']:.0f} GB/s",
+        "",
+        "| stage | median, ms | 99 %, ms | floor, ms | times the floor | straightforward, ms | times faster |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for stage in stages:
+        cells = [stage.median, stage.slowest, stage.floor]
+        rival = "" if stage.rival is None else f"{1e3 * stage.rival:.0f}"
+        ratio = "" if stage.ratio is None else f"{stage.ratio:.1f}"
+        times = " | ".join(f"{1e3 * value:.3g}" for value in cells)
+        lines.append(f"| {stage.name} | {times} | {stage.median / stage.floor:.1f} | {rival} | {ratio} |")
+    if cost is not None:
+        lines += [
+            "",
+            f"Against float32: {cost.labels:.2%} of labels change, distances by {cost.distance:.2g} of half the "
+            "object's longest visible side on average.",
+        ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,220 @@
+"""The stages of an answer, each timed against its floor and, where there is one, the rival."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from mereo.bench.floor import Machine, Work, count_operations, synchronize
+from mereo.bench.rival import Rival
+from mereo.extraction import extract_dense, extract_whole, locate
+from mereo.frame import Normalizer
+from mereo.frames import Frame
+from mereo.model import Model
+from mereo.reconstruction import SEARCH_BOX
+from mereo.refinement import sample_coarse_to_fine
+
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage's times in seconds.
+
+    Attributes:
+        name: what is done.
+        median, slowest: of our repetitions; the 99th percentile stands for the slowest where there are a hundred.
+        floor: the least that this machine could take.
+        rival: the straightforward implementation's median; None where it was not run.
+    """
+
+    name: str
+    median: float
+    slowest: float
+    floor: float
+    rival: float | None = None
+
+    @property
+    def ratio(self) -> float | None:
+        """How many times faster than the rival."""
+        return None if self.rival is None else self.rival / self.median
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Everything that is timed about one model and frame.
+
+    Attributes:
+        repeats: of each stage; the rival's grids run once.
+        rival: time the straightforward implementation too, and compare its labels.
+    """
+
+    model: Model
+    frame: Frame
+    machine: Machine
+    repeats: int = 7
+    rival: bool = False
+
+    def run(self) -> list[Stage]:
+        """All stages, in the order of an answer. Raises ``RuntimeError`` where the rival's labels differ."""
+        self._warm_up()
+        return [self.prepare(), self.encode(), self.queries(40_000), self.whole_frame(), self.labels(), self.surfaces()]
+
+    def prepare(self) -> Stage:
+        """Depth image to normalized points in farthest-point order."""
+        cloud = self.frame.depth.to_points()
+        points, kept = len(cloud), self.model.network.config.points
+        # each chosen point is compared with all: differences, squares, sums and the smaller distance
+        work = Work(operations=9.0 * points * min(points, kept), bytes=float(self.frame.depth.depth.nbytes))
+        return self._stage("preprocessing", work, lambda: self.model.normalized_cloud(self.frame.depth.to_points()))
+
+    def encode(self) -> Stage:
+        """The network's encoder; preprocessing is not in it."""
+        cloud, normalizer = self._input()
+        viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32)).to(self.model.device)
+        with torch.inference_mode():
+            return self._network_stage("encoder", lambda: self.model.inference.encode(cloud, viewpoint))
+
+    def queries(self, count: int) -> Stage:
+        """Class logits at random points of the object's box."""
+        code = self.model.encode(self.frame.depth.to_points())
+        points = self._random_points(count)
+        ours = partial(self.model.logits, code, points)
+        rival = partial(self._rival().logits, points) if self.rival else None
+        if rival is not None:
+            self._compare(ours(), rival())
+        return self._network_stage(f"{count // 1000}k queries", ours, rival)
+
+    def whole_frame(self) -> Stage:
+        """Depth image to labels of 10,000 and then 40,000 points, as in the authors' follow-up."""
+        coarse, fine = self._random_points(10_000), self._random_points(40_000)
+
+        def ours() -> None:
+            code = self.model.encode(self.frame.depth.to_points())
+            self.model.logits(code, coarse)
+            self.model.logits(code, fine)
+
+        def straightforward() -> None:
+            rival = self._rival()
+            rival.logits(coarse)
+            rival.logits(fine)
+
+        return self._network_stage("a frame: 10k + 40k queries", ours, straightforward if self.rival else None)
+
+    def labels(self) -> Stage:
+        """The labels of the evaluation's grid, 100^3 cells."""
+        grid = self.frame.truth.grid
+        x, y, z = grid.labels.shape
+        field = partial(self.model.logits, self.model.encode(self.frame.depth.to_points()))
+
+        def ours() -> UInt8[np.ndarray, "x y z"]:
+            return sample_coarse_to_fine(field, grid.origin, grid.spacing, (x, y, z)).labels
+
+        work = self._grid_work(ours())
+        rival = partial(self._dense_labels, self._rival()) if self.rival else None
+        return self._stage(f"labels, {x} x {y} x {z}", work, ours, rival, once=True)
+
+    def surfaces(self) -> Stage:
+        """Closed meshes of all segments, 128 cells along the longest side; finding the object's box is in it."""
+        model = self.model
+        code = model.encode(self.frame.depth.to_points())
+        field, search = partial(model.logits, code), code.normalizer.invert(SEARCH_BOX)
+
+        def ours() -> UInt8[np.ndarray, "x y z"]:
+            found = extract_whole(field, locate(field, search), 128, model.names, model.colors, model.nested)
+            return found.grid.labels
+
+        box = locate(field, search)
+        dense = partial(extract_dense, resolution=128, names=model.names, colors=model.colors, nested=model.nested)
+        rival = (lambda: dense(self._rival().logits, box)) if self.rival else None
+        return self._stage("surfaces of all segments, 128", self._grid_work(ours()), ours, rival, once=True)
+
+    # --- parts ---------------------------------------------------------------------------------------------------
+
+    def _warm_up(self) -> None:
+        code = self.model.encode(self.frame.depth.to_points())
+        self.model.logits(code, self._random_points(8192))
+
+    def _input(self) -> tuple[torch.Tensor, Normalizer]:
+        cloud, normalizer = self.model.normalized_cloud(self.frame.depth.to_points())
+        return cloud.to(self.model.device), normalizer
+
+    def _rival(self) -> Rival:
+        return Rival(self.model, *self._input())
+
+    def _random_points(self, count: int) -> Float[np.ndarray, "n 3"]:
+        grid = self.frame.truth.grid
+        size = grid.spacing * grid.labels.shape
+        return grid.origin + np.random.default_rng(SEED).random((count, 3)) * size
+
+    def _dense_labels(self, rival: Rival) -> UInt8[np.ndarray, "x y z"]:
+        grid = self.frame.truth.grid
+        nodes = np.indices(grid.labels.shape).reshape(3, -1).T
+        return rival.logits(grid.positions(nodes)).argmax(axis=1).astype(np.uint8).reshape(grid.labels.shape)
+
+    def _grid_work(self, labels: UInt8[np.ndarray, "x y z"]) -> Work:
+        """Asking the corners of every cell that holds a change of label, and nothing else."""
+        code = self.model.encode(self.frame.depth.to_points())
+        points = self._random_points(4096)
+        each = count_operations(lambda: self.model.logits(code, points)) / len(points)
+        return Work(each * int(needed_nodes(labels).sum()), float(labels.nbytes))
+
+    def _network_stage(self, name: str, ours: Callable[[], object], rival: Callable[[], object] | None = None) -> Stage:
+        weights = sum(parameter.nbytes for parameter in self.model.inference.parameters())
+        return self._stage(name, Work(count_operations(ours), float(weights)), ours, rival)
+
+    def _stage(
+        self,
+        name: str,
+        work: Work,
+        ours: Callable[[], object],
+        rival: Callable[[], object] | None = None,
+        once: bool = False,
+    ) -> Stage:
+        """Ours and the rival's take turns, so that a busy machine slows both."""
+        mine, theirs = [], []
+        for repeat in range(self.repeats):
+            mine.append(self._seconds(ours))
+            if rival is not None and not (once and repeat):
+                theirs.append(self._seconds(rival))
+        slowest = float(np.quantile(mine, 0.99))
+        return Stage(
+            name,
+            statistics.median(mine),
+            slowest,
+            work.seconds(self.machine),
+            statistics.median(theirs) if theirs else None,
+        )
+
+    def _seconds(self, work: Callable[[], object]) -> float:
+        start = time.perf_counter()
+        work()
+        synchronize(self.model.device)
+        return time.perf_counter() - start
+
+    @staticmethod
+    def _compare(ours: Float[np.ndarray, "n c"], theirs: Float[np.ndarray, "n c"]) -> None:
+        """Labels must agree wherever the leading class leads by more than rounding."""
+        best = np.sort(theirs, axis=1)
+        clear = best[:, -1] - best[:, -2] > 1e-3 * np.abs(theirs).max()
+        wrong = int((ours.argmax(axis=1) != theirs.argmax(axis=1))[clear].sum())
+        if wrong:
+            raise RuntimeError(f"{wrong} of {len(ours)} labels differ between the model and the rival; they must agree")
+
+
+def needed_nodes(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Corners of the cells whose corners do not all have one label."""
+    needed = np.zeros(labels.shape, dtype=bool)
+    low, high = labels[:-1, :-1, :-1].copy(), labels[:-1, :-1, :-1].copy()
+    corners = [np.s_[a : a - 1 or None, b : b - 1 or None, c : c - 1 or None] for a, b, c in np.ndindex(2, 2, 2)]
+    for corner in corners:
+        np.minimum(low, labels[corner], out=low)
+        np.maximum(high, labels[corner], out=high)
+    for corner in corners:
+        needed[corner] |= low != high
+    return needed

@@ -1,0 +1,105 @@
+"""The benchmark's own parts: its rival gives the model's answers, its floor counts what must be asked."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from mereo import bench_command
+from mereo.bench import fitting
+from mereo.bench.floor import Machine, Work, count_operations
+from mereo.bench.report import table
+from mereo.bench.rival import Rival, farthest_points
+from mereo.bench.stages import Bench, Stage, needed_nodes
+from mereo.config import PRESETS
+from mereo.frames import load_frame
+from mereo.ordering import farthest_point_order
+from mereo.weights import load_model
+
+MACHINE = Machine(1e11, 1e10)
+
+
+def test_the_rival_answers_as_the_model() -> None:
+    frame, model = load_frame("rope"), load_model("rope")
+    cloud = frame.depth.to_points()
+    points = frame.truth.grid.positions(np.random.default_rng(0).integers(0, 100, (500, 3)))
+    ours = model.logits(model.encode(cloud), points)
+    theirs = Rival(model, *model.normalized_cloud(cloud)).logits(points)
+    np.testing.assert_allclose(theirs, ours, atol=1e-3 * np.abs(ours).max())
+    assert len(np.unique(ours.argmax(axis=1))) > 3
+
+
+def test_the_rivals_points_are_the_farthest() -> None:
+    points = np.random.default_rng(0).normal(size=(80, 3)).astype(np.float32)
+    order = farthest_point_order(points, 80)
+    found = farthest_points(torch.from_numpy(points[order]), 40)
+    assert torch.equal(found, torch.arange(40))
+
+
+def test_different_labels_are_an_error() -> None:
+    ours = np.array([[5.0, 0.0], [0.0, 5.0]], dtype=np.float32)
+    with pytest.raises(RuntimeError, match="1 of 2 labels differ"):
+        Bench._compare(ours, np.array([[5.0, 0.0], [5.0, 0.0]], dtype=np.float32))
+    Bench._compare(ours, ours)
+
+
+def test_needed_nodes_are_the_corners_of_cells_with_a_change() -> None:
+    labels = (np.random.default_rng(1).random((6, 5, 4)) < 0.1).astype(np.uint8)
+    needed = np.zeros(labels.shape, dtype=bool)
+    for cell in np.ndindex(5, 4, 3):
+        corners = tuple(np.array([np.add(cell, step) for step in product((0, 1), repeat=3)]).T)
+        if len(np.unique(labels[corners])) > 1:
+            needed[corners] = True
+    np.testing.assert_array_equal(needed_nodes(labels), needed)
+    assert 0 < needed.sum() < needed.size
+
+
+def test_work_is_bound_by_operations_or_bytes() -> None:
+    assert Work(2e11, 1e9).seconds(MACHINE) == 2.0
+    assert Work(1e9, 4e10).seconds(MACHINE) == 4.0
+    ones = torch.ones(10, 20)
+    assert count_operations(lambda: ones @ ones.T) == 2 * 10 * 20 * 10
+
+
+def test_a_fitted_network_knows_its_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitting, "STEPS", 30)
+    monkeypatch.setattr(fitting, "QUERIES", 512)
+    frame = load_frame("rope")
+    model = fitting.fitted_model("tiny", frame)
+    grid, kept = frame.truth.grid, frame.truth.kept
+    cells = np.argwhere(kept & (grid.labels > 0))[::50]
+    labels = model.query(model.encode(frame.depth.to_points()), grid.positions(cells)).label
+    assert (labels > 0).mean() > 0.5
+    assert model.network.config == replace(PRESETS["tiny"].network, dropout=0.0)
+
+
+def test_the_table_names_ratio_and_floor() -> None:
+    stage = Stage("encoder", 0.020, 0.030, 0.005, rival=0.1)
+    facts = {
+        "model": "rope",
+        "device": "cpu",
+        "threads": 2,
+        "cores": 2,
+        "amx": False,
+        "precision": "float32",
+        "gigaflops": 200.0,
+        "gigabytes_per_second": 10.0,
+    }
+    assert "| encoder | 20 | 30 | 5 | 4.0 | 100 | 5.0 |" in table([stage, replace(stage, rival=None)], facts)
+
+
+def test_bad_options_are_refused() -> None:
+    with pytest.raises(ValueError, match="0 repeats are asked for"):
+        bench_command.BenchCommand(repeats=0).run()
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match="torch sees no CUDA device"):
+            bench_command.BenchCommand(device="cuda").run()
+
+
+@pytest.mark.slow
+def test_every_stage_is_timed() -> None:
+    stages = Bench(load_model("rope"), load_frame("rope"), MACHINE, repeats=1).run()
+    assert len(stages) == 6
+    assert all(stage.floor > 0 and 0 < stage.median <= stage.slowest for stage in stages)
