@@ -15,7 +15,7 @@ def run(store: Store, scale: Scale) -> Result:
     cases: list[ErrorCase] = []
     ours: dict[str, Score] = {}
     recipes = {"recipe": scale.recipe} if scale.rival is None else {"paper": scale.recipe, "large": scale.rival}
-    for scene in scale.choose(OBJECTS):
+    for scene in OBJECTS if scale.decides else scale.choose(OBJECTS):
         dataset = store.dataset(scene, GenerateConfig(), scale.examples)
         for variant, recipe in recipes.items():
             weights = store.run(dataset, recipe)

@@ -22,7 +22,7 @@ class Scale:
         rival: a second recipe to report beside it where an experiment compares whole recipes; None for one only.
         examples, test_examples: of each dataset, and of each evaluation.
         cells: of the evaluation's grid along each axis; the paper's is 100.
-        objects: the most objects that an experiment takes, in its own order; None means all.
+        objects: the most objects on which variants are compared, in an experiment's own order; None means all.
         downloads: whether objects are taken whose meshes are downloaded.
         decides: whether networks learn enough for claims to be judged.
     """
