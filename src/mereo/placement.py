@@ -14,20 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from mereo.frame import transform_points
 from mereo.mesh import SegmentedMesh
-from mereo.registration import (
-    CONTACT,
-    SEGMENT_LIMITS,
-    WHOLE_LIMITS,
-    Poses,
-    Registration,
-    Scan,
-    diagonal,
-    exposed,
-    facing,
-    match,
-    moved,
-    register,
-)
+from mereo.registration import SEGMENT_LIMITS, WHOLE_LIMITS, Registration, Scan, match, register
+from mereo.scan_surface import CONTACT, Poses, diagonal, exposed, facing, moved
 from mereo.scans import Frame
 from mereo.solid import Solids
 
@@ -147,9 +135,11 @@ def place(
     alone = [[int(index)] for index in np.flatnonzero(start.own & ~held)]
     whole = register(shown, scan, start.poses, [together, *alone] if together else alone, WHOLE_LIMITS)
     _check_explained(whole, scan)
+    _check_runaway(rest, start.poses, whole, diagonal(rest))
     if as_one:
         return _measured(rest, shown, points, scan, start, whole, ["scan"] * len(held))
-    each = register(shown, scan, whole.poses, [[i] for i in range(len(held)) if not held[i]], SEGMENT_LIMITS)
+    others = [[index] for index in range(len(held)) if not held[index]]
+    each = register(shown, scan, whole.poses, others, SEGMENT_LIMITS, hold=True)
     _check_explained(each, scan)
     _check_runaway(rest, np.where(start.own[:, None, None], start.poses, whole.poses), each)
     final, placed_by = _with_neighbours(rest, start, each)
@@ -166,15 +156,16 @@ def _check_explained(found: Registration, scan: Scan) -> None:
         )
 
 
-def _check_runaway(rest: SegmentedMesh, before: Poses, found: Registration) -> None:
+def _check_runaway(rest: SegmentedMesh, before: Poses, found: Registration, least: float = 0.0) -> None:
+    """No segment may move farther than its own size, or than ``least`` (scene units)."""
     for index, segment in enumerate(rest.segments):
         low, high = segment.bounds
         shift = _shift(before[index], found.poses[index], (low + high) / 2)
-        size = float(np.linalg.norm(high - low)) * scale_of(before[index])
+        size = max(float(np.linalg.norm(high - low)), least) * scale_of(before[index])
         if shift > size:
             raise ValueError(
-                f"segment {segment.name!r} moved by {shift:.3g} from its start, more than its own size of {size:.3g}; "
-                "it must have gone astray: give it a start of its own (three pairs), or leave it at its neighbour "
+                f"segment {segment.name!r} moved by {shift:.3g} from its start, but at most {size:.3g}, its own size "
+                "or the object's, is plausible: give it a start of its own (three pairs), or leave it at its neighbour "
                 f"with --hold {segment.name}"
             )
 

@@ -1,7 +1,7 @@
 """Rigid registration of an object's segments to a scan of it (paper, section 4.3), from a rough start.
 
-Point-to-plane ICP is small_gicp's; what is decided here is which scan points a segment may answer for. A scan shows one
-side of an object and every segment only in part, so each round
+ICP is small_gicp's generalized one (plane to plane; Segal, Haehnel and Thrun, RSS 2009); what is decided here is which
+scan points a segment may answer for. A scan shows one side of an object and every segment only in part, so each round
 
 1. leaves out the faces that cannot be in the scan: those turned away from the scanner, those inside or in contact with
    another segment at rest (nested, a cut, a joint);
@@ -9,15 +9,15 @@ side of an object and every segment only in part, so each round
    shrinks from round to round;
 3. moves each body (all segments at first, then each by itself) onto its own points.
 
-A body is held in the directions in which its points do not constrain it (a ball turns freely, a rod slides), after
-Zhang, Kaess and Singh, "On degeneracy of optimization-based state estimation problems" (ICRA 2016).
+Where asked, a body is held in the directions in which its points do not constrain it (a ball turns freely, a rod
+slides), after Zhang, Kaess and Singh, "On degeneracy of optimization-based state estimation problems" (ICRA 2016).
 
 Notation: ``T_scan_segment`` maps rest coordinates (scene units) to the scan's frame and unit: a similarity. Motions are
 rigid, in the scan's frame. p points, s segments.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import ModuleType
 
 import numpy as np
@@ -25,21 +25,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from mereo.frame import inverse_rigid, rigid, transform_points
-from mereo.mesh import Segment, SegmentedMesh
+from mereo.frame import inverse_rigid, rigid
+from mereo.mesh import SegmentedMesh
+from mereo.scan_surface import CLUSTER, Poses, face_areas, facing, moved, sample_surface, thinned
 from mereo.solid import Solids
-
-Poses = Float[np.ndarray, "s 4 4"]
-"""``T_scan_segment`` of each segment, in label order."""
 
 CELLS = 200
 """Scan points are thinned to one in a cell of a two-hundredth of the object's diagonal."""
-
-CONTACT = 0.005
-"""Faces nearer than this to another segment at rest are in contact, in diagonals of the object."""
-
-FACING = -0.1
-"""Least cosine between a face's normal and the way to the scanner; below 0, as the pose is not right yet."""
 
 WHOLE_LIMITS = (0.15, 0.1, 0.06, 0.04, 0.025, 0.015, 0.01, 0.007, 0.005)
 SEGMENT_LIMITS = (0.05, 0.03, 0.02, 0.013, 0.009, 0.007, 0.005, 0.005)
@@ -55,6 +47,13 @@ LEAST_SHARE = 0.02
 LOOSE = 0.002
 """A direction whose curvature, per point and with the body's radius as unit, is below this is held. A flat square turns
 about its normal with 0 and tilts with 0.2; the bunny's right ear, seen from the side, has 0.008."""
+
+NEIGHBORS = 12
+"""Scan points from which the scanned surface's direction is estimated."""
+
+FLATNESS = 1e-3
+"""The library's variance of a surface across itself, where that along it is 1. It adds those of scan and model, so that
+one point's distance counts 1 / (2 ``FLATNESS``), and its place on the surface 1/2."""
 
 ITERATIONS = 8
 """Of ICP in each round; the next round goes on."""
@@ -72,13 +71,7 @@ def load_icp() -> ModuleType:
     return module
 
 
-# --- the scan, and the surfaces that it can show ---------------------------------------------------------------------
-
-
-def diagonal(mesh: SegmentedMesh) -> float:
-    """Of the joint box of all segments."""
-    low, high = mesh.bounds
-    return float(np.linalg.norm(high - low))
+# --- the scan, and whose its points are -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,46 +101,6 @@ class Scan:
             )
         apart = KDTree(kept).query(kept, k=2)[0][:, 1]
         return cls(kept, viewpoint, size, float(np.median(apart)) ** 2)
-
-
-def thinned(points: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, "p 3"]:
-    """One of the points in each cell of a grid: their mean would lie off a curved surface."""
-    cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    return points[np.sort(first)]
-
-
-def exposed(rest: SegmentedMesh) -> SegmentedMesh:
-    """The faces that can be seen from outside: not inside another segment and not within ``CONTACT`` of one."""
-    solids, reach = Solids(rest), CONTACT * diagonal(rest)
-    inner = {index for index, _ in rest.nesting}
-    shown = []
-    for index, segment in enumerate(rest.segments):
-        middles = segment.vertices[segment.faces].mean(axis=1)
-        hidden = np.full(len(middles), index in inner)
-        for other in set(range(solids.count)) - inner - {index}:
-            hidden |= (solids.segment_distance(other, middles) < reach) | solids.inside(other, middles)
-        shown.append(replace(segment, faces=segment.faces[~hidden]))
-    return replace(rest, segments=tuple(shown))
-
-
-def moved(mesh: SegmentedMesh, poses: Poses) -> SegmentedMesh:
-    """Each segment by its own transform."""
-    pairs = zip(poses, mesh.segments, strict=True)
-    return mesh.with_vertices([transform_points(pose, segment.vertices) for pose, segment in pairs])
-
-
-def facing(placed: SegmentedMesh, viewpoint: Float[np.ndarray, "3"]) -> SegmentedMesh:
-    """The faces that are turned towards ``viewpoint``."""
-    return replace(placed, segments=tuple(_facing(segment, viewpoint) for segment in placed.segments))
-
-
-def _facing(segment: Segment, viewpoint: Float[np.ndarray, "3"]) -> Segment:
-    corners = segment.vertices[segment.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    way = viewpoint - corners.mean(axis=1)
-    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
-    return replace(segment, faces=segment.faces[np.einsum("ij,ij->i", normal, way) > FACING * size])
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +148,12 @@ class Registration:
 
 
 def register(
-    shown: SegmentedMesh, scan: Scan, poses: Poses, bodies: Sequence[Sequence[int]], limits: Sequence[float]
+    shown: SegmentedMesh,
+    scan: Scan,
+    poses: Poses,
+    bodies: Sequence[Sequence[int]],
+    limits: Sequence[float],
+    hold: bool = False,
 ) -> Registration:
     """Move each body, a list of segments, onto the scan; all segments take part in saying whose a point is.
 
@@ -205,6 +163,8 @@ def register(
         poses: where to start.
         bodies: indices of the segments that move together; what is in none stays.
         limits: one for each round, in diagonals of the object.
+        hold: keep bodies where they are along directions that the scan does not constrain. Not from a rough start: from
+            there a body must also slide to where its points are.
     """
     fitted, held = np.zeros(len(poses), dtype=bool), np.zeros(len(poses), dtype=np.int64)
     for limit in limits:
@@ -216,7 +176,7 @@ def register(
             surface = SegmentedMesh(tuple(surfaces.segments[index] for index in body))
             fitted[body] = shows(points, surface, scan.area)
             if fitted[body[0]]:
-                motion, held[body] = icp(points, surface, matches.limit, scan.area)
+                motion, held[body] = icp(points, surface, matches.limit, scan.area, hold)
                 poses[body] = motion @ poses[body]
     surfaces = facing(moved(shown, poses), scan.viewpoint)
     return Registration(poses, fitted, held, match(scan.points, surfaces, limits[-1] * scan.size))
@@ -228,27 +188,31 @@ def shows(points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, area: float)
 
 
 def icp(
-    points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, limit: float, area: float
+    points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, limit: float, area: float, hold: bool
 ) -> tuple[Float[np.ndarray, "4 4"], int]:
     """The rigid motion of ``surface`` onto ``points``, and in how many directions it is held."""
     library = load_icp()
-    samples = sample_surface(surface, area / 2)
-    center = samples.mean(axis=0)
-    radius = float(np.linalg.norm(samples - center, axis=1).max())
-    target = library.PointCloud((samples - center) / radius)
+    samples = sample_surface(surface, area)
+    center = samples.mean(axis=(0, 1))
+    radius = float(np.linalg.norm(samples - center, axis=-1).max())
+    target, source = (library.PointCloud((a - center) / radius) for a in (samples.reshape(-1, 3), points))
     tree = library.KdTree(target)
-    library.estimate_normals(target, tree, 12)
+    library.estimate_covariances(target, tree, CLUSTER)
+    library.estimate_covariances(source, num_neighbors=NEIGHBORS)
     result = library.align(
         target,
-        library.PointCloud((points - center) / radius),
+        source,
         tree,
-        registration_type="PLANE_ICP",
+        registration_type="GICP",
         max_correspondence_distance=2 * (limit + np.sqrt(area)) / radius,  # points are chosen; it only must not cut
         max_iterations=ITERATIONS,
         rotation_epsilon=1e-6,
         translation_epsilon=1e-6,
     )
-    points_to_surface, held = constrained(result.T_target_source, result.H / max(result.num_inliers, 1))
+    points_to_surface, held = result.T_target_source, 0
+    if hold:
+        curvature = 2 * FLATNESS * result.H / max(result.num_inliers, 1)
+        points_to_surface, held = constrained(points_to_surface, curvature)
     motion = inverse_rigid(points_to_surface)
     motion[:3, 3] = center - motion[:3, :3] @ center + radius * motion[:3, 3]
     return motion, held
@@ -265,22 +229,3 @@ def constrained(
     turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
     kept = firm @ (firm.T @ np.concatenate([turn, motion[:3, 3]]))
     return rigid(Rotation.from_rotvec(kept[:3]).as_matrix(), kept[3:]), 6 - firm.shape[1]
-
-
-def face_areas(mesh: SegmentedMesh) -> Float[np.ndarray, " f"]:
-    """Of all faces of all segments."""
-    vertices, faces, _ = mesh.merged()
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
-def sample_surface(mesh: SegmentedMesh, area: float, least: int = 1000, most: int = 60_000) -> Float[np.ndarray, "n 3"]:
-    """Points on the faces, uniformly, one for each ``area``; the same ones in every call."""
-    areas = face_areas(mesh)
-    rng = np.random.default_rng(0)
-    count = int(np.clip(areas.sum() / area, least, most))
-    vertices, faces, _ = mesh.merged()
-    corners = vertices[faces[rng.choice(len(faces), size=count, p=areas / areas.sum())]]
-    along, across = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    return a * (1 - along) + b * along * (1 - across) + c * along * across

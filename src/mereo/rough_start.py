@@ -21,8 +21,8 @@ from mereo.mesh import SegmentedMesh
 from mereo.mesh_files import readable
 from mereo.model import Model
 from mereo.placement import Start, scale_of
-from mereo.registration import diagonal
 from mereo.rest_pose import rest_frame
+from mereo.scan_surface import diagonal
 from mereo.scans import Frame, scanner_to_camera
 
 LEAST_PAIRS = 3

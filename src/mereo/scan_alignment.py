@@ -102,14 +102,14 @@ def _start(
 def print_placement(placement: Placement, title: str, unit: str) -> None:
     """A table of the segments; lengths in millimetres."""
     mm = 1000 * UNITS_M[unit]
-    table = Table(title=title, title_justify="left")
+    table = Table(title=f"{title}; millimetres and degrees", title_justify="left")
     for column in ("segment", "placed by"):
-        table.add_column(column)
-    for column in ("points", "median mm", "RMS mm", "95 % mm", "moved mm", "turned °", "held"):
+        table.add_column(column, no_wrap=True)
+    for column in ("points", "median", "RMS", "95 %", "moved", "turned", "held"):
         table.add_column(column, justify="right")
     for one in placement.segments:
         fit = [f"{mm * value:.3f}" if one.points else "-" for value in (one.median, one.rms, one.p95)]
-        by = one.placed_by if one.seen else f"not seen, {one.placed_by}"
+        by = one.placed_by if one.seen else f"unseen: {one.placed_by}"
         held = f"{one.held} of 6" if one.held else ""
         table.add_row(one.name, by, str(one.points), *fit, f"{mm * one.shift:.2f}", f"{one.turn_deg:.1f}", held)
     console = Console()
@@ -123,7 +123,7 @@ def print_placement(placement: Placement, title: str, unit: str) -> None:
         if one.held:
             console.print(
                 f"{one.name}: the scan leaves {one.held} of 6 directions open (it could turn or slide); there it "
-                "stays as it started",
+                "stays where it was placed together with the others",
                 highlight=False,
                 soft_wrap=True,
             )

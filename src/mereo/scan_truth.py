@@ -14,7 +14,7 @@ from mereo.mesh import SegmentedMesh
 from mereo.mesh_files import readable
 from mereo.output import write_json
 from mereo.placement import Placement
-from mereo.registration import diagonal, moved
+from mereo.scan_surface import diagonal, moved
 from mereo.scans import Frame, PosedScan
 from mereo.scene import SCENES, load_scene
 
