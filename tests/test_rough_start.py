@@ -17,7 +17,7 @@ POSE = rigid(SCALE * TURN, np.array([1.0, 2.0, 3.0]))
 MODEL = np.array([[0.0, 0, 0], [20, 0, 0], [0, 12, 0], [30, 5, 8]])
 
 
-def pairs(model: np.ndarray = MODEL, pose: np.ndarray = POSE) -> dict[str, object]:
+def pairs(model: np.ndarray = MODEL, pose: np.ndarray = POSE) -> dict[str, list[list[float]]]:
     return {"model": model.tolist(), "scan": transform_points(pose, model).tolist()}
 
 
@@ -69,6 +69,9 @@ def test_noisy_pairs_give_the_best_rotation() -> None:
         assert cost(pose) < cost(rigid(turn, rng.normal(scale=0.1, size=3)) @ pose)
 
 
+SPREAD = np.array([[0.0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0], [0, 0, 9]])
+SADDLE = SCALE * SPREAD + np.outer([-15, 15, -15, 15, 0], [0, 0, 1])
+TWISTED = {"model": SPREAD.tolist(), "scan": SADDLE.tolist()}
 MIRROR = POSE @ np.diag([-1.0, 1, 1, 1])
 
 
@@ -85,7 +88,8 @@ MIRROR = POSE @ np.diag([-1.0, 1, 1, 1])
         ({"object": {"model": []}}, SCALE, 'has the keys \'model\'; pairs are "model" and "scan"'),
         ({"object": {**pairs(), "scan": "here"}}, SCALE, "scan of the start of the object must be rows of 3 finite"),
         ({"object": pairs(np.outer([0, 1, 2, 3], [1.0, 2, 3]))}, SCALE, "lie on a line; they must span a triangle"),
-        ({"object": pairs(pose=MIRROR)}, SCALE, "pairs of the object are .* apart .* left and right|scan units per"),
+        ({"object": pairs(pose=MIRROR)}, SCALE, "the pairs of the object fit a mirror image better"),
+        ({"object": pairs(SPREAD), "segments": {"arm": TWISTED}}, SCALE, "pairs of segment 'arm' are 13.4 apart"),
         ({"object": pairs()}, None, "about 2.5 scan units per scene unit.: give the scene's unit with --scene-unit-mm"),
         ({"object": pairs()}, 2500.0, "has 2.5 scan units per scene unit, but the units of scene and scan give 2500"),
         ({"object": POSE.tolist()}, 0.0025, "has 2.5 scan units per scene unit, but .* give 0.0025"),

@@ -1,6 +1,7 @@
 """``mereo align`` and the truth it writes, which ``mereo evaluate`` takes."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from analytic import AnalyticModel
 
 from mereo import assets
 from mereo.__main__ import main
+from mereo.mesh_files import read_segmented_mesh
 from mereo.metrics import Scores
 from mereo.placement import Start, place
 from mereo.scan_evaluation import evaluate_scans
@@ -64,7 +66,7 @@ def oracle(folder: Path, shift_mm: float) -> Scores:
     truth = read_truth(folder / "truth").truth
     solids, shift = Solids(truth), np.array([shift_mm, 0.0, 0.0])
     model = AnalyticModel.of(lambda points: 5.0 * np.eye(3)[solids.label(points - shift)], truth.names)
-    evaluation = evaluate_scans(model, folder / f"test{shift_mm}", truths=[folder / "truth"], cells=30)
+    evaluation = evaluate_scans(model, folder / f"test{shift_mm}", truths=[folder / "truth"], cells=20)
     assert list(evaluation.examples) == ["truth"]
     written = json.loads((folder / f"test{shift_mm}/metrics.json").read_text())
     assert written["iou"] == evaluation.scores.iou and written["scans"] == ["truth"]
@@ -73,8 +75,9 @@ def oracle(folder: Path, shift_mm: float) -> Scores:
 
 def test_evaluate_takes_the_truth(bar: tuple[Path, Scene, np.ndarray]) -> None:
     """The truth scores one, and less when it is moved by a tenth of the bar's length."""
-    assert oracle(bar[0], 0.0).iou == oracle(bar[0], 0.0 + 1e-9).miou == 1.0
-    assert 0.6 < oracle(bar[0], 4.0).iou < 0.95
+    exact = oracle(bar[0], 0.0)
+    assert exact.iou == exact.miou == 1.0
+    assert 0.4 < oracle(bar[0], 4.0).iou < 0.7
 
 
 @pytest.mark.parametrize("fault", ["gone", "another scan", "another mesh", "another format", "damaged"])
@@ -126,8 +129,6 @@ def test_the_command_refuses(
     options: list[str],
     sentence: str,
 ) -> None:
-    import re
-
     monkeypatch.chdir(bar[0])
     assert main(["align", "scan.npy", "--scene", "bar.yaml", "--output", "out", *options]) == 2
     assert re.search(sentence, capsys.readouterr().err)
@@ -135,8 +136,6 @@ def test_the_command_refuses(
 
 
 def test_the_rest_pose_is_exported(bar: tuple[Path, Scene, np.ndarray], capsys: pytest.CaptureFixture[str]) -> None:
-    from mereo.mesh_files import read_segmented_mesh
-
     folder, scene, _ = bar
     for name in ("rest.ply", "rest.glb"):
         assert main(["scene", "export", str(folder / "bar.yaml"), "--output", str(folder / name)]) == 0

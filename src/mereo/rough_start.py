@@ -33,6 +33,9 @@ LEAST_GUESSES = 30
 SCALE_ERROR = 0.25
 """A start whose scale differs more than this from the known one is of another unit; picked points are not this bad."""
 
+MIRROR_ERROR = 0.2
+"""Pairs that fit this share of the largest residual may be mirrored or not: nearly flat, they do not tell."""
+
 PAIR_ERROR = 0.1
 """Largest RMS distance of pairs after the best fit, in diagonals of the object."""
 
@@ -138,8 +141,8 @@ def pose_of_pairs(
 ) -> Float[np.ndarray, "4 4"]:
     """The similarity of known scale that takes ``model`` to ``scan`` best (Kabsch, 1976).
 
-    Raises ``ValueError`` for fewer than three pairs, points on a line, an unknown or another scale, or a residual above
-    ``tolerance`` (scene units).
+    Raises ``ValueError`` for fewer than three pairs, points on a line, an unknown or another scale, mirrored pairs, or
+    a residual above ``tolerance`` (scene units).
     """
     if len(model) != len(scan) or len(model) < LEAST_PAIRS:
         raise ValueError(
@@ -158,13 +161,24 @@ def pose_of_pairs(
             f"{found:.4g} scan units per scene unit): give the scene's unit with --scene-unit-mm"
         )
     check_scale(found, scale, of)
-    error = float(np.sqrt(np.mean(np.sum((target - scale * source @ rotation.T) ** 2, axis=1))))
+    error, mirrored = (misfit(scale * source * hand, target) for hand in ([1, 1, 1], [-1, 1, 1]))
+    if error > MIRROR_ERROR * tolerance * scale and mirrored < error / 2:
+        raise ValueError(
+            f"the pairs of {of} fit a mirror image better ({mirrored:.3g} apart instead of {error:.3g}); poses do not "
+            "mirror: check that left and right are not exchanged, and the axes of both files"
+        )
     if error > tolerance * scale:
         raise ValueError(
             f"the pairs of {of} are {error:.3g} apart (RMS) after the best fit; at most {tolerance * scale:.3g} makes "
-            "a start: check that both lists are in the same order and that left and right are not exchanged"
+            "a start: check that both lists are in the same order"
         )
     return rigid(scale * rotation, scan.mean(axis=0) - scale * rotation @ model.mean(axis=0))
+
+
+def misfit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> float:
+    """RMS distance of centred pairs after the best rotation."""
+    rotation = Rotation.align_vectors(target, source)[0].as_matrix()
+    return float(np.sqrt(np.mean(np.sum((target - source @ rotation.T) ** 2, axis=1))))
 
 
 def start_from_model(

@@ -102,7 +102,7 @@ def _start(
 def print_placement(placement: Placement, title: str, unit: str) -> None:
     """A table of the segments; lengths in millimetres."""
     mm = 1000 * UNITS_M[unit]
-    table = Table(title=f"{title}; millimetres and degrees", title_justify="left")
+    table = Table(title=f"{title}; millimetres and degrees", title_justify="left", box=None, padding=(0, 2, 0, 0))
     for column in ("segment", "placed by"):
         table.add_column(column, no_wrap=True)
     for column in ("points", "median", "RMS", "95 %", "moved", "turned", "held"):
@@ -110,7 +110,7 @@ def print_placement(placement: Placement, title: str, unit: str) -> None:
     for one in placement.segments:
         fit = [f"{mm * value:.3f}" if one.points else "-" for value in (one.median, one.rms, one.p95)]
         by = one.placed_by if one.seen else f"unseen: {one.placed_by}"
-        held = f"{one.held} of 6" if one.held else ""
+        held = str(one.held) if one.held else ""
         table.add_row(one.name, by, str(one.points), *fit, f"{mm * one.shift:.2f}", f"{one.turn_deg:.1f}", held)
     console = Console()
     console.print(table)
