@@ -13,6 +13,7 @@ import tyro
 from tyro.conf import subcommand
 
 from mereo import commands, scene_commands
+from mereo.align_command import Align
 from mereo.bench_command import BenchCommand
 from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
 from mereo.experiment_command import Experiment
@@ -101,17 +102,19 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         (scene_commands.SceneNew, "new"),
         (scene_commands.SceneCheck, "check"),
         (scene_commands.ScenePreview, "preview"),
+        (scene_commands.SceneExport, "export"),
     )
     assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")
     return (
         Annotated[commands.Demo, subcommand("demo")]
         | Annotated[commands.Doctor, subcommand("doctor")]
-        | Annotated[_group(scene), subcommand("scene", description="List, write, check or draw scenes.")]
+        | Annotated[_group(scene), subcommand("scene", description="List, write, check, draw or export scenes.")]
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
         | Annotated[_starting(commands.Generate, settings=GenerateConfig(sensor=sensor)), subcommand("generate")]
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
+        | Annotated[Align, subcommand("align")]
         | Annotated[Experiment, subcommand("experiment")]
         | Annotated[BenchCommand, subcommand("bench")]
     )

@@ -145,7 +145,8 @@ class Evaluate:
         examples: how many.
         seed: test seeds start at 1,000,000.
         scene: the scene's name or file, where it is not the built-in one that the weights were trained on.
-        scans: score the four real range scans of the bunny, whose poses are known, instead of rendered views.
+        scans: score real scans instead of rendered views: truth files, or their folders, of `mereo align`; without
+            any, the four range scans of the bunny, whose poses are known.
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
         noise_std: Gaussian noise on the depth, standard deviation in scene units.
         terms: what else is wrong with the depth image.
@@ -156,22 +157,23 @@ class Evaluate:
     examples: int = 128
     seed: int = 1_000_000
     scene: str | None = None
-    scans: bool = False
+    scans: tuple[Path, ...] | None = None
     sensor: Sensor = "paper"
     noise_std: float = 0.1
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
 
     def run(self) -> None:
-        from mereo.evaluation import evaluate_scans, evaluate_weights, markdown_table
+        from mereo.evaluation import evaluate_weights, markdown_table
 
         settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)
-        if self.scans:
+        if self.scans is not None:
+            from mereo.scan_evaluation import evaluate_scans
             from mereo.weights import load_model
 
             if settings != GenerateConfig():
                 raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
 
-            print(markdown_table(evaluate_scans(load_model(self.weights), self.output)))
+            print(markdown_table(evaluate_scans(load_model(self.weights), self.output, truths=self.scans)))
             return
         evaluate_weights(
             self.weights, self.output, examples=self.examples, seed=self.seed, scene=self.scene, settings=settings

@@ -19,6 +19,7 @@ PURPOSES: dict[str, str] = {
     "sensors": "ROS bags and netCDF recordings",
     "simulation": "states from finite elements",
     "cluster": "data generation on several machines",
+    "align": "ground truth from scans",
     "dev": "tests and checks",
 }
 """What each extra of pyproject.toml is for; which packages it means is read from the installed metadata."""

@@ -1,4 +1,4 @@
-"""Scores on test sets (paper, appendix B): synthetic views of a scene, and the four real scans of the bunny.
+"""Scores on test sets (paper, appendix B), and on synthetic views of a scene; for real scans see ``scan_evaluation``.
 
 The joint box of all true segments is divided into 100^3 cells; their centres are labelled by the truth and by the
 model, and those outside every segment's enlarged box are dropped. One confusion matrix is summed over the whole set;
@@ -26,7 +26,6 @@ from mereo.model import Model
 from mereo.output import new_directory, write_json
 from mereo.reconstruction import segment_names
 from mereo.refinement import sample_coarse_to_fine
-from mereo.scans import SCANS, scan_in_camera
 from mereo.scene import SCENES, Scene, load_scene
 from mereo.synthesis import example_rng, sample_view
 from mereo.weights import load_model
@@ -170,24 +169,6 @@ def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, i
     return TestCase(f"{scene.name} {index}", view.depth.to_points(), truth_grid(view.mesh, cells))
 
 
-def evaluate_scans(model: Model, output: str | Path | None = None, *, cells: int = CELLS) -> Evaluation:
-    """Scores on the four real scans of the bunny; writes what ``evaluate_weights`` does when ``output`` is given.
-
-    Raises ``ValueError`` for another object's model and ``assets.AssetUnavailable`` where a scan cannot be had.
-    """
-
-    def case(index: int) -> TestCase:
-        cloud, truth, _ = scan_in_camera(SCANS[index])
-        check_names(model, truth.names)
-        return TestCase(SCANS[index], cloud, truth_grid(truth, cells))
-
-    evaluation = score_cases(model, case, len(SCANS), progress=False)
-    if output is not None:
-        with new_directory(output) as directory:
-            _write(directory, evaluation, {"scans": list(SCANS), "trained": model.provenance})
-    return evaluation
-
-
 def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progress: bool) -> Evaluation:
     """One confusion matrix over ``case(0) ... case(count - 1)``, which are made one at a time."""
     names, colors = segment_names(model)
@@ -245,13 +226,14 @@ def evaluate_weights(
             "sensor": asdict(settings.sensor),
             "trained": model.provenance,
         }
-        _write(directory, evaluation, facts)
+        write_evaluation(directory, evaluation, facts)
     print(markdown_table(evaluation))
     print(f"wrote {output}")
     return evaluation
 
 
-def _write(directory: Path, evaluation: Evaluation, facts: dict[str, Any]) -> None:
+def write_evaluation(directory: Path, evaluation: Evaluation, facts: dict[str, Any]) -> None:
+    """metrics.json, table.md and errors.png; ``facts`` come first in the JSON."""
     write_json(directory / "metrics.json", metrics(evaluation, facts))
     (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
     error_picture(directory / "errors.png", evaluation.cases)

@@ -156,6 +156,17 @@ class Model:
         """Class logits only: what surface extraction needs."""
         return self._chunked(code, points, lambda *found: (self.class_logits(*found),))[0]
 
+    def rest(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"] | None:
+        """Where each point was at rest, in rest coordinates (see ``rest_pose``); None from a model without template."""
+        if self.network.decoder.lookup is None:
+            return None
+
+        def rest(prediction: Prediction, _: Tensor) -> tuple[Tensor]:
+            assert prediction.rest is not None
+            return (prediction.rest,)
+
+        return self._chunked(code, points, rest)[0].astype(np.float64)
+
     def class_logits(self, prediction: Prediction, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q c"]:
         """Logits of empty space and each segment; ``queries`` are normalized."""
         logits = prediction.logits

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from jaxtyping import Float, UInt8
 
 from mereo.camera import Camera
@@ -188,6 +189,15 @@ def write_labels_npz(
             spacing=np.asarray(spacing, dtype=np.float64),
             names=np.asarray(names),
         )
+
+
+def write_mesh_ply(path: str | Path, mesh: SegmentedMesh) -> None:
+    """All segments as one mesh, its faces in their colours, vertices in double precision."""
+    vertices, faces, owner = mesh.merged()
+    colors = np.asarray(mesh.colors, dtype=np.uint8)[owner]
+    whole = trimesh.Trimesh(vertices, faces, face_colors=colors, process=False)
+    with atomic_file(path) as partial:
+        whole.export(partial, file_type="ply")
 
 
 # --- glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) --------------------------------------------

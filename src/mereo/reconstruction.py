@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -31,10 +31,8 @@ from mereo.output import GLTF_CAMERA_ROTATION, new_directory, write_json, write_
 from mereo.pictures import render_cloud_and_segments
 from mereo.refinement import Field
 from mereo.report import write_report
-from mereo.scans import SCANNER_TO_CAMERA, scanner_to_camera
+from mereo.scans import SCANNER_TO_CAMERA, Frame, scanner_to_camera
 from mereo.weights import load_model
-
-Frame = Literal["camera", "scanner"]
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Where segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one lies behind it."""

@@ -4,6 +4,9 @@ Scanner frame: x right, y up, z toward the scanner, the origin somewhere near th
 the rest-pose segments of the scene "bunny", brought into a scan's frame, are its exact answer.
 """
 
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Float
 
@@ -12,6 +15,9 @@ from mereo.camera import PointCloud
 from mereo.files import read_point_cloud
 from mereo.frame import Normalizer, rigid, transform_points
 from mereo.mesh import SegmentedMesh
+
+Frame = Literal["camera", "scanner"]
+"""Axes of a cloud: x right, y down, z forward from the camera at the origin; or the scanner's, above."""
 
 SCANS = tuple(assets.BUNNY_SCAN_POSES)
 """Names of the bunny's scans."""
@@ -62,9 +68,34 @@ def bunny_truth(name: str) -> SegmentedMesh:
     return rest_mesh().transformed(np.linalg.inv(assets.BUNNY_SCAN_POSES[name]) @ T_model_scene)
 
 
+@dataclass(frozen=True, eq=False)
+class PosedScan:
+    """A real scan with its truth.
+
+    Attributes:
+        name: for tables.
+        cloud: in the scan's own frame and unit.
+        truth: the segments, in the same.
+        frame: the axes of both: "camera" (x right, y down, z forward from the camera at the origin) or "scanner".
+    """
+
+    name: str
+    cloud: PointCloud
+    truth: SegmentedMesh
+    frame: Frame
+
+    def in_camera(self) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
+        """Cloud and truth in a camera frame, and ``T_camera_scan``."""
+        T_camera_scan = scanner_to_camera(self.cloud.points) if self.frame == "scanner" else np.eye(4)
+        cloud = PointCloud(transform_points(T_camera_scan, self.cloud.points))
+        return cloud, self.truth.transformed(T_camera_scan), T_camera_scan
+
+
+def bunny_posed(name: str) -> PosedScan:
+    """A real scan of the bunny with its truth; raises as ``bunny_scan``."""
+    return PosedScan(name, bunny_scan(name)[0], bunny_truth(name), "scanner")
+
+
 def scan_in_camera(name: str) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
     """A real scan and its truth in a camera frame, metres, and ``T_camera_scan``."""
-    scan, _ = bunny_scan(name)
-    T_camera_scan = scanner_to_camera(scan.points)
-    cloud = PointCloud(transform_points(T_camera_scan, scan.points))
-    return cloud, bunny_truth(name).transformed(T_camera_scan), T_camera_scan
+    return bunny_posed(name).in_camera()

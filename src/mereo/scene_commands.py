@@ -1,4 +1,4 @@
-"""The commands ``mereo scene ...``: list, write, check and draw scenes. See ``commands``."""
+"""The commands ``mereo scene ...``: list, write, check, draw and export scenes. See ``commands``."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,4 +88,33 @@ class ScenePreview:
             preview_all(self.output, self.seed)
         else:
             preview_scene(load_scene(self.scene), self.output, self.seed)
+        print(f"wrote {self.output}")
+
+
+@dataclass(frozen=True)
+class SceneExport:
+    """Write a scene's segments at rest, in scene units: to look at, or to pick points in for `mereo align`.
+
+    Attributes:
+        scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
+        output: a PLY file (one mesh, coloured), or a GLB file (a node for each segment).
+    """
+
+    scene: Positional[str]
+    output: Path
+
+    def run(self) -> None:
+        import numpy as np
+
+        from mereo.output import write_mesh_ply, write_segments_glb
+        from mereo.scene import load_scene
+
+        suffix = self.output.suffix.lower()
+        if suffix not in (".ply", ".glb"):
+            raise ValueError(f"{self.output} has the suffix {suffix!r}; it must be .ply or .glb: rename it")
+        rest = load_scene(self.scene).rest
+        if suffix == ".ply":
+            write_mesh_ply(self.output, rest)
+        else:
+            write_segments_glb(self.output, rest, np.eye(3))
         print(f"wrote {self.output}")

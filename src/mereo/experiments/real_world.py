@@ -5,10 +5,10 @@ poses.
 """
 
 from mereo.config import GenerateConfig
-from mereo.evaluation import evaluate_scans
 from mereo.experiments.result import Claim, Result, Row, published
 from mereo.experiments.scales import Scale
 from mereo.experiments.store import Score, Store
+from mereo.scan_evaluation import evaluate_scans
 from mereo.weights import load_model
 
 NOTES = ("The paper's figures are those of its printed lizard (15 scans), ours of the bunny (4 scans).",)
