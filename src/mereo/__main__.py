@@ -15,6 +15,7 @@ from tyro.conf import subcommand
 from mereo import commands, scene_commands
 from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
 from mereo.experiment_command import Experiment
+from mereo.view_command import View
 
 Choice = TypeVar("Choice")
 
@@ -111,6 +112,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
+        | Annotated[View, subcommand("view")]
         | Annotated[Experiment, subcommand("experiment")]
     )
 

@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from mereo.camera import Camera, DepthImage
 from mereo.config import MIN_POINTS, GenerateConfig
@@ -97,19 +97,18 @@ class Laboratory:
     def most_tilt_rad(self) -> float:
         return float(min(self.scene.workspace.aperture_rad / 2, np.pi))
 
+    def pose(self, target: Float[np.ndarray, "3"], place: CameraPlace) -> Float[np.ndarray, "4 4"]:
+        """``T_world_camera`` of a camera there, aimed at ``target``."""
+        cosine = float(np.cos(place.tilt_rad))
+        return self.scene.workspace.pose(target, cosine, place.azimuth_rad, place.distance, place.roll_rad)
+
     def look(self, played: Played, place: CameraPlace) -> View:
         """The state as the camera sees it; its noise is the same every time, so that pictures do not flicker.
 
         Raises ``ValueError`` where fewer than ``MIN_POINTS`` points of the object are seen.
         """
         state = self.scene.deform(played.deformations)
-        T_world_camera = self.scene.workspace.pose(
-            state.mesh.bounds.mean(axis=0),
-            float(np.cos(place.tilt_rad)),
-            place.azimuth_rad,
-            place.distance,
-            place.roll_rad,
-        )
+        T_world_camera = self.pose(state.mesh.bounds.mean(axis=0), place)
         mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
         rng = np.random.default_rng(0)
         seen = observe(Solids(mesh), self.camera, self.settings.noise_std, self.settings.sensor, rng)

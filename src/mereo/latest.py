@@ -26,7 +26,7 @@ class LatestWins(Generic[Request]):
     ) -> None:
         self._quick, self._fine, self._failed, self._settle_s = quick, fine, failed, settle_s
         self._changed = threading.Condition()
-        self._waiting: Request | None = None
+        self._waiting: list[Request] = []
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="latest-wins", daemon=True)
         self._thread.start()
@@ -34,7 +34,7 @@ class LatestWins(Generic[Request]):
     def submit(self, request: Request) -> None:
         """Returns at once. A request that still waits is dropped."""
         with self._changed:
-            self._waiting = request
+            self._waiting = [request]
             self._changed.notify()
 
     def stop(self) -> None:
@@ -45,20 +45,18 @@ class LatestWins(Generic[Request]):
         self._thread.join()
 
     def _run(self) -> None:
-        rested: Request | None = None
+        rested: list[Request] = []
         while True:
             with self._changed:
-                self._changed.wait_for(
-                    lambda: self._stopped or self._waiting is not None, None if rested is None else self._settle_s
-                )
+                wait_s = self._settle_s if rested else None
+                self._changed.wait_for(lambda: self._stopped or bool(self._waiting), wait_s)
                 if self._stopped:
                     return
-                request, self._waiting = self._waiting, None
-            if request is not None:
-                rested = request if self._did(self._quick, request) else None
-            elif rested is not None:
-                self._did(self._fine, rested)
-                rested = None
+                newest, self._waiting = self._waiting, []
+            if newest:
+                rested = newest if self._did(self._quick, newest[0]) else []
+            elif rested:
+                self._did(self._fine, rested.pop())
 
     def _did(self, work: Callable[[Request], None], request: Request) -> bool:
         try:
