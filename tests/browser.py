@@ -34,7 +34,7 @@ class Page:
         command = [BROWSER, *OPTIONS, f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", address]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         port_file = profile / "DevToolsActivePort"
-        until(lambda: port_file.is_file() and port_file.read_text().count("\n") > 0, 60)
+        until(lambda: port_file.is_file() and port_file.read_text().count("\n") > 0)
         with urllib.request.urlopen(f"http://127.0.0.1:{port_file.read_text().split()[0]}/json/list") as answer:
             target = next(t for t in json.load(answer) if t["type"] == "page")
         self._socket = connect(target["webSocketDebuggerUrl"], max_size=None)
@@ -64,6 +64,13 @@ class Page:
     def evaluate(self, script: str) -> Any:
         return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
 
+    def still(self) -> None:
+        """No transitions: a page that fades in takes long where every frame is drawn in software."""
+        self.evaluate(
+            "document.head.insertAdjacentHTML('beforeend',"
+            "'<style>* { transition: none !important; animation: none !important }</style>')"
+        )
+
     def text(self) -> str:
         return str(self.evaluate("document.body.innerText"))
 
@@ -78,12 +85,12 @@ class Page:
         self.call("Input.dispatchMouseEvent", type="mouseReleased", **where)
 
 
-def until(condition: Callable[[], Any], timeout_s: float = 30.0) -> Any:
-    """Wait for something to be true and return it; fails after ``timeout_s``."""
+def until(condition: Callable[[], Any], timeout_s: float = 120.0) -> Any:
+    """Wait for something to be true and return it; fails after ``timeout_s``, which a busy machine may need."""
     end = time.monotonic() + timeout_s
     while not (found := condition()):
-        assert time.monotonic() < end, f"nothing happened within {timeout_s:g} s"
-        time.sleep(0.1)
+        assert time.monotonic() < end, f"it did not happen within {timeout_s:g} s"
+        time.sleep(0.2)
     return found
 
 

@@ -11,7 +11,7 @@ import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import CodeType
+from types import CodeType, FrameType
 from typing import Any
 
 import numpy as np
@@ -155,7 +155,8 @@ def _plain(values: Any) -> Any:
 
 def _trail() -> Trail:
     """The calls from ``freedoms.play`` down to the recorder, which are what a draw is known by."""
-    frame, found = sys._getframe(1), []
+    frame: FrameType | None = sys._getframe(1)
+    found: list[tuple[CodeType, int]] = []
     while frame is not None and frame.f_code.co_name != "play":
         if not _is_ours(frame.f_code):
             found.append((frame.f_code, frame.f_lasti))

@@ -70,7 +70,7 @@ class Freedom:
         group, name, unit: for people.
         low, high, value: as the scene draws them, angles in degrees; a normal draw in standard deviations, many
             numbers together in turns.
-        step: 1 for whole numbers, otherwise a two-hundredth of the range.
+        whole: whether only whole numbers mean something.
     """
 
     key: Key
@@ -81,7 +81,7 @@ class Freedom:
     low: float
     high: float
     value: float
-    step: float
+    whole: bool = False
 
 
 # --- playing ----------------------------------------------------------------------------------------------------------
@@ -183,7 +183,7 @@ def freedoms(played: Played) -> tuple[Freedom, ...]:
         name = f"{name} {seen[named]}" if repeated[named] > 1 else name
         if _together(call):
             turn = played.turns.get(call.key, (0.0, call.shares))[0]
-            found.append(Freedom(call.key, None, group, name, " turns", 0.0, 1.0, turn, 0.005))
+            found.append(Freedom(call.key, None, group, name, " turns", 0.0, 1.0, turn))
         else:
             found += [_freedom(call, index, group, name, unit) for index in range(len(call.shares))]
     return tuple(freedom for freedom in found if freedom.high > freedom.low)
@@ -199,13 +199,13 @@ def _freedom(call: Call, index: int, group: str, name: str, unit: str) -> Freedo
     low, high, share = float(call.low[index]), float(call.high[index]), float(call.shares[index])
     if call.kind == "normal":
         value = float(np.clip(ndtri(share), -NORMAL_REACH, NORMAL_REACH))
-        return Freedom(call.key, index, group, name, " σ", -NORMAL_REACH, NORMAL_REACH, value, 0.03)
+        return Freedom(call.key, index, group, name, " σ", -NORMAL_REACH, NORMAL_REACH, value)
     if call.kind in ("integers", "choice"):
         value = low + np.floor(share * (high - low))
-        return Freedom(call.key, index, group, name, "", low, high - 1, value, 1.0)
+        return Freedom(call.key, index, group, name, "", low, high - 1, float(value), whole=True)
     factor = 180 / np.pi if unit == "°" else 1.0
     low, high = sorted((low * factor, high * factor))
-    return Freedom(call.key, index, group, name, unit, low, high, low + share * (high - low), (high - low) / 200)
+    return Freedom(call.key, index, group, name, unit, low, high, low + share * (high - low))
 
 
 def set_value(scene: Scene, played: Played, freedom: Freedom, value: float) -> Played:

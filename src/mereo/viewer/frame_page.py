@@ -10,7 +10,7 @@ from mereo.coloring import CONFIDENCE, confidence, distance_scale, observed_dist
 from mereo.inspection import Inspection, first_hit
 from mereo.reconstruction import segment_names
 from mereo.viewer import words
-from mereo.viewer.stage import CLOUD_COLOR, SegmentControls, SegmentLayer, Stage
+from mereo.viewer.stage import CLOUD_COLOR, CLOUD_SIZE, SegmentControls, SegmentLayer, Stage
 
 COLORINGS = ("segment", "confidence", "distance")
 EMPTY_COLOR = (150, 156, 168)
@@ -30,7 +30,7 @@ class FramePage:
         self._painted: dict[str, tuple[list[UInt8[np.ndarray, "_ 3"]], str]] = {}
         self._build(title, facts)
         self._draw()
-        self.stage.look_from(self.toward + 0.28 * np.array([1.0, y, 0.0]))
+        self.stage.look_from(self.toward + 0.28 * np.array([1.0, y, 0.0]), self._bounds())
 
     def _bounds(self) -> Float[np.ndarray, "2 3"]:
         corners = [s.vertices for s in self.mesh.segments if len(s.vertices)]
@@ -47,7 +47,7 @@ class FramePage:
         self.controls = SegmentControls(gui, self.mesh, self._draw)
         with gui.add_folder("Observed points"):
             cloud_on = gui.add_checkbox("show", True)
-            size = gui.add_slider("size", 0.002, 0.05, 0.001, 0.012)
+            size = gui.add_slider("size", 0.002, 0.04, 0.001, CLOUD_SIZE)
         points = self.stage.place(self.inspection.cloud.points)
         cloud = self.server.scene.add_point_cloud(
             "/cloud", points, CLOUD_COLOR, point_size=size.value, point_shape="circle", precision="float32"
@@ -98,7 +98,7 @@ class FramePage:
 
     def _turn(self, name: str) -> None:
         side = np.array([1.0, 0.0, 0.0])
-        self.stage.look_from({"camera": self.toward, "side": side, "behind": -self.toward}[name])
+        self.stage.look_from({"camera": self.toward, "side": side, "behind": -self.toward}[name], self._bounds())
 
     # --- probing ------------------------------------------------------------------------------------------------------
 
@@ -106,8 +106,8 @@ class FramePage:
         origin, direction = (np.array(ray, dtype=float) for ray in (event.ray_origin, event.ray_direction))
         place = first_hit(self.mesh, self.stage.back(origin), direction, self.controls.visible())
         if place is not None:
-            self.probing.value = True
             self._move_probe(place)
+            self.probing.value = True
 
     def _switch_probe(self) -> None:
         if self.probing.value and self._arrow is None:

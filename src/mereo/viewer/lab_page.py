@@ -9,9 +9,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from mereo.coloring import CONFIDENCE, Scale, confidence, distance_scale, error_scale, observed_distance, surface_error
-from mereo.frame import inverse_rigid, transform_points
+from mereo.frame import transform_points
 from mereo.freedoms import Freedom, Played, Refused, freedoms, random_state, set_value
 from mereo.laboratory import Laboratory, Trial, depth_picture
 from mereo.latest import LatestWins
@@ -20,7 +22,7 @@ from mereo.solid import Solids
 from mereo.synthesis import View
 from mereo.viewer import words
 from mereo.viewer.sliders import CameraSliders, FreedomSliders
-from mereo.viewer.stage import CLOUD_COLOR, SegmentControls, SegmentLayer, Stage
+from mereo.viewer.stage import CLOUD_COLOR, CLOUD_SIZE, SegmentControls, SegmentLayer, Stage
 
 SHOWN = ("reconstruction", "truth", "side by side")
 COLORINGS = ("segment", "error", "confidence", "distance")
@@ -101,20 +103,23 @@ class LabPage:
         view.on_click(lambda _: self._look(view.value))
         for handle in (self._shown, self._coloring, self._points):
             handle.on_update(lambda _: self._draw())
+        self._shown.on_update(lambda _: self._look())
         gui.add_button("Random state").on_click(lambda _: self._wish_anew())
         with gui.add_folder("Camera"):
             self._camera = CameraSliders(gui, self.laboratory, lambda: self.worker.submit(None))
-        self._sliders = FreedomSliders(gui, self._wish)
+        self._sliders = FreedomSliders(gui, gui.add_folder("Deformation"), self._wish)
         self.controls = SegmentControls(gui, rest, self._draw)
 
     def _look(self, name: str = "camera") -> None:
         """The depth camera's own direction, a little from the side, or another one."""
-        middle = self.laboratory.scene.rest.bounds.mean(axis=0)
-        place = self.laboratory.first_place() if self.moment is None else self._camera.place()
-        T_world_camera = self.laboratory.pose(middle, place)
+        bounds, place = self.laboratory.scene.rest.bounds, self._camera.place()
+        T_world_camera = self.laboratory.pose(bounds.mean(axis=0), place)
+        if self.moment is not None:
+            T_world_camera = self.moment.view.T_world_camera
+            bounds = self.moment.view.mesh.transformed(T_world_camera).bounds
         toward, right = -T_world_camera[:3, 2], T_world_camera[:3, 0]
         direction = {"camera": toward + 0.2 * right, "side": right, "behind": -toward}[name]
-        self.stage.look_from(direction, 4.2)
+        self.stage.look_from(direction, bounds, 1.35 if self._shown.value != "side by side" else 2.2)
 
     # --- wishes -------------------------------------------------------------------------------------------------------
 
@@ -134,9 +139,9 @@ class LabPage:
             wishes, seed = list(self._wishes.values()), self._new_seed
             self._wishes, self._new_seed = {}, None
         scene = self.laboratory.scene
-        played = random_state(scene, seed) if seed is not None or self.moment is None else self.moment.played
-        if seed is not None:
-            return played
+        if seed is not None or self.moment is None:
+            return random_state(scene, seed or 0)
+        played = self.moment.played
         for freedom, value in wishes:
             # a slider of a part that has just gone has nothing left to move
             if freedom.key in played.keys:
@@ -153,7 +158,10 @@ class LabPage:
                 self._sliders.show(freedoms(self.moment.played))
             raise
         view = self.laboratory.look(played, self._camera.place())
-        self.moment = Moment(played, view, None if self.moment is None else self.moment.trial)
+        is_first = self.moment is None
+        self.moment = Moment(played, view)
+        if is_first:
+            self._look()
         self._sliders.show(freedoms(played))
         self._picture.image = depth_picture(view.depth, 3)
         self._rebuild(*QUICK)
@@ -174,6 +182,7 @@ class LabPage:
 
     def _failed(self, error: Exception) -> None:
         self._say(" ".join(str(error).split()) or type(error).__name__, bad=True)
+        self._draw()
 
     # --- results ------------------------------------------------------------------------------------------------------
 
@@ -197,36 +206,46 @@ class LabPage:
         if moment is None:
             return
         with self._drawing, self.server.atomic():
-            T_world_camera = moment.view.T_world_camera
-            mode = self._shown.value
-            self._draw_camera(moment.view)
-            truth = moment.view.mesh.transformed(T_world_camera)
-            aside = 2.1 * np.cross(T_world_camera[:3, 2], self.stage.up) * (mode == "side by side")
-            self._legend.visible = False
-            if mode == "reconstruction" or moment.trial is None and self.laboratory.model is not None:
+            mode, T_world_camera = self._shown.value, moment.view.T_world_camera
+            # side by side: both give way, along the camera's horizon
+            aside = (1.05 if mode == "side by side" else 0.0) * T_world_camera[:3, 0]
+            self._draw_camera(moment.view, -aside)
+            if mode == "reconstruction":
                 self.true.clear_from()
             else:
-                self.true.show(truth, self.controls, shift=aside / 2)
+                self.true.show(moment.view.mesh.transformed(T_world_camera), self.controls, shift=aside)
+            self._legend.visible = False
             if moment.trial is None or mode == "truth":
                 self.found.clear_from()
                 return
             colors = self._colors(moment.view, moment.trial)
             surfaces = moment.trial.result.surfaces.transformed(T_world_camera)
-            self.found.show(surfaces, self.controls, colors, -aside / 2)
+            self.found.show(surfaces, self.controls, colors, -aside)
 
-    def _draw_camera(self, view: View) -> None:
-        """The observed points, and the camera with its image, at its place."""
+    def _draw_camera(self, view: View, shift: Float[np.ndarray, "3"]) -> None:
+        """The observed points, and the camera with its image at its place."""
         scene, T_world_camera = self.server.scene, view.T_world_camera
-        aside = 2.1 * np.cross(T_world_camera[:3, 2], self.stage.up) * (self._shown.value == "side by side")
-        points = self.stage.place(transform_points(T_world_camera, view.depth.to_points().points)) - aside / 2
+        points = self.stage.place(transform_points(T_world_camera, view.depth.to_points().points))
         scene.add_point_cloud(
             "/points",
-            points,
+            points + shift,
             CLOUD_COLOR,
-            point_size=0.012,
+            point_size=CLOUD_SIZE,
             point_shape="circle",
             precision="float32",
             visible=bool(self._points.value),
+        )
+        x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
+        scene.add_camera_frustum(
+            "/camera",
+            self.laboratory.scene.workspace.fov_rad,
+            1.0,
+            scale=0.35,
+            color=(150, 160, 176),
+            image=depth_picture(view.depth),
+            format="png",
+            wxyz=(w, x, y, z),
+            position=tuple(self.stage.place(T_world_camera[:3, 3])),
         )
 
     def _colors(self, view: View, trial: Trial) -> list[np.ndarray] | None:

@@ -2,6 +2,7 @@
 
 import threading
 from pathlib import Path
+from typing import Any
 
 from mereo.frames import load_frame, shipped_frames
 from mereo.inspection import Inspection
@@ -10,7 +11,7 @@ from mereo.reconstruction import Frame, read_input
 from mereo.scene import load_scene
 from mereo.viewer.frame_page import FramePage
 from mereo.viewer.lab_page import LabPage
-from mereo.viewer.stage import import_viser, start_server
+from mereo.viewer.stage import import_viser, start_server, stop_server
 from mereo.weights import load_model, shipped_names
 
 PORT = 8080
@@ -64,8 +65,8 @@ def view_scene(name: str, weights: str | None, *, port: int = PORT) -> None:
     _serve(server, page)
 
 
-def _serve(server: object, page: LabPage | None = None) -> None:
-    print(f"open http://127.0.0.1:{server.get_port()} in a browser; Ctrl-C ends", flush=True)  # type: ignore[attr-defined]
+def _serve(server: Any, page: LabPage | None = None) -> None:
+    print(f"open http://127.0.0.1:{server.get_port()} in a browser; Ctrl-C ends", flush=True)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:
@@ -73,4 +74,4 @@ def _serve(server: object, page: LabPage | None = None) -> None:
     finally:
         if page is not None:
             page.close()
-        server.stop()  # type: ignore[attr-defined]
+        stop_server(server)

@@ -13,13 +13,13 @@ Moved = Callable[[Freedom, float], None]
 
 
 class FreedomSliders:
-    """One slider for each degree of freedom, in a folder for each group.
+    """One slider for each degree of freedom, in a folder for each group, all in ``folder``.
 
     Sliders that a new state still has stay as they are, also while they are being dragged; others come and go.
     """
 
-    def __init__(self, gui: Any, moved: Moved) -> None:
-        self._gui, self._moved = gui, moved
+    def __init__(self, gui: Any, folder: Any, moved: Moved) -> None:
+        self._gui, self._folder, self._moved = gui, folder, moved
         self._folders: dict[str, Any] = {}
         self._handles: dict[tuple[Key, int | None], Any] = {}
         self._freedoms: dict[tuple[Key, int | None], Freedom] = {}
@@ -43,17 +43,16 @@ class FreedomSliders:
         """Bounds may depend on other draws; values change when a state is refused or drawn anew."""
         handle, before = self._handles[place], self._freedoms[place]
         if (before.low, before.high) != (freedom.low, freedom.high):
-            handle.min, handle.max, handle.step = freedom.low, freedom.high, freedom.step
-        handle.value = freedom.value
+            handle.min, handle.max, handle.step = _range(freedom)
+        handle.value = _on_range(freedom)
 
     def _add(self, place: tuple[Key, int | None], freedom: Freedom) -> Any:
         if freedom.group not in self._folders:
-            self._folders[freedom.group] = self._gui.add_folder(freedom.group, expand_by_default=not self._folders)
+            with self._folder:
+                self._folders[freedom.group] = self._gui.add_folder(freedom.group, expand_by_default=not self._folders)
         with self._folders[freedom.group]:
             unit = f" ({freedom.unit.strip()})" if freedom.unit else ""
-            handle = self._gui.add_slider(
-                f"{freedom.name}{unit}", freedom.low, freedom.high, freedom.step, _on_range(freedom)
-            )
+            handle = self._gui.add_slider(f"{freedom.name}{unit}", *_range(freedom), _on_range(freedom))
         handle.on_update(lambda event: self._told(event, place))
         return handle
 
@@ -63,8 +62,27 @@ class FreedomSliders:
             self._moved(self._freedoms[place], float(self._handles[place].value))
 
 
+def _range(freedom: Freedom) -> tuple[float, float, float]:
+    """Ends and step of a slider, in numbers with few digits: a step of 0.01, 0.1, ... that divides it into 100 or more.
+
+    Ends move outward by less than a step; ``set_value`` keeps to the true ones.
+    """
+    if freedom.whole:
+        return freedom.low, freedom.high, 1.0
+    digits = _digits(freedom)
+    step = 10.0**-digits
+    low, high = np.floor(freedom.low / step + 1e-6) * step, np.ceil(freedom.high / step - 1e-6) * step
+    return round(float(low), digits), round(float(high), digits), step
+
+
+def _digits(freedom: Freedom) -> int:
+    return int(np.ceil(2 - np.log10(freedom.high - freedom.low) - 1e-9))
+
+
 def _on_range(freedom: Freedom) -> float:
-    return min(max(freedom.value, freedom.low), freedom.high)
+    low, high, _ = _range(freedom)
+    value = freedom.value if freedom.whole else round(freedom.value, _digits(freedom))
+    return min(max(value, low), high)
 
 
 class CameraSliders:

@@ -6,9 +6,10 @@ the input's unit, so that sizes of points, gizmos and clipping distances fit.
 
 import contextlib
 import io
+import logging
 import socket
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import trimesh
@@ -20,7 +21,16 @@ from mereo.mesh import Segment, SegmentedMesh
 BACKDROP = ((58, 65, 78), (22, 25, 32))
 """Top and bottom of the background, neutral and dark: the palette's yellow is hard to see on white."""
 
-CLOUD_COLOR = (255, 255, 255)
+ENVIRONMENT = 0.45
+"""Of viser's surrounding light; with all of it the palette's colours fade to white."""
+
+CLOUD_COLOR = (244, 246, 250)
+CLOUD_SIZE = 0.008
+FOV_RAD = float(np.deg2rad(40.0))
+"""Of the page's own camera."""
+
+FEW = 6
+"""More segments than this have their check boxes in a closed folder, or the panel would be all boxes."""
 
 
 def import_viser() -> Any:
@@ -28,9 +38,7 @@ def import_viser() -> Any:
     try:
         import viser
     except ImportError:
-        raise ImportError(
-            "viser is not installed; `mereo view` needs it: run pip install 'mereo[view]' (or pip install viser)"
-        ) from None
+        raise ImportError("viser is not installed; `mereo view` needs it: run pip install 'mereo[view]'") from None
     return viser
 
 
@@ -44,6 +52,8 @@ def start_server(port: int, title: str) -> Any:
         except OSError:
             raise OSError(f"port {port} is taken or not allowed; choose another one with --port") from None
         port = probe.getsockname()[1]
+    # browsers open connections ahead and drop them, which websockets reports with a traceback each
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()):  # its own banner
         server = viser.ViserServer(host="127.0.0.1", port=port, label=title, verbose=False)
     server.gui.configure_theme(
@@ -54,9 +64,17 @@ def start_server(port: int, title: str) -> Any:
     backdrop = np.array(BACKDROP[0]) * (1 - share) + np.array(BACKDROP[1]) * share
     server.scene.set_background_image(np.broadcast_to(backdrop, (256, 8, 3)).astype(np.uint8), format="png")
     server.scene.configure_default_lights(cast_shadow=False)
+    server.scene.configure_environment_map(environment_intensity=ENVIRONMENT)
     return server
 
 
+def stop_server(server: Any) -> None:
+    """Close all pages; without the line that viser prints."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+@runtime_checkable
 class Shown(Protocol):
     """Which segments are shown, and how opaque each is."""
 
@@ -86,15 +104,20 @@ class Stage:
     def back(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         return points / self.scale + self.center
 
-    def look_from(self, direction: Float[np.ndarray, "3"], distance: float = 3.6) -> None:
-        """Turn every open page, and those to come, to the object from this direction."""
-        position = tuple(distance * direction / np.linalg.norm(direction))
+    def look_from(
+        self, direction: Float[np.ndarray, "3"], bounds: Float[np.ndarray, "2 3"], room: float = 1.35
+    ) -> None:
+        """Turn every open page, and those to come, to what lies within ``bounds``, from this direction."""
+        low, high = self.place(bounds)
+        target = (low + high) / 2
+        distance = room * float(np.linalg.norm(high - low)) / 2 / np.sin(FOV_RAD / 2)
+        position = tuple(target + distance * direction / np.linalg.norm(direction))
         first = self.server.initial_camera
-        first.position, first.look_at, first.up = position, (0.0, 0.0, 0.0), tuple(self.up)
-        first.fov = float(np.deg2rad(40.0))
+        first.position, first.look_at, first.up = position, tuple(target), tuple(self.up)
+        first.fov = FOV_RAD
         for client in self.server.get_clients().values():
             with client.atomic():
-                client.camera.position, client.camera.look_at = position, (0.0, 0.0, 0.0)
+                client.camera.position, client.camera.look_at = position, tuple(target)
                 client.camera.up_direction = tuple(self.up)
 
 
@@ -162,7 +185,7 @@ class SegmentControls:
     """A check box and an opacity slider for each segment."""
 
     def __init__(self, gui: Any, mesh: SegmentedMesh, changed: Any) -> None:
-        with gui.add_folder("Segments"):
+        with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= FEW):
             self._boxes = [gui.add_checkbox(segment.name, True) for segment in mesh.segments]
         with gui.add_folder("Opacity", expand_by_default=False):
             self._all = gui.add_slider("all", 0.0, 1.0, 0.05, 1.0)

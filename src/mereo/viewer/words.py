@@ -90,7 +90,7 @@ def answer(found: Answer, names: Sequence[str], colors: Sequence[Color], place: 
     distance, direction = float(found.distance[0]), found.direction[0]
     where = "inside" if distance < 0 else "outside"
     said = "distance not trained" if np.isnan(distance) else f"{abs(distance):.3g}{unit} {where} the nearest surface"
-    toward = "" if np.isnan(direction).any() else f"towards {_vector(direction)}"
+    toward = "" if np.isnan(direction).any() else f"towards {_vector(direction.tolist())}"
     return (
         f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">at {_vector(place)}{unit}</span></div>'
         f'{bars(rows)}<div style="{BOX}">{escape(said)}<br><span style="{SOFT}">{toward}</span></div>'
