@@ -35,9 +35,8 @@ HISTORY = 60
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What the page shows: a state, how it is seen, and what has been made of that so far."""
+    """What the page shows: a state as it is seen, and what has been made of that so far."""
 
-    played: Played
     view: View
     trial: Trial | None = None
 
@@ -52,6 +51,7 @@ class LabPage:
         self._wishes: dict[tuple[Any, int | None], tuple[Freedom, float]] = {}
         self._new_seed: int | None = seed
         self._scores: list[tuple[float, float]] = []
+        self.played: Played | None = None
         self.moment: Moment | None = None
         rest = laboratory.scene.rest
         self.stage = Stage(server, rest.bounds, np.asarray(laboratory.scene.workspace.axis, dtype=float))
@@ -133,38 +133,37 @@ class LabPage:
             self._new_seed = int(self._seeds.integers(2**31))
         self.worker.submit(None)
 
-    def _fulfil(self) -> Played:
-        """The state that is wished for. A value that the scene refuses leaves the state before it."""
+    def _fulfil(self) -> tuple[Played, Refused | None]:
+        """The state that is wished for. Values that the scene refuses are left out, and the last of them is told."""
         with self._wishing:
             wishes, seed = list(self._wishes.values()), self._new_seed
             self._wishes, self._new_seed = {}, None
-        scene = self.laboratory.scene
-        if seed is not None or self.moment is None:
-            return random_state(scene, seed or 0)
-        played = self.moment.played
+        scene, refusal = self.laboratory.scene, None
+        if seed is not None or self.played is None:
+            return random_state(scene, seed or 0), None
+        played = self.played
         for freedom, value in wishes:
-            # a slider of a part that has just gone has nothing left to move
-            if freedom.key in played.keys:
+            if freedom.key not in played.keys:
+                continue  # a slider of a part that has just gone has nothing left to move
+            try:
                 played = set_value(scene, played, freedom, value)
-        return played
+            except Refused as error:
+                refusal = error
+        return played, refusal
 
     # --- the worker's thread ------------------------------------------------------------------------------------------
 
     def _quick(self, _: None) -> None:
-        try:
-            played = self._fulfil()
-        except Refused:
-            if self.moment is not None:
-                self._sliders.show(freedoms(self.moment.played))
-            raise
-        view = self.laboratory.look(played, self._camera.place())
-        is_first = self.moment is None
-        self.moment = Moment(played, view)
+        self.played, refusal = self._fulfil()
+        self._sliders.show(freedoms(self.played))
+        view, is_first = self.laboratory.look(self.played, self._camera.place()), self.moment is None
+        self.moment = Moment(view)
         if is_first:
             self._look()
-        self._sliders.show(freedoms(played))
         self._picture.image = depth_picture(view.depth, 3)
         self._rebuild(*QUICK)
+        if refusal is not None:
+            raise refusal
 
     def _fine(self, _: None) -> None:
         if self.laboratory.model is not None:
