@@ -65,11 +65,9 @@ class Page:
         return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
 
     def still(self) -> None:
-        """No transitions: a page that fades in takes long where every frame is drawn in software."""
-        self.evaluate(
-            "document.head.insertAdjacentHTML('beforeend',"
-            "'<style>* { transition: none !important; animation: none !important }</style>')"
-        )
+        """No transitions: viser fades a scene in, which takes long where frames are drawn in software."""
+        style = "* { transition: none !important; animation: none !important } canvas { opacity: 1 !important }"
+        self.evaluate(f"document.head.insertAdjacentHTML('beforeend', '<style>{style}</style>')")
 
     def text(self) -> str:
         return str(self.evaluate("document.body.innerText"))
