@@ -192,7 +192,12 @@ def test_weights_of_another_object() -> None:
 def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_model(untrained(load_scene("rope").rest.names), tmp_path / "w.safetensors")
     result = evaluate_weights(tmp_path / "w.safetensors", tmp_path / "out", examples=2, cells=12)
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["errors.png", "metrics.json", "table.md"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "errors.png",
+        "metrics.json",
+        "report.html",
+        "table.md",
+    ]
     stored = json.loads((tmp_path / "out/metrics.json").read_text())
     assert stored["iou"] == pytest.approx(result.scores.iou) and stored["seed"] == 1_000_000
     assert stored["confusion"] == result.confusion.tolist()

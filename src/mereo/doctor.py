@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import torch
 
 PURPOSES: dict[str, str] = {
+    "view": "the pages of `mereo view`",
     "track": "training curves in TensorBoard",
     "vtk": "smooth surfaces from label volumes",
     "onnx": "networks for other runtimes",

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 from rich.console import Console
 from rich.progress import track
 
 from mereo.camera import PointCloud
 from mereo.config import TEST_SEED_START, GenerateConfig
 from mereo.error_pictures import ErrorCase, error_picture
+from mereo.evaluation_report import write_evaluation_report
 from mereo.frames import TruthGrid, truth_grid
 from mereo.mesh import Color, SegmentedMesh
 from mereo.metrics import Scores, confusion_matrix, intersection_over_union
@@ -213,7 +214,7 @@ def evaluate_weights(
     cells: int = CELLS,
     settings: GenerateConfig | None = None,
 ) -> Evaluation:
-    """``mereo evaluate``: write metrics.json, table.md and errors.png into a new directory, and print the table."""
+    """``mereo evaluate``: write metrics.json, table.md, errors.png, report.html; print the table."""
     with new_directory(output) as directory:
         model = load_model(weights)
         settings = settings or GenerateConfig()
@@ -233,10 +234,12 @@ def evaluate_weights(
 
 
 def write_evaluation(directory: Path, evaluation: Evaluation, facts: dict[str, Any]) -> None:
-    """metrics.json, table.md and errors.png; ``facts`` come first in the JSON."""
-    write_json(directory / "metrics.json", metrics(evaluation, facts))
+    """metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON."""
+    found = metrics(evaluation, facts)
+    write_json(directory / "metrics.json", found)
     (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
     error_picture(directory / "errors.png", evaluation.cases)
+    write_evaluation_report(directory / "report.html", found, evaluation.cases[0].colors, directory / "errors.png")
 
 
 def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
@@ -249,15 +252,11 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "confusion matrix over the set; miou is the mean over the segments without empty space",
         "iou": scores.iou,
         "miou": scores.miou,
-        "per_segment": dict(zip(evaluation.names, _floats(scores.per_segment), strict=True)),
+        "per_segment": dict(zip(evaluation.names, scores.per_segment.tolist(), strict=True)),
         "example_mean": {"iou": iou, "miou": miou},
         "per_example": {name: {"iou": each.iou, "miou": each.miou} for name, each in evaluation.examples.items()},
         "confusion": evaluation.confusion,
     }
-
-
-def _floats(values: Float[np.ndarray, " n"]) -> list[float]:
-    return [float(value) for value in values]
 
 
 def markdown_table(evaluation: Evaluation) -> str:

@@ -47,11 +47,17 @@ class Workspace:
         cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, np.pi)), 1.0)
         azimuth = rng.uniform(0.0, 2 * np.pi)
         distance = rng.uniform(*self.distance)
-        sine = np.sqrt(1.0 - cosine**2)
-        local = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
-        to_camera = _basis(np.asarray(self.axis, dtype=float)) @ local
         roll = rng.uniform(0.0, 2 * np.pi) if self.any_roll else 0.0
-        return look_at(target + distance * to_camera, target, np.asarray(self.axis, dtype=float), roll)
+        return self.pose(target, cosine, azimuth, distance, roll)
+
+    def pose(
+        self, target: Float[np.ndarray, "3"], cosine: float, azimuth_rad: float, distance: float, roll_rad: float = 0.0
+    ) -> Float[np.ndarray, "4 4"]:
+        """``T_world_camera`` of a camera aimed at ``target``, by its azimuth and the cosine of its tilt."""
+        sine = np.sqrt(1.0 - cosine**2)
+        local = np.array([sine * np.cos(azimuth_rad), sine * np.sin(azimuth_rad), cosine])
+        to_camera = _basis(np.asarray(self.axis, dtype=float)) @ local
+        return look_at(target + distance * to_camera, target, np.asarray(self.axis, dtype=float), roll_rad)
 
 
 def _basis(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

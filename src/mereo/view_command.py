@@ -1,0 +1,56 @@
+"""The command ``mereo view``. See ``commands``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a frame and its reconstruction in a browser, or move a scene by hand (--scene): needs the extra `view`.
+
+    Attributes:
+        input: a point cloud or depth image, as for `mereo reconstruct`; without it (and --scene) a shipped frame.
+        weights: a shipped name or a file; by default those that are shipped for the frame or the scene.
+        scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
+        port: where the page is, on this machine only (127.0.0.1); 0 takes any that is free.
+        resolution: grid cells along the longest side.
+        intrinsics: the depth camera, JSON or YAML.
+        depth_scale: pixel value of one metre.
+        mask: image that is not 0 on the object.
+        frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
+        drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
+    """
+
+    input: Positional[Path | None] = None
+    weights: str | None = None
+    scene: str | None = None
+    port: int = 8080
+    resolution: int = 128
+    intrinsics: Path | None = None
+    depth_scale: float = 1000.0
+    mask: Path | None = None
+    frame: Literal["camera", "scanner"] = "camera"
+    drop_invalid: bool = False
+
+    def run(self) -> None:
+        from mereo.viewer.serve import view_frame, view_scene
+
+        if self.scene is not None:
+            if self.input is not None:
+                raise ValueError(f"both {self.input} and --scene {self.scene} are given; one can be shown: drop one")
+            view_scene(self.scene, self.weights, port=self.port)
+            return
+        view_frame(
+            self.input,
+            self.weights,
+            port=self.port,
+            resolution=self.resolution,
+            intrinsics=self.intrinsics,
+            depth_scale=self.depth_scale,
+            mask=self.mask,
+            frame=self.frame,
+            drop_invalid=self.drop_invalid,
+        )

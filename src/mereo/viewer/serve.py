@@ -1,0 +1,77 @@
+"""``mereo view``: load what is to be shown, start the page, keep it until Ctrl-C."""
+
+import threading
+from pathlib import Path
+from typing import Any
+
+from mereo.frames import load_frame, shipped_frames
+from mereo.inspection import Inspection
+from mereo.laboratory import Laboratory
+from mereo.reconstruction import Frame, read_input
+from mereo.scene import load_scene
+from mereo.viewer.frame_page import FramePage
+from mereo.viewer.lab_page import LabPage
+from mereo.viewer.stage import import_viser, start_server, stop_server
+from mereo.weights import load_model, shipped_names
+
+PORT = 8080
+
+
+def view_frame(
+    input: Path | None,
+    weights: str | None,
+    *,
+    port: int = PORT,
+    resolution: int = 128,
+    intrinsics: Path | None = None,
+    depth_scale: float = 1000.0,
+    mask: Path | None = None,
+    frame: Frame = "camera",
+    drop_invalid: bool = False,
+) -> None:
+    """Show a frame and its reconstruction; without ``input`` the shipped frame of the weights."""
+    import_viser()
+    if input is None:
+        name = weights or shipped_frames()[0]
+        if name not in shipped_frames():
+            raise ValueError(
+                f"there is no frame to show and none is shipped for {name!r}; name a depth image or a point cloud, or "
+                f"take the weights of a shipped frame: {', '.join(shipped_frames())}"
+            )
+        cloud, title, weights = load_frame(name).depth.to_points(), f"{name}, shipped frame", name
+    elif weights is None:
+        raise ValueError(
+            f"{input} is given without weights; the model of its object is needed: give --weights, a file or one of "
+            f"{', '.join(shipped_names())}"
+        )
+    else:
+        cloud, title = read_input(input, intrinsics, depth_scale, mask, frame, drop_invalid), input.name
+    inspection = Inspection.of(cloud, load_model(weights), resolution, frame)
+    unit = "m" if input is not None and input.suffix.lower() == ".png" else ""
+    server = start_server(port, "mereo")
+    FramePage(server, inspection, title, f"{len(cloud):,} points · weights {weights}", unit)
+    _serve(server)
+
+
+def view_scene(name: str, weights: str | None, *, port: int = PORT) -> None:
+    """The laboratory of a scene; without ``weights`` the shipped ones, where there are any."""
+    import_viser()
+    scene = load_scene(name)
+    known = weights or (scene.name if scene.name in shipped_names() else None)
+    laboratory = Laboratory(scene, None if known is None else load_model(known))
+    facts = f"weights {known}" if known else "no weights: states and depth images only"
+    server = start_server(port, "mereo")
+    page = LabPage(server, laboratory, f"Laboratory: {scene.name}", facts)
+    _serve(server, page)
+
+
+def _serve(server: Any, page: LabPage | None = None) -> None:
+    print(f"open http://127.0.0.1:{server.get_port()} in a browser; Ctrl-C ends", flush=True)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("closed")
+    finally:
+        if page is not None:
+            page.close()
+        stop_server(server)

@@ -1,0 +1,98 @@
+"""What surfaces are coloured by, on shapes where the right numbers are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shapes import ball
+
+from mereo.camera import Camera, DepthImage
+from mereo.coloring import (
+    Scale,
+    confidence,
+    distance_scale,
+    error_scale,
+    observed_distance,
+    surface_error,
+    vertex_normals,
+)
+from mereo.inspection import first_hit
+from mereo.laboratory import FAR, NEAR, NOTHING, depth_picture
+from mereo.mesh import SegmentedMesh
+from mereo.model import Answer
+from mereo.solid import Solids
+
+GREYS = Scale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
+
+
+def two_balls(radius: float = 2.0) -> SegmentedMesh:
+    return SegmentedMesh((ball((0, 0, 0), radius, "one", 0, level=3), ball((6, 0, 0), radius, "two", 1, level=3)))
+
+
+def test_a_scale_is_linear_between_its_stops_and_constant_beyond() -> None:
+    values = np.array([-5.0, 1.0, 1.5, 2.0, 2.5, 3.0, 9.0, np.nan])
+    assert GREYS.colors(values)[:, 0].tolist() == [0, 0, 50, 100, 175, 250, 250, 128]
+
+
+def test_confidence_is_the_drop_of_probability_across_the_surface() -> None:
+    """A model that is certain of one ball's border, and says one half everywhere near the other's."""
+
+    def ask(points: np.ndarray) -> Answer:
+        inside = (np.linalg.norm(points, axis=1) < 2.0).astype(float)
+        unsure = 0.5 * (np.linalg.norm(points - [6, 0, 0], axis=1) < 3.0)
+        probability = np.stack([1 - inside - unsure, inside, unsure], axis=1)
+        nothing = np.zeros(len(points))
+        return Answer(probability.argmax(axis=1).astype(np.uint8), probability, nothing, np.zeros_like(points))
+
+    sure, guessed = confidence(two_balls(), ask)
+    np.testing.assert_array_equal(sure, 1.0)
+    np.testing.assert_array_equal(guessed, 0.0)
+
+
+def test_segments_that_were_not_found_have_no_colours() -> None:
+    mesh = two_balls()
+    lost = replace(mesh.segments[1], vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), dtype=np.int64))
+    mesh = SegmentedMesh((mesh.segments[0], lost))
+    assert [len(v) for v in observed_distance(mesh, np.zeros((1, 3)))] == [len(mesh.segments[0].vertices), 0]
+    assert len(surface_error(mesh, Solids(two_balls()))[1]) == 0
+    assert distance_scale([np.zeros(0)], "").high > 0
+
+
+def test_distance_to_what_was_observed_tells_seen_from_guessed() -> None:
+    mesh = two_balls()
+    one, two = observed_distance(mesh, mesh.segments[0].vertices)
+    np.testing.assert_array_equal(one, 0.0)
+    assert two.min() == pytest.approx(2.0, abs=0.05)
+    assert two.max() == pytest.approx(6.0, abs=0.05)
+    scale = distance_scale([one, two], " mm")
+    assert 0 < scale.high <= 6 and scale.words[1].endswith(" mm, guessed")
+
+
+@pytest.mark.parametrize("radius, wanted", [(2.5, 0.5), (1.6, -0.4)])
+def test_error_is_positive_outside_of_the_truth(radius: float, wanted: float) -> None:
+    for values in surface_error(two_balls(radius), Solids(two_balls())):
+        np.testing.assert_allclose(values, wanted, atol=0.03)
+    scale = error_scale(two_balls(), "")
+    assert (scale.low, scale.high) == (-0.5, 0.5)
+    blue, orange = scale.colors(np.array([0.5, -0.5])).tolist()
+    assert blue[2] > blue[0] and orange[0] > orange[2]
+
+
+def test_vertex_normals_of_a_ball_point_away_from_its_middle() -> None:
+    segment = ball((1, 2, 3), 2.0, "one", 0, level=3)
+    np.testing.assert_allclose(vertex_normals(segment), (segment.vertices - [1, 2, 3]) / 2.0, atol=0.02)
+
+
+def test_a_ray_meets_the_nearest_surface_that_is_shown() -> None:
+    mesh, origin, along = two_balls(), np.array([-9.0, 0.01, 0.02]), np.array([2.0, 0.0, 0.0])
+    np.testing.assert_allclose(first_hit(mesh, origin, along, [True, True]), [-2.0, 0.01, 0.02], atol=0.05)
+    np.testing.assert_allclose(first_hit(mesh, origin, along, [False, True]), [4.0, 0.01, 0.02], atol=0.05)
+    assert first_hit(mesh, origin, along, [False, False]) is None
+    assert first_hit(mesh, origin, -along, [True, True]) is None
+
+
+def test_a_depth_picture_shows_near_light_and_nothing_dark() -> None:
+    camera = Camera.from_fov(3, 1, 1.0)
+    picture = depth_picture(DepthImage(np.array([[0.0, 2.0, 5.0]]), camera), factor=2)
+    assert picture.shape == (2, 6, 3)
+    assert [tuple(p) for p in picture[0, ::2].tolist()] == [NOTHING, NEAR, FAR]

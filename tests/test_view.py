@@ -1,0 +1,174 @@
+"""`mereo view`: its pages in a real browser, and its command."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import BROWSER, Page, pixels_of, until
+from PIL import Image
+from toy_scene import rest_mesh, toy_scene
+
+from mereo.camera import PointCloud
+from mereo.config import PRESETS
+from mereo.extraction import LabelGrid
+from mereo.inspection import Inspection
+from mereo.laboratory import Laboratory
+from mereo.model import Answer, Model, Network
+from mereo.reconstruction import Reconstruction
+from mereo.viewer import stage, words
+from mereo.viewer.frame_page import FramePage
+from mereo.viewer.lab_page import LabPage
+
+needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome in PATH")
+
+
+class Told(Inspection):
+    """An inspection whose answers are a closed form: the label is the box that holds a point, or nothing."""
+
+    def ask(self, points: np.ndarray) -> Answer:
+        label = np.where(np.abs(points[:, 1]) < 6, 1 + np.clip((points[:, 0] + 18) // 12, 0, 2), 0).astype(np.uint8)
+        toward = np.tile([0.0, 0.0, -1.0], (len(points), 1))
+        return Answer(label, np.eye(5)[label], points[:, 2] - 150.0, toward)
+
+
+def toy_inspection() -> Told:
+    """The toy, 150 units in front of a camera."""
+    T_camera_rest = np.eye(4)
+    T_camera_rest[2, 3] = 150.0
+    mesh = rest_mesh().transformed(T_camera_rest)
+    grid = LabelGrid(np.zeros((2, 2, 2), dtype=np.uint8), np.zeros(3), np.ones(3), mesh.names)
+    points = np.concatenate([segment.vertices[::2] for segment in mesh.segments])
+    cloud = PointCloud(points[points[:, 2] <= 162.0])
+    model = Model(Network(PRESETS["tiny"].network, 4).eval(), mesh.names, mesh.colors)
+    return Told(cloud, Reconstruction(mesh, grid, (), {}, 0, False), model, model.encode(cloud), np.eye(4))
+
+
+@pytest.fixture
+def server() -> Iterator[object]:
+    started = stage.start_server(0, "mereo")
+    yield started
+    started.stop()
+
+
+@needs_viser
+@needs_browser
+def test_the_page_of_a_frame_shows_every_segment_and_answers(tmp_path: Path, server: object) -> None:
+    page = FramePage(server, toy_inspection(), "toy <frame>", "closed form", "mm")
+    with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (900, 640)) as browser:  # type: ignore[attr-defined]
+        until(lambda: "toy <frame>" in browser.text())
+        browser.still()
+        assert {"box_0", "box_1", "box_2", "ball", "Probe"} <= set(browser.text().split("\n"))
+
+        def all_shown() -> bool:
+            shown = browser.screenshot()[:, :560]
+            Image.fromarray(shown).save(tmp_path / "page.png")
+            return all(pixels_of(shown, segment.color) > 150 for segment in page.mesh.segments)
+
+        until(all_shown)
+        # the middle of the stage lies in the middle box: a click there asks the model
+        browser.click(280, 320)
+        until(lambda: "the nearest surface" in browser.text())
+        assert re.search(r"box_\d at -?[\d.]+", browser.text())
+        page.coloring.value = "distance"
+        until(lambda: "distance to the nearest observed point" in browser.text())
+
+
+@pytest.mark.slow
+@needs_viser
+@needs_browser
+def test_the_laboratory_follows_its_sliders_in_a_browser(tmp_path: Path, server: object) -> None:
+    page = LabPage(server, Laboratory(toy_scene(), None), "Laboratory: toy", "no weights")
+    with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (1200, 760)) as browser:  # type: ignore[attr-defined]
+        until(lambda: "points seen" in browser.text())
+        browser.still()
+        assert {"Camera", "Deformation", "tilt (°)", "lift", "Random state"} <= set(browser.text().split("\n"))
+        before, picture = page.moment, page._picture.image.copy()
+        assert before is not None
+        browser.evaluate("[...document.querySelectorAll('button')].find(b => b.innerText == 'Random state').click()")
+        until(lambda: page.moment is not before and (page._picture.image != picture).any())
+
+        def shown() -> bool:
+            return all(pixels_of(browser.screenshot(), segment.color) > 150 for segment in rest_mesh().segments)
+
+        until(shown)
+    page.close()
+
+
+@needs_viser
+def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object) -> None:
+    port = server.get_port()  # type: ignore[attr-defined]
+    assert server.get_host() == "127.0.0.1"  # type: ignore[attr-defined]
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as answer:
+        assert answer.status == 200
+    with pytest.raises(OSError, match=f"port {port} is taken or not allowed; choose another one with --port"):
+        stage.start_server(port, "mereo")
+
+
+@needs_viser
+@pytest.mark.slow
+def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mereo", "view", "--scene", "robot", "--port", "0"]
+    variables = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=variables) as process:
+        assert process.stdout and process.stderr
+        line = process.stdout.readline()
+        address = re.search(r"open (http://127\.0\.0\.1:\d+) in a browser", line)
+        assert address, line
+        with urllib.request.urlopen(address[1], timeout=60) as answer:
+            assert b"<html" in answer.read()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0
+        assert process.stdout.read() == "closed\n"
+        assert process.stderr.read() == ""
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (("--weights", "lizard"), "none is shipped for 'lizard'; name a depth image or a point cloud"),
+        (("cloud.ply",), "cloud.ply is given without weights; the model of its object is needed: give --weights"),
+        (("cloud.ply", "--scene", "rope"), "both cloud.ply and --scene rope are given; one can be shown: drop one"),
+    ],
+)
+def test_what_cannot_be_shown_is_said_in_one_sentence(
+    arguments: tuple[str, ...], sentence: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mereo.__main__ import main
+
+    monkeypatch.setattr("mereo.viewer.serve.import_viser", lambda: None)
+    assert main(["view", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("mereo: error: ") and error.count("\n") == 1
+    assert sentence in error
+
+
+def test_without_viser_one_sentence_names_the_extra(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mereo.__main__ import main
+
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view"]) == 2
+    assert "`mereo view` needs it: run pip install 'mereo[view]'" in capsys.readouterr().err
+
+
+def test_names_cannot_break_the_panels() -> None:
+    name = "<script>x</script>"
+    answer = Answer(
+        np.array([1], dtype=np.uint8), np.array([[0.25, 0.75]]), np.array([-2.0]), np.array([[0.0, 1.0, 0.0]])
+    )
+    text = words.answer(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), (1.0, 2.0, 3.0), " mm")
+    shown = re.sub(r"<[^>]+>", " ", text)
+    assert "<script" not in text + words.chips((name,), ((1, 2, 3),)) + words.heading(name, name) + words.message(name)
+    for told in ("0.75", "2 mm inside the nearest surface", "towards 0, 1, 0", "at 1, 2, 3 mm"):
+        assert told in shown
+    assert shown.index("0.75") < shown.index("0.25")  # the likeliest first
