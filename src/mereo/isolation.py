@@ -17,22 +17,24 @@ from scipy.spatial import cKDTree
 
 from mereo.camera import DepthImage, PointCloud
 from mereo.config import MIN_POINTS
-from mereo.input_config import IsolationConfig
+from mereo.input_config import Frame, IsolationConfig
 from mereo.plane import largest_plane
 from mereo.thinning import MAX_POINTS, spacing, thin_to_grid
 
 PLANE_SPACINGS = 3.0
-"""Half the thickness of a plane: the noise of depth cameras is a few pixels wide, and grows with distance as they do."""
+"""Half the thickness of a plane in the middle of the cloud; the noise of depth cameras is a few pixels wide."""
 
 PLANE_SHARE = 0.1
 """The largest plane must hold this share of the points, or there is none."""
 
-OUTLIER_NEIGHBORS, OUTLIER_STD = 16, 2.0
+OUTLIER_NEIGHBORS, OUTLIER_STD = 16, 6.0
 """A point is an outlier where the mean distance to this many neighbours is beyond the mean over the cloud plus this
-many standard deviations (Rusu et al., RAS 2008; PCL's StatisticalOutlierRemoval)."""
+many standard deviations (Rusu et al., RAS 2008; PCL's StatisticalOutlierRemoval). The 1 or 2 that are common elsewhere
+take surfaces that are seen edge-on, and with them the outline that the network's frame is made from."""
 
-CLUSTER_GAP = 4.0
-"""Points less than this many spacings apart belong together; a surface seen at 75 degrees has neighbours that far."""
+CLUSTER_GAP = 10.0
+"""Points less than this many spacings apart belong together. Neighbours on a surface seen at 84 degrees are that far
+apart; with 6, the network's input loses ears."""
 
 CLUSTER_NEIGHBORS = 12
 """Edges looked at per point; a cluster of at least that density is held together by them."""
@@ -65,7 +67,11 @@ Step = Callable[[Float[np.ndarray, "_ 3"]], Keep]
 
 
 def isolate(
-    seen: PointCloud | DepthImage, config: IsolationConfig, unit_m: float = 1.0, rng: np.random.Generator | None = None
+    seen: PointCloud | DepthImage,
+    config: IsolationConfig,
+    unit_m: float = 1.0,
+    frame: Frame = "camera",
+    rng: np.random.Generator | None = None,
 ) -> tuple[PointCloud, tuple[IsolationStep, ...]]:
     """The points of the object, and what each step left out.
 
@@ -74,13 +80,14 @@ def isolate(
         config: the steps. Before one that compares neighbours, a cloud of more than ``MAX_POINTS`` is thinned evenly
             in space.
         unit_m: metres per unit of ``seen``.
+        frame: its axes. In a camera's the noise is taken to grow with distance squared, as that of depth cameras does.
         rng: draws the planes that are tried; by default always the same ones.
 
     Raises ``ValueError`` where fewer than ``MIN_POINTS`` points are left, naming the step and its cure.
     """
     cloud = seen.to_points() if isinstance(seen, DepthImage) else seen
     points, done = cloud.points, list[IsolationStep]()
-    for name, step in _steps(config, unit_m, np.random.default_rng(0) if rng is None else rng):
+    for name, step in _steps(config, unit_m, frame, np.random.default_rng(0) if rng is None else rng):
         keep, detail = step(points)
         left = int(keep.sum())
         if left < MIN_POINTS:
@@ -102,7 +109,9 @@ CURES = {
 }
 
 
-def _steps(config: IsolationConfig, unit_m: float, rng: np.random.Generator) -> Iterator[tuple[str, Step]]:
+def _steps(
+    config: IsolationConfig, unit_m: float, frame: Frame, rng: np.random.Generator
+) -> Iterator[tuple[str, Step]]:
     """The steps that are on, in their order: what is cheap and sure comes first."""
     if config.depth_range is not None:
         near, far = (limit / unit_m for limit in config.depth_range)
@@ -111,7 +120,7 @@ def _steps(config: IsolationConfig, unit_m: float, rng: np.random.Generator) -> 
         low, high = np.array(config.box).reshape(2, 3) / unit_m
         yield "box", lambda points: (((points >= low) & (points <= high)).all(axis=1), "")
     if config.remove_plane:
-        yield "plane", lambda points: _off_plane(points, unit_m, rng)
+        yield "plane", lambda points: _off_plane(points, unit_m, frame, rng)
     if config.remove_outliers or config.largest_cluster:
         yield "thinning", _thinned
     if config.remove_outliers:
@@ -123,8 +132,10 @@ def _steps(config: IsolationConfig, unit_m: float, rng: np.random.Generator) -> 
 # --- steps -----------------------------------------------------------------------------------------------------------
 
 
-def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, rng: np.random.Generator) -> Keep:
-    tolerance = PLANE_SPACINGS * spacing(points)
+def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, frame: Frame, rng: np.random.Generator) -> Keep:
+    tolerance = np.full(len(points), PLANE_SPACINGS * spacing(points))
+    if frame == "camera":
+        tolerance *= np.maximum(points[:, 2] / np.median(points[:, 2]), 1.0) ** 2
     plane = largest_plane(points, tolerance, rng)
     off = np.ones(len(points), dtype=bool) if plane is None else plane.distance(points) > tolerance
     share = 1.0 - off.mean()
@@ -134,7 +145,7 @@ def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, rng: np.random.G
             "or more: leave out --remove-plane, or crop less before it"
         )
     normal = " ".join(f"{value:.2f}" for value in plane.normal)
-    return off, f"the plane with normal {normal}, {2e3 * tolerance * unit_m:.2g} mm thick"
+    return off, f"the plane with normal {normal}, {2e3 * tolerance.min() * unit_m:.2g} mm thick"
 
 
 def _thinned(points: Float[np.ndarray, "n 3"]) -> Keep:

@@ -105,7 +105,7 @@ def read_observation(
             f"{path} is in a scanner's frame, in which depth is not known: leave out --depth-range and crop with --box"
         )
     whole = len(cloud), _depths_m(cloud, unit_m)
-    kept, steps = isolate(cloud, isolation, unit_m)
+    kept, steps = isolate(cloud, isolation, unit_m, reading.frame)
     return Observation(source, kept, unit_m, reading.frame, whole, steps)
 
 
@@ -124,8 +124,8 @@ def size_warning(observation: Observation, provenance: Mapping[str, object]) -> 
         return None
     return (
         f"the visible part is {longest:.3g} m long, but {least:.3g} to {greatest:.3g} m in training: other things are "
-        "in the cloud (crop with --box or --depth-range), or its unit is wrong (--unit-m 0.001 for clouds in millimetres, --depth-scale "
-        "for images); results are in the cloud's unit all the same"
+        "in the cloud (crop with --box or --depth-range), or its unit is wrong (--unit-m 0.001 for clouds in "
+        "millimetres, --depth-scale for images); results are in the cloud's unit all the same"
     )
 
 
