@@ -3,9 +3,9 @@
     python examples/isolate_object.py
     python examples/isolate_object.py --input depth.png --intrinsics camera.json --depth-range 0.4 1.0 --remove-plane
 
-Without an input it takes a real scan of the Stanford bunny, puts it on a table before a wall with points floating about,
-and scores the reconstruction against the truth: the scan alone, crowded, and isolated again. With one it reads your
-file with the options of `mereo reconstruct` and writes pictures of what was there and of what is kept.
+Without an input it takes a real scan of the Stanford bunny, puts it on a table before a wall with points floating
+about, and scores the reconstruction against the truth: the scan alone, crowded, and isolated again. With one it reads
+your file with the options of `mereo reconstruct` and writes pictures of what was there and of what is kept.
 """
 
 from dataclasses import replace
@@ -55,7 +55,7 @@ def crowded_bunny(output: Path) -> None:
     scan, truth, _ = scan_in_camera(SCAN)
     crowded = PointCloud(crowd(scan.points, np.random.default_rng(0)))
     near, far = scan.points[:, 2].min() - 0.05, scan.points[:, 2].max() + 0.05
-    config = IsolationConfig(depth_range=(near, far), remove_plane=True, largest_cluster=True)
+    config = IsolationConfig(depth_range=(near, far), remove_plane=True, largest_cluster=True, cluster_gap=0.02)
     isolated, steps = isolate(crowded, config)
     for step in steps:
         print(f"  {step}")
@@ -81,8 +81,8 @@ def draw(path: Path, clouds: dict[str, PointCloud]) -> None:
 
 def main(
     input: Path | None = None,
-    reading: Annotated[InputConfig, tyro.conf.arg(name="")] = InputConfig(),
-    isolation: Annotated[IsolationConfig, tyro.conf.arg(name="")] = IsolationConfig(),
+    reading: Annotated[InputConfig, tyro.conf.arg(name="")] = InputConfig(),  # noqa: B008 (frozen)
+    isolation: Annotated[IsolationConfig, tyro.conf.arg(name="")] = IsolationConfig(),  # noqa: B008
     output: Path = Path("out/isolated.png"),
 ) -> None:
     if input is None:

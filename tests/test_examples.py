@@ -10,6 +10,7 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 EXPECTED = {
+    "isolate_object.py": "isolated",
     "query_points.py": "to the nearest surface",
     "reconstruct_cloud.py": "report.html",
     "sampling_2d.py": "",

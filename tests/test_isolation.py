@@ -89,9 +89,8 @@ def test_far_planes_are_as_rough_as_depth_cameras_make_them() -> None:
 
 
 def test_a_cloud_without_a_plane_is_said_so() -> None:
-    ball = np.random.default_rng(0).normal(size=(4000, 3))
-    with pytest.raises(ValueError, match=r"the largest plane holds \d% of the 4000 points.*leave out --remove-plane"):
-        isolate(PointCloud(ball), IsolationConfig(remove_plane=True))
+    with pytest.raises(ValueError, match=r"the largest plane holds \d% of the 20000 points.*leave out --remove-plane"):
+        isolate(PointCloud(half_ball(20000)), IsolationConfig(remove_plane=True))
 
 
 def test_outliers_go_and_the_object_stays() -> None:
@@ -106,10 +105,21 @@ def test_the_largest_cluster_is_kept_whole() -> None:
     assert set(map(tuple, BALL)) <= set(map(tuple, left)) and len(left) <= len(BALL) + 5
 
 
-def test_clusters_are_single_linkage() -> None:
-    points = np.array([0.0, 0.9, 1.8, 3.0, 3.5])[:, None] * [1.0, 0.0, 0.0]
-    assert clusters(points, 1.0).tolist() == [0, 0, 0, 1, 1]
-    assert len(set(clusters(points, 1.3).tolist())) == 1
+def test_clusters_follow_neighbours_not_distance() -> None:
+    """Two dense sheets 5 spacings apart are two; a sheet whose rows are 5 spacings apart is one."""
+    dense = np.stack(np.meshgrid(np.arange(60.0), np.arange(50.0), [0.0]), axis=-1).reshape(-1, 3)
+    sheets = np.concatenate([dense[:1500] + np.array([0, 0, 5.0]), dense])
+    np.testing.assert_array_equal(clusters(sheets), np.repeat([1, 0], [1500, 3000]))
+    assert (clusters(dense * [1.0, 5.0, 1.0]) == 0).all()
+    assert (clusters(dense * [1.0, 10.1, 1.0]) > 0).any(), "rows farther apart than the gap"
+
+
+def test_groups_within_the_gap_are_kept_with_those_behind_them() -> None:
+    row = [half_ball(n, (x, 0.0, 0.8)) for n, x in ((3000, 0.0), (800, 0.25), (500, 0.5), (700, -0.5))]
+    gap = IsolationConfig(largest_cluster=True, cluster_gap=0.06)
+    left, (_, step) = isolate(PointCloud(1000 * np.concatenate(row)), gap, 0.001)
+    assert len(left) == 4300 and left.points[:, 0].min() > -110
+    assert step.detail == "3 of 4 clusters, the largest left out has 700"
 
 
 @pytest.mark.parametrize(
@@ -117,6 +127,7 @@ def test_clusters_are_single_linkage() -> None:
     [
         ({"depth_range": (0.9, 0.4)}, "the depth range is 0.9 0.4; it must be the nearest and the farthest"),
         ({"depth_range": (0.4, float("nan"))}, "the depth range is 0.4 nan"),
+        ({"cluster_gap": 0.01}, "the cluster gap is 0.01 m; it must not be negative and belongs to the largest"),
         ({"box": (0, 0, 0, 1, 0, 1)}, "the box is 0 0 0 1 0 1; each of x0 y0 z0 must be less than"),
     ],
 )
@@ -174,7 +185,7 @@ def test_a_real_scan_among_clutter(name: str, require_asset: Callable[[str], Pat
     scan, truth, _ = scan_in_camera(name)
     crowded = PointCloud(crowd()(scan.points, np.random.default_rng(0)))
     near, far = scan.points[:, 2].min() - 0.05, scan.points[:, 2].max() + 0.05
-    config = IsolationConfig(depth_range=(near, far), remove_plane=True, largest_cluster=True)
+    config = IsolationConfig(depth_range=(near, far), remove_plane=True, largest_cluster=True, cluster_gap=0.02)
     isolated, _ = isolate(crowded, config)
     model = load_model("bunny")
     alone, before, after = (grid_scores(model, cloud, truth, 40) for cloud in (scan, crowded, isolated))

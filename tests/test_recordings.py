@@ -168,7 +168,7 @@ def test_what_a_recording_lacks_is_said(tmp_path: Path) -> None:
     for options, expected in (
         (
             {"topic": "/nothing"},
-            "no images or clouds on topic '/nothing'; those it has are on: /camera/color/image_raw",
+            "no images or clouds on topic '/nothing'; those it has are on: /camera/color",
         ),
         ({"frame_index": 3}, "has 3 frames; frame 3 is asked for"),
         ({"frame_index": -1}, "the frame index is -1"),

@@ -24,6 +24,7 @@ from mereo.extraction import LabelGrid, extract_whole, locate
 from mereo.frame import inverse_rigid, rigid, transform_points
 from mereo.input_config import Frame as Frame
 from mereo.input_config import InputConfig, IsolationConfig
+from mereo.isolation import STRAY_SHARE, stray_share
 from mereo.measurement import FoundSegment, measure
 from mereo.mesh import PALETTE, Color, SegmentedMesh
 from mereo.model import Model
@@ -207,6 +208,9 @@ def reconstruct_file(
     with new_directory(output, force) as directory:
         seen = read_observation(input, reading, isolation)
         print(seen)
+        apart = 0.0 if isolation.largest_cluster else stray_share(seen.cloud)
+        if apart > STRAY_SHARE:
+            print(f"{apart:.1%} of it lies apart from the largest group; if that is not the object: --largest-cluster")
         model = load_model(weights)
         warning = size_warning(seen, model.provenance)
         if warning is not None:
