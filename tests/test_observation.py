@@ -78,7 +78,11 @@ def test_the_mask_and_the_crop_work_together(folder: Path) -> None:
         ),
         ("d.png", {"intrinsics": Path("k.json"), "unit_m": 0.001}, "comes in metres: leave out --unit-m"),
         ("d.png", {"intrinsics": Path("k.json"), "topic": "/d"}, "is no ROS recording and has no topics"),
-        ("c.ply", {"intrinsics": Path("k.json")}, "is read as a point cloud; leave out intrinsics, mask and depth scale"),
+        (
+            "c.ply",
+            {"intrinsics": Path("k.json")},
+            "is read as a point cloud; leave out intrinsics, mask and depth scale",
+        ),
         ("c.ply", {"mask": Path("m.png")}, "is read as a point cloud; leave out intrinsics, mask and depth scale"),
         ("c.ply", {"depth_scale": 1000.0}, "is read as a point cloud; leave out intrinsics, mask and depth scale"),
     ],

@@ -184,7 +184,7 @@ def _largest_cluster(points: Float[np.ndarray, "n 3"], gap: float) -> Keep:
         if len(near) == 0:
             break
         keep |= np.isin(label, near)
-    others = np.setdiff1d(label[~keep], [])
+    others = np.unique(label[~keep])
     left_out = f", the largest left out has {sizes[others].max()}" if len(others) else ""
     return keep, f"{len(sizes) - len(others)} of {len(sizes)} clusters{left_out}"
 
