@@ -118,7 +118,6 @@ def test_every_format_gives_the_same_metres(tmp_path: Path, name: str) -> None:
         np.save(path, {"short": MILLIMETRES, "float": METRES, "double": METRES.astype(">f8")}[path.stem])
     else:
         Image.fromarray(MILLIMETRES if path.stem == "short" else METRES).save(path, compression="tiff_lzw")
-    assert is_depth_image(path)
     depth = read_depth_image(path, CAMERA).depth
     np.testing.assert_allclose(depth, MILLIMETRES / 1000, rtol=1e-6)
     assert depth[2, 3] == 0, "NaN and 0 both say that nothing was measured"
@@ -165,6 +164,7 @@ def test_what_is_no_depth_image_is_said_so(tmp_path: Path) -> None:
 
 
 def test_arrays_are_told_apart_by_their_shape(tmp_path: Path) -> None:
-    for shape, image in (((6, 8), True), ((100, 3), False), ((6, 8, 3), False)):
+    cases = (((48, 64), True), ((100, 3), False), ((100, 2), False), ((100, 6), False), ((48, 64, 3), False))
+    for shape, image in cases:
         np.save(tmp_path / "a.npy", np.ones(shape))
         assert is_depth_image(tmp_path / "a.npy") == image

@@ -17,6 +17,12 @@ EXPECTED = {
     "sensors.py": "wrote",
     "simulate_liver.py": "3 states of 98 nodes",
 }
+ASSETS = {
+    "isolate_object.py": ("bunny/bunny.off", "bunny/bun000.ply"),
+    "simulate_liver.py": ("liver/lapgym_liver_volumetric.vtk",),
+}
+"""Downloads that they need."""
+
 EXTRAS = {"simulate_liver.py": "mujoco"}
 """Modules that come with an extra of the package."""
 
@@ -27,8 +33,8 @@ def test_every_example_is_run() -> None:
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_example_runs(name: str, tmp_path: Path, require_asset: Callable[[str], Path]) -> None:
-    if name == "simulate_liver.py":
-        require_asset("liver/lapgym_liver_volumetric.vtk")
+    for asset in ASSETS.get(name, ()):
+        require_asset(asset)
     if name in EXTRAS:
         pytest.importorskip(EXTRAS[name], reason=f"{name} needs {EXTRAS[name]}")
     done = subprocess.run(

@@ -114,10 +114,15 @@ def test_clusters_follow_neighbours_not_distance() -> None:
     assert (clusters(dense * [1.0, 10.1, 1.0]) > 0).any(), "rows farther apart than the gap"
 
 
+def test_a_few_points_are_no_trouble() -> None:
+    for count in (1, 2, 5):
+        assert clusters(np.ones((count, 3))).tolist() == [0] * count
+
+
 def test_groups_within_the_gap_are_kept_with_those_behind_them() -> None:
     row = [half_ball(n, (x, 0.0, 0.8)) for n, x in ((3000, 0.0), (800, 0.25), (500, 0.5), (700, -0.5))]
     gap = IsolationConfig(largest_cluster=True, cluster_gap=0.06)
-    left, (_, step) = isolate(PointCloud(1000 * np.concatenate(row)), gap, 0.001)
+    left, (step,) = isolate(PointCloud(1000 * np.concatenate(row)), gap, 0.001)
     assert len(left) == 4300 and left.points[:, 0].min() > -110
     assert step.detail == "3 of 4 clusters, the largest left out has 700"
 
@@ -189,5 +194,5 @@ def test_a_real_scan_among_clutter(name: str, require_asset: Callable[[str], Pat
     isolated, _ = isolate(crowded, config)
     model = load_model("bunny")
     alone, before, after = (grid_scores(model, cloud, truth, 40) for cloud in (scan, crowded, isolated))
-    assert before.iou < 0.3
+    assert before.iou < 0.6 and before.miou < 0.1
     assert after.iou > alone.iou - 0.05 and after.miou > alone.miou - 0.1

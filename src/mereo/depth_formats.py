@@ -19,6 +19,9 @@ MILLIMETRES, METRES = 1000.0, 1.0
 NOTHING_M = 1e9
 """Renderers store 1e10 where a ray met nothing."""
 
+NARROWEST = 16
+"""Columns of an array that is an image; with fewer it is a list of points, or of points with something else."""
+
 EXR_CHANNELS = ("z", "v", "y", "r", "depth", "distance")
 """Last parts of the names that a depth channel goes by; v is Blender's, r that of an image saved as grey colour."""
 
@@ -38,7 +41,7 @@ def is_depth_image(path: Path) -> bool:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, OSError, EOFError):
         return False  # the reader of clouds says what is wrong
-    return array.ndim == 2 and array.shape[1] != 3
+    return array.ndim == 2 and array.shape[1] >= NARROWEST
 
 
 def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:

@@ -136,8 +136,9 @@ def _steps(
 
 def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, frame: Frame, rng: np.random.Generator) -> Keep:
     tolerance = np.full(len(points), PLANE_SPACINGS * spacing(points))
-    if frame == "camera":
-        tolerance *= np.maximum(points[:, 2] / np.median(points[:, 2]), 1.0) ** 2
+    middle = np.median(points[:, 2])
+    if frame == "camera" and middle > 0:  # what lies behind the camera is refused later
+        tolerance *= np.maximum(points[:, 2] / middle, 1.0) ** 2
     plane = largest_plane(points, tolerance, rng)
     off = np.ones(len(points), dtype=bool) if plane is None else plane.distance(points) > tolerance
     share = 1.0 - off.mean()
@@ -165,8 +166,10 @@ def _inliers(points: Float[np.ndarray, "n 3"]) -> Keep:
 def clusters(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """The number of each point's cluster, the largest being 0; see ``CLUSTER_NEIGHBORS``."""
     count = min(CLUSTER_NEIGHBORS, len(points) - 1) + 1
-    gap = np.nextafter(CLUSTER_GAP * spacing(points), np.inf)
-    distance, neighbor = cKDTree(points).query(points, k=count, distance_upper_bound=gap)
+    gap = CLUSTER_GAP * spacing(points)
+    if gap == 0:  # all at one place
+        return np.zeros(len(points), dtype=np.int64)
+    distance, neighbor = cKDTree(points).query(points, k=range(1, count + 1), distance_upper_bound=gap)
     row, column = np.nonzero(np.isfinite(distance))
     edges = (np.ones(len(row), dtype=np.int8), (row, neighbor[row, column]))
     label = connected_components(coo_matrix(edges, shape=(len(points),) * 2), directed=False)[1]
