@@ -16,6 +16,7 @@ import pytest
 import mereo.__main__ as command_line
 from mereo import commands
 from mereo.config import PRESETS, GenerateConfig, PresetName, SamplingConfig
+from mereo.input_config import InputConfig
 from mereo.scene import SCENES
 
 WITHOUT_NETWORK = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
@@ -137,7 +138,7 @@ def test_train_options_override_the_preset() -> None:
 def test_reconstruct_options() -> None:
     text = "reconstruct scan.ply --weights bunny --output out --frame scanner --resolution 64 --drop-invalid --force"
     assert command_line.parse(text.split()) == commands.Reconstruct(
-        Path("scan.ply"), "bunny", Path("out"), resolution=64, frame="scanner", drop_invalid=True, force=True
+        Path("scan.ply"), "bunny", Path("out"), 64, InputConfig(frame="scanner", drop_invalid=True), force=True
     )
 
 
@@ -294,7 +295,7 @@ def test_doctor_exits_with_0() -> None:
             "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force",
             "mereo.reconstruction",
             "reconstruct_file",
-            {"intrinsics": Path("k.json"), "depth_scale": 5000.0, "mask": Path("m.png"), "force": True},
+            {"reading": InputConfig(Path("k.json"), 5000.0, Path("m.png")), "force": True},
         ),
         ("demo --output out", "mereo.demo", "main", {"output": Path("out")}),
     ],

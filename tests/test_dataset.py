@@ -1,5 +1,6 @@
 """Batches: augmentation moves everything together, and every batch depends on its generator alone."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,17 @@ FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return Dataset.load(write_toy_dataset(tmp_path_factory.mktemp("toy") / "data"))
+
+
+def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> None:
+    """Half balls of radius 5 to 10 are 10 to 20 wide, seen by points that nearly reach the rim."""
+    directory = write_toy_dataset(tmp_path / "data")
+    assert Dataset.load(directory).visible_m is None
+    manifest = json.loads((directory / "manifest.json").read_text())
+    (directory / "manifest.json").write_text(json.dumps({**manifest, "unit_m": 0.01}))
+    visible_m = Dataset.load(directory).visible_m
+    assert visible_m is not None
+    assert visible_m == (pytest.approx(0.1, rel=0.1), pytest.approx(0.2, rel=0.1))
 
 
 def rng(seed: int = 0) -> torch.Generator:

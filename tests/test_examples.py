@@ -10,11 +10,18 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 EXPECTED = {
+    "isolate_object.py": "isolated",
     "query_points.py": "to the nearest surface",
     "reconstruct_cloud.py": "report.html",
     "sensors.py": "wrote",
     "simulate_liver.py": "3 states of 98 nodes",
 }
+ASSETS = {
+    "isolate_object.py": ("bunny/bunny.off", "bunny/bun000.ply"),
+    "simulate_liver.py": ("liver/lapgym_liver_volumetric.vtk",),
+}
+"""Downloads that they need."""
+
 EXTRAS = {"simulate_liver.py": "mujoco"}
 """Modules that come with an extra of the package."""
 
@@ -25,8 +32,8 @@ def test_every_example_is_run() -> None:
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_example_runs(name: str, tmp_path: Path, require_asset: Callable[[str], Path]) -> None:
-    if name == "simulate_liver.py":
-        require_asset("liver/lapgym_liver_volumetric.vtk")
+    for asset in ASSETS.get(name, ()):
+        require_asset(asset)
     if name in EXTRAS:
         pytest.importorskip(EXTRAS[name], reason=f"{name} needs {EXTRAS[name]}")
     done = subprocess.run(

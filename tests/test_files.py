@@ -1,7 +1,5 @@
 """Every format gives back the points that were written; every damaged file gets one sentence with its cure."""
 
-import json
-import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -11,10 +9,9 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
-from mereo.camera import Camera, PointCloud
-from mereo.files import read_camera, read_depth_image, read_mask, read_point_cloud, read_segmented_mesh
+from mereo.camera import Camera
+from mereo.files import read_camera, read_mask, read_point_cloud, read_segmented_mesh
 from mereo.point_formats import _lzf_decompress
 
 POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
@@ -195,134 +192,6 @@ def test_missing_files_and_directories(tmp_path: Path) -> None:
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(ValueError, match="is a directory"):
         read_point_cloud(tmp_path / "folder.ply")
-
-
-# --- depth images and intrinsics -------------------------------------------------------------------------------------
-
-
-def save_depth(path: Path, values: np.ndarray) -> Path:
-    Image.fromarray(values).save(path)
-    return path
-
-
-def test_depth_is_value_over_scale_and_masked(tmp_path: Path) -> None:
-    values = np.random.default_rng(1).integers(400, 60000, (6, 8)).astype(np.uint16)
-    values[2, 3] = 0
-    path = save_depth(tmp_path / "d.png", values)
-    np.testing.assert_array_equal(read_depth_image(path, CAMERA, 5000.0).depth, values / 5000.0)
-    mask = np.zeros((6, 8), np.uint8)
-    mask[1:4, 2:5] = 255
-    masked = read_depth_image(path, CAMERA, 5000.0, save_depth(tmp_path / "m.png", mask))
-    assert int(masked.valid.sum()) == 8
-    np.testing.assert_array_equal(masked.depth, np.where(mask > 0, values / 5000.0, 0))
-
-
-def test_a_bad_depth_image_gets_one_sentence(tmp_path: Path) -> None:
-    good = np.full((6, 8), 900, np.uint16)
-    path = tmp_path / "d.png"
-    for values, scale, expected in (
-        (np.zeros((6, 8), np.uint16), 1000.0, "measures 0 pixels in the image"),
-        (np.full((6, 8), 90, np.uint8), 1000.0, "mode L, not a 16-bit grey PNG"),
-        (np.full((6, 9), 900, np.uint16), 1000.0, "9 x 6 pixels but the intrinsics say 8 x 6"),
-        (good, 1.0, "median depth of .* is 900 m.*--depth-scale"),
-        (good, 1e6, "median depth of .* is 0.0009 m.*--depth-scale"),
-        (good, 0.0, "depth scale is 0.0"),
-        (good, float("nan"), "depth scale is nan"),
-    ):
-        save_depth(path, values)
-        with pytest.raises(ValueError, match=expected) as caught:
-            read_depth_image(path, CAMERA, scale)
-        assert "\n" not in str(caught.value)
-    noise = np.random.default_rng(0).integers(500, 1500, (60, 80)).astype(np.uint16)
-    path.write_bytes(save_depth(path, noise).read_bytes()[:3000])
-    with pytest.raises(ValueError, match="cannot be read as a depth image") as caught:
-        read_depth_image(path, CAMERA)
-    assert_sentence(caught.value, path)
-    save_depth(path, good)
-    with pytest.raises(ValueError, match="measures 0 pixels inside the mask"):
-        read_depth_image(path, CAMERA, 1000.0, save_depth(tmp_path / "m.png", np.zeros((6, 8), np.uint8)))
-    with pytest.raises(ValueError, match="the mask .* is 5 x 4 pixels but the depth image is 8 x 6"):
-        read_depth_image(path, CAMERA, 1000.0, save_depth(tmp_path / "m.png", np.ones((4, 5), np.uint8)))
-
-
-def test_masks_of_all_kinds_agree(tmp_path: Path) -> None:
-    truth = np.random.default_rng(2).random((5, 7)) > 0.5
-    grey = Image.fromarray(truth.astype(np.uint8) * 9)
-    for name, image in (
-        ("grey", grey),
-        ("deep", Image.fromarray(truth.astype(np.uint16) * 256)),
-        ("bits", Image.fromarray(truth)),
-        ("color", Image.merge("RGB", (Image.new("L", grey.size), grey, Image.new("L", grey.size)))),
-        ("opaque", Image.merge("RGBA", (grey, grey, grey, Image.new("L", grey.size, 255)))),
-    ):
-        image.save(tmp_path / f"{name}.png")
-        np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
-
-
-K = [[525.0, 0.0, 319.5], [0.0, 520.0, 239.5], [0.0, 0.0, 1.0]]
-FLAT = [v for row in K for v in row]
-SIZE = {"width": 640, "height": 480}
-ROS2 = "header:\n  frame_id: depth\nheight: 480\nwidth: 640\ndistortion_model: plumb_bob\nd:\n- 0.0\n- 0.0\nk:\n"
-ROS2 += "".join(f"- {v}\n" for v in FLAT) + "r:\n- 1.0\n- 0.0\n---\n"
-ROS1 = f"image_width: 640\nimage_height: 480\ncamera_name: depth\nK: {FLAT}\nD: [0.1, -0.2]\n"
-CALIBRATOR = f"image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: {FLAT}\n"
-CAMERAS = {
-    "plain.json": json.dumps({"fx": 525, "fy": 520, "cx": 319.5, "cy": 239.5, **SIZE}),
-    "realsense.json": json.dumps({"fx": 525, "fy": 520, "ppx": 319.5, "ppy": 239.5, **SIZE}),
-    "open3d.json": json.dumps({"intrinsic_matrix": np.array(K).T.ravel().tolist(), **SIZE}),
-    "matrix.json": json.dumps({"K": K, **SIZE}),
-    "ros.json": json.dumps({"k": FLAT, **SIZE}),
-    "centred.json": json.dumps({"fx": 525, "fy": 520, "cx": 320.0, "cy": 240.0, "pixel_center": 0.5, **SIZE}),
-    "ros2.yaml": ROS2,
-    "ros1.yaml": ROS1,
-    "calibrator.yml": CALIBRATOR,
-}
-
-
-@pytest.mark.parametrize("name", CAMERAS)
-def test_all_forms_of_intrinsics_mean_the_same_camera(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_text(CAMERAS[name])
-    # 319.5 where pixel centres are whole numbers is the middle of 640 pixels: 320
-    assert read_camera(tmp_path / name) == Camera(640, 480, 525.0, 520.0, 320.0, 240.0)
-
-
-@pytest.mark.parametrize(
-    "content, expected",
-    [
-        ("{", "cannot be read as a camera intrinsics file"),
-        ("[1, 2]", "not an object"),
-        ('{"width": 4, "height": 3}', "neither fx, fy, cx, cy nor"),
-        ('{"fx": 5, "fy": 5, "cx": 2, "cy": 2}', "no width and height"),
-        ('{"fx": "wide", "fy": 5, "cx": 2, "cy": 2, "width": 4, "height": 3}', "could not convert"),
-        ('{"fx": -5, "fy": 5, "cx": 2, "cy": 2, "width": 4, "height": 3}', "focal length is -5"),
-        ('{"K": [5, 0, 2, 0], "width": 4, "height": 3}', "4 numbers instead of 9"),
-        (json.dumps({"K": np.array(K).T.ravel().tolist(), **SIZE}), "last row"),
-    ],
-)
-def test_bad_intrinsics_get_one_sentence(tmp_path: Path, content: str, expected: str) -> None:
-    (tmp_path / "c.json").write_text(content)
-    with pytest.raises(ValueError, match=expected) as caught:
-        read_camera(tmp_path / "c.json")
-    assert "\n" not in str(caught.value)
-
-
-def test_the_size_may_come_from_the_image(tmp_path: Path) -> None:
-    (tmp_path / "c.json").write_text('{"fx": 5, "fy": 5, "cx": 2, "cy": 2}')
-    assert read_camera(tmp_path / "c.json", (4, 3)) == Camera(4, 3, 5.0, 5.0, 2.5, 2.5)
-
-
-def test_real_depth_frames_are_where_their_rooms_are() -> None:
-    folder = Path(os.environ.get("MEREO_ASSETS", "")) / "depth"
-    if not (folder / "tum_depth_5000.png").exists():
-        pytest.skip("MEREO_ASSETS holds no real depth frames")
-    camera = read_camera(folder / "intrinsics.json")
-    assert camera == read_camera(folder / "open3d_camera_primesense.json")
-    for name, scale in (("pcl_person_depth_mm.png", 1000.0), ("tum_depth_5000.png", 5000.0)):
-        image = read_depth_image(folder / name, camera, scale)
-        cloud: PointCloud = image.to_points()
-        assert 0.7 < np.median(cloud.points[:, 2]) < 4.0
-        row, column = np.nonzero(image.valid)
-        np.testing.assert_allclose(camera.project(cloud.points), np.column_stack([column, row]) + 0.5, atol=1e-9)
 
 
 # --- meshes ----------------------------------------------------------------------------------------------------------

@@ -4,22 +4,23 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from analytic import AnalyticModel, ball, logits_of, union, untrained
-from PIL import Image
 
 import mereo
-from mereo.camera import Camera, PointCloud
+from mereo.camera import PointCloud
 from mereo.frame import inverse_rigid, transform_points
-from mereo.output import write_camera
+from mereo.input_config import IsolationConfig
+from mereo.observation import SizeWarning
 from mereo.reconstruction import (
     Frame,
     Reconstruction,
-    read_input,
     reconstruct,
     reconstruct_file,
     summarize,
@@ -166,6 +167,26 @@ def test_from_file_to_files(
         reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "out", resolution=16)
 
 
+def test_what_is_read_and_left_out_is_printed_and_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Strays beside the object are pointed out, and left out when asked; the summary says so."""
+    cloud, model = scene("camera")
+    np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
+    monkeypatch.setattr("mereo.reconstruction.load_model", lambda _: replace(model, provenance={"visible_m": [2, 3]}))
+    read = partial(reconstruct_file, tmp_path / "cloud.npy", "any", resolution=16)
+    with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
+        read(output=tmp_path / "crowded")
+    assert "33.3% of it lies apart from the largest group; if that is not the object" in capsys.readouterr().out
+    with pytest.warns(SizeWarning, match="the visible part is 0.1[0-9]* m long"):
+        read(output=tmp_path / "alone", isolation=IsolationConfig(largest_cluster=True, cluster_gap=0.02))
+    assert "largest cluster: 1200 of 1800 points kept (1 of 2 clusters" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "alone/summary.json").read_text())
+    assert summary["points"] == 1200 and summary["isolation"][-1]["name"] == "largest cluster"
+    np.testing.assert_allclose(summary["depth_m"], np.quantile(cloud[:, 2], [0, 0.5, 1]))
+    assert max(summary["visible_size_m"]) == pytest.approx(np.ptp(cloud[:, 1]), rel=1e-6)
+
+
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     save_model(untrained(NAMES), tmp_path / "w.safetensors")
     np.save(tmp_path / "cloud.npy", scene("camera")[0][:5])
@@ -178,35 +199,6 @@ def test_an_empty_field_is_said_so() -> None:
     model = AnalyticModel.of(logits_of(lambda p: np.ones(len(p))), ("one",))
     with pytest.raises(ValueError, match="the model finds no segment near the cloud"):
         reconstruct(scene("camera")[0], model)
-
-
-# --- input -----------------------------------------------------------------------------------------------------------
-
-
-def test_a_depth_image_becomes_the_points_it_shows(tmp_path: Path) -> None:
-    camera = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
-    write_camera(tmp_path / "k.json", camera)
-    depth = np.zeros((10, 20), dtype=np.uint16)
-    depth[2:7, 5:15] = 2500
-    Image.fromarray(depth).save(tmp_path / "d.png")
-    points = read_input(tmp_path / "d.png", tmp_path / "k.json", depth_scale=5000.0).points
-    assert len(points) == 50
-    np.testing.assert_allclose(points[:, 2], 0.5)
-    np.testing.assert_allclose(camera.project(points)[0], [5.5, 2.5])
-
-
-@pytest.mark.parametrize(
-    "name, options, text",
-    [
-        ("d.png", {}, "is a depth image without intrinsics; they are needed: give --intrinsics FILE"),
-        ("d.png", {"intrinsics": "k.json", "frame": "scanner"}, "those are always in the camera frame"),
-        ("c.ply", {"intrinsics": "k.json"}, "is read as a point cloud; leave out the intrinsics and the mask"),
-        ("c.ply", {"mask": "m.png"}, "is read as a point cloud; leave out the intrinsics and the mask"),
-    ],
-)
-def test_contradictory_inputs(name: str, options: dict[str, str], text: str) -> None:
-    with pytest.raises(ValueError, match=text):
-        read_input(Path(name), **options)  # type: ignore[arg-type]
 
 
 # --- the package -----------------------------------------------------------------------------------------------------

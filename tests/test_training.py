@@ -81,6 +81,7 @@ def test_run_directory_tells_the_story(dataset: Path, tmp_path: Path) -> None:
     model = load_model(tmp_path / "run" / "weights.safetensors")
     assert model.names == NAMES
     assert model.provenance["training_seed"] == 5 and model.provenance["scene"] == "toy"
+    assert model.provenance["visible_m"] is None, "the dataset states no unit"
 
 
 def test_class_offsets_are_in_the_last_bias_and_nowhere_else(dataset: Path, tmp_path: Path) -> None:

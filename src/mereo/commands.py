@@ -6,11 +6,12 @@
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
 from mereo.config import GenerateConfig, PresetName, Sensor, SensorConfig, TrainConfig
+from mereo.input_config import InputConfig, IsolationConfig
 
 
 @dataclass(frozen=True)
@@ -182,18 +183,16 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Reconstruct:
-    """Reconstruct all segments from a point cloud (PLY, PCD, XYZ, NPY, NPZ) or a 16-bit depth image (PNG).
+    """Reconstruct all segments from one frame: a depth image (PNG, TIFF, EXR, NPY), a point cloud (PLY, PCD, XYZ, NPY,
+    NPZ, ZDF) or a ROS recording (bag, MCAP).
 
     Attributes:
         input: the file; results are in its frame and units.
         weights: a shipped name or a file.
         output: folder to create.
         resolution: grid cells along the longest side.
-        intrinsics: the depth camera, JSON or YAML.
-        depth_scale: pixel value of one metre.
-        mask: image that is not 0 on the object.
-        frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
-        drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
         force: replace an existing output folder.
     """
 
@@ -201,11 +200,8 @@ class Reconstruct:
     weights: str
     output: Path
     resolution: int = 128
-    intrinsics: Path | None = None
-    depth_scale: float = 1000.0
-    mask: Path | None = None
-    frame: Literal["camera", "scanner"] = "camera"
-    drop_invalid: bool = False
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     force: bool = False
 
     def run(self) -> None:
@@ -216,11 +212,8 @@ class Reconstruct:
             self.weights,
             self.output,
             resolution=self.resolution,
-            intrinsics=self.intrinsics,
-            depth_scale=self.depth_scale,
-            mask=self.mask,
-            frame=self.frame,
-            drop_invalid=self.drop_invalid,
+            reading=self.reading,
+            isolation=self.isolation,
             force=self.force,
         )
 

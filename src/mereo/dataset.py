@@ -44,6 +44,7 @@ class Dataset:
         viewpoint: the camera's position in normalized coordinates.
         manifest: how the dataset was made.
         template: signed distances to the segments at rest (``rest_pose.rest_distances``); None in older datasets.
+        visible_m: least and greatest longest side of the visible part's box in metres; None where the unit is unknown.
     """
 
     cloud: Float[Tensor, "e p 3"]
@@ -56,6 +57,7 @@ class Dataset:
     rest: Float[Tensor, "e q 3"]
     manifest: dict[str, Any]
     template: Float[Tensor, "s n n n"] | None = None
+    visible_m: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.cloud)
@@ -84,6 +86,7 @@ class Dataset:
             **{key: joined[key] for key in queries},
             manifest=manifest,
             template=_read_template(directory),
+            visible_m=_visible_m(joined["scale"], manifest.get("unit_m")),
         )
 
     @property
@@ -156,6 +159,11 @@ def _read_shard(path: Path) -> dict[str, Tensor]:
         return load_file(path)
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path} cannot be read ({error}); delete it and run mereo generate ... --resume") from None
+
+
+def _visible_m(scale: Float[Tensor, " e"], unit_m: float | None) -> tuple[float, float] | None:
+    """From the normalizers' scales, which are one over half the longest side."""
+    return None if unit_m is None else (2 * unit_m / float(scale.max()), 2 * unit_m / float(scale.min()))
 
 
 def _read_template(directory: Path) -> Tensor | None:

@@ -13,10 +13,11 @@ from mereo.assets import AssetUnavailable
 from mereo.camera import PointCloud
 from mereo.evaluation import grid_confusion, predict_grid
 from mereo.frames import TruthGrid, load_frame, shipped_frames, truth_grid
+from mereo.input_config import Frame
 from mereo.metrics import Scores, intersection_over_union
 from mereo.model import Model
 from mereo.reconstruction import Reconstruction, reconstruct, segment_names, write_reconstruction
-from mereo.scans import Frame, bunny_scan, scan_in_camera
+from mereo.scans import bunny_scan, scan_in_camera
 from mereo.weights import load_model, shipped_names
 
 REAL_SCAN = "bun000"

@@ -17,7 +17,7 @@ PURPOSES: dict[str, str] = {
     "onnx": "networks for other runtimes",
     "cad": "3MF files",
     "medical": "NIfTI and NRRD volumes",
-    "sensors": "ROS bags and netCDF recordings",
+    "sensors": "ROS bags, EXR depth images and Zivid clouds",
     "simulation": "states from finite elements",
     "cluster": "data generation on several machines",
     "align": "ground truth from scans",

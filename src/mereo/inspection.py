@@ -7,9 +7,10 @@ from jaxtyping import Float
 
 from mereo.camera import PointCloud
 from mereo.frame import inverse_rigid, transform_points
+from mereo.input_config import Frame
 from mereo.mesh import SegmentedMesh
 from mereo.model import Answer, EncodedCloud, Model
-from mereo.reconstruction import Frame, Reconstruction, reconstruct, segment_names
+from mereo.reconstruction import Reconstruction, reconstruct, segment_names
 from mereo.scans import scanner_to_camera
 
 

@@ -29,7 +29,7 @@ def readable(path: Path, kind: str) -> Iterator[None]:
         raise ValueError(f"{path} is empty (0 bytes); a {kind} is needed: export or download it again")
     try:
         yield
-    except MemoryError:
+    except (MemoryError, ImportError):
         raise
     except Exception as error:
         # a library's text may be several sentences: its first line is the reason

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from mereo.frame import transform_points
+from mereo.input_config import Frame
 from mereo.mesh import SegmentedMesh
 from mereo.registration import SEGMENT_LIMITS, WHOLE_LIMITS, Registration, Scan, match, register
 from mereo.scan_surface import CONTACT, Poses, diagonal, exposed, facing, moved
-from mereo.scans import Frame
 from mereo.solid import Solids
 
 FAR = 1000.0

@@ -1,4 +1,4 @@
-"""Parsers of point-cloud formats: PLY, PCD, text and numpy arrays.
+"""Parsers of point-cloud formats: PLY, PCD, text, numpy arrays and ZDF.
 
 Each returns [n, 3] positions, NaN rows included, or raises any exception whose text completes "cannot be read as a
 point cloud (...)"; ``mereo.files`` turns it into the sentence a user sees.
@@ -6,6 +6,7 @@ point cloud (...)"; ``mereo.files`` turns it into the sentence a user sees.
 
 import re
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -223,6 +224,20 @@ def _lzf_decompress(data: bytes, size: int) -> bytes:
     return bytes(output)
 
 
+# --- ZDF (Zivid; NetCDF 4) -------------------------------------------------------------------------------------------
+
+
+def _zdf_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Organized, millimetres, NaN where nothing was measured."""
+    if find_spec("netCDF4") is None:
+        raise ImportError(f"{path} needs netCDF4, which is not installed: pip install 'mereo[sensors]'")
+    import netCDF4
+
+    with netCDF4.Dataset(path) as file:
+        cloud = file["data"]["pointcloud"][:]
+    return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))
+
+
 def _expect(found: int, declared: int) -> None:
     if found < declared:
         raise ValueError(f"it is truncated: {found} of {declared} points")
@@ -233,4 +248,5 @@ CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n 3"]]] = {
     ".pcd": _pcd_points,
     **dict.fromkeys((".xyz", ".txt", ".pts", ".asc", ".csv"), _text_points),
     **dict.fromkeys((".npy", ".npz"), _array_points),
+    ".zdf": _zdf_points,
 }

@@ -6,6 +6,7 @@ Everything that comes out is in the input's frame and units.
 """
 
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -15,23 +16,23 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
 from mereo.camera import PointCloud
 from mereo.extraction import LabelGrid, extract_whole, locate
-from mereo.files import read_camera, read_depth_image, read_point_cloud
 from mereo.frame import inverse_rigid, rigid, transform_points
+from mereo.input_config import Frame, InputConfig, IsolationConfig
+from mereo.isolation import STRAY_SHARE, stray_share
 from mereo.measurement import FoundSegment, measure
 from mereo.mesh import PALETTE, Color, SegmentedMesh
-from mereo.mesh_files import readable
 from mereo.model import Model
+from mereo.observation import SizeWarning, read_observation, size_warning
 from mereo.output import GLTF_CAMERA_ROTATION, new_directory, write_json, write_labels_npz, write_segments_glb
 from mereo.pictures import render_cloud_and_segments
 from mereo.refinement import Field
 from mereo.report import write_report
-from mereo.scans import SCANNER_TO_CAMERA, Frame, scanner_to_camera
+from mereo.scans import SCANNER_TO_CAMERA, scanner_to_camera
 from mereo.weights import load_model
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
@@ -198,45 +199,27 @@ def reconstruct_file(
     output: str | Path,
     *,
     resolution: int = 128,
-    intrinsics: str | Path | None = None,
-    depth_scale: float = 1000.0,
-    mask: str | Path | None = None,
-    frame: Frame = "camera",
-    drop_invalid: bool = False,
+    reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
+    isolation: IsolationConfig = IsolationConfig(),  # noqa: B008
     force: bool = False,
 ) -> Reconstruction:
-    """``mereo reconstruct``: read a point cloud or a depth image, reconstruct, write a new directory, print a table."""
+    """``mereo reconstruct``: read one frame of a sensor, reconstruct, write a new directory, print what was found."""
     with new_directory(output, force) as directory:
-        cloud = read_input(Path(input), intrinsics, depth_scale, mask, frame, drop_invalid)
+        seen = read_observation(input, reading, isolation)
+        print(seen)
+        apart = 0.0 if isolation.largest_cluster else stray_share(seen.cloud)
+        if apart > STRAY_SHARE:
+            print(f"{apart:.1%} of it lies apart from the largest group; if that is not the object: --largest-cluster")
         model = load_model(weights)
-        result = reconstruct(cloud, model, resolution, frame)
-        facts = {"title": Path(input).name, "weights": str(weights), "resolution": resolution, "points": len(cloud)}
-        _write_files(directory, result, cloud, frame, facts)
-    print_segments(result, f"{Path(input).name}, {len(cloud)} points")
+        warning = size_warning(seen, model.provenance)
+        if warning is not None:
+            warnings.warn(warning, SizeWarning, stacklevel=2)
+        result = reconstruct(seen.cloud, model, resolution, seen.frame)
+        facts = {"title": seen.source, "weights": str(weights), "resolution": resolution, "points": len(seen.cloud)}
+        _write_files(directory, result, seen.cloud, seen.frame, {**facts, **seen.facts()})
+    print_segments(result, f"{seen.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result
-
-
-def read_input(
-    path: Path,
-    intrinsics: str | Path | None = None,
-    depth_scale: float = 1000.0,
-    mask: str | Path | None = None,
-    frame: Frame = "camera",
-    drop_invalid: bool = False,
-) -> PointCloud:
-    """The points of a depth image (PNG, metres) or of a point cloud file (its own unit)."""
-    if path.suffix.lower() != ".png":
-        if intrinsics is not None or mask is not None:
-            raise ValueError(f"{path} is read as a point cloud; leave out the intrinsics and the mask")
-        return read_point_cloud(path, drop_invalid)
-    if intrinsics is None:
-        raise ValueError(f"{path} is a depth image without intrinsics; they are needed: give --intrinsics FILE")
-    if frame != "camera":
-        raise ValueError(f"the frame is {frame!r} but {path} is a depth image; those are always in the camera frame")
-    with readable(path, "depth image"), Image.open(path) as image:
-        size = image.size
-    return read_depth_image(path, read_camera(intrinsics, size), depth_scale, mask).to_points()
 
 
 def print_segments(result: Reconstruction, title: str) -> None:

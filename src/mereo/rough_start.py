@@ -17,13 +17,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mereo.frame import inverse_rigid, rigid, transform_points
+from mereo.input_config import Frame
 from mereo.mesh import SegmentedMesh
 from mereo.mesh_files import readable
 from mereo.model import Model
 from mereo.placement import Start, scale_of
 from mereo.rest_pose import rest_frame
 from mereo.scan_surface import diagonal
-from mereo.scans import Frame, scanner_to_camera
+from mereo.scans import scanner_to_camera
 
 LEAST_PAIRS = 3
 

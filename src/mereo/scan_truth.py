@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from mereo.files import read_point_cloud
+from mereo.input_config import Frame
 from mereo.mesh import SegmentedMesh
 from mereo.mesh_files import readable
 from mereo.output import write_json
 from mereo.placement import Placement
 from mereo.scan_surface import diagonal, moved
-from mereo.scans import Frame, PosedScan
+from mereo.scans import PosedScan
 from mereo.scene import SCENES, load_scene
 
 TRUTH = "truth.json"

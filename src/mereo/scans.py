@@ -5,7 +5,6 @@ the rest-pose segments of the scene "bunny", brought into a scan's frame, are it
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -14,10 +13,8 @@ from mereo import assets
 from mereo.camera import PointCloud
 from mereo.files import read_point_cloud
 from mereo.frame import Normalizer, rigid, transform_points
+from mereo.input_config import Frame
 from mereo.mesh import SegmentedMesh
-
-Frame = Literal["camera", "scanner"]
-"""Axes of a cloud: x right, y down, z forward from the camera at the origin; or the scanner's, above."""
 
 SCANS = tuple(assets.BUNNY_SCAN_POSES)
 """Names of the bunny's scans."""

@@ -245,6 +245,7 @@ class Trainer:
             "training_examples": manifest["examples"],
             "steps": self.step,
             "mereo": manifest["version"],
+            "visible_m": self.data.visible_m,
             "class_offsets": None if offsets is None else offsets.tolist(),
             "recipe": asdict(self.config),
         }

@@ -1,10 +1,12 @@
 """The command ``mereo view``. See ``commands``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
+
+from mereo.input_config import InputConfig, IsolationConfig
 
 
 @dataclass(frozen=True)
@@ -17,11 +19,6 @@ class View:
         scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
         port: where the page is, on this machine only (127.0.0.1); 0 takes any that is free.
         resolution: grid cells along the longest side.
-        intrinsics: the depth camera, JSON or YAML.
-        depth_scale: pixel value of one metre.
-        mask: image that is not 0 on the object.
-        frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
-        drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
     """
 
     input: Positional[Path | None] = None
@@ -29,11 +26,8 @@ class View:
     scene: str | None = None
     port: int = 8080
     resolution: int = 128
-    intrinsics: Path | None = None
-    depth_scale: float = 1000.0
-    mask: Path | None = None
-    frame: Literal["camera", "scanner"] = "camera"
-    drop_invalid: bool = False
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
 
     def run(self) -> None:
         from mereo.viewer.serve import view_frame, view_scene
@@ -48,9 +42,6 @@ class View:
             self.weights,
             port=self.port,
             resolution=self.resolution,
-            intrinsics=self.intrinsics,
-            depth_scale=self.depth_scale,
-            mask=self.mask,
-            frame=self.frame,
-            drop_invalid=self.drop_invalid,
+            reading=self.reading,
+            isolation=self.isolation,
         )

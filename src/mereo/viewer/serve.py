@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from mereo.frames import load_frame, shipped_frames
+from mereo.input_config import Frame, InputConfig, IsolationConfig
 from mereo.inspection import Inspection
 from mereo.laboratory import Laboratory
-from mereo.reconstruction import Frame, read_input
+from mereo.observation import read_observation
 from mereo.scene import load_scene
 from mereo.viewer.frame_page import FramePage
 from mereo.viewer.lab_page import LabPage
@@ -23,14 +24,12 @@ def view_frame(
     *,
     port: int = PORT,
     resolution: int = 128,
-    intrinsics: Path | None = None,
-    depth_scale: float = 1000.0,
-    mask: Path | None = None,
-    frame: Frame = "camera",
-    drop_invalid: bool = False,
+    reading: InputConfig | None = None,
+    isolation: IsolationConfig | None = None,
 ) -> None:
     """Show a frame and its reconstruction; without ``input`` the shipped frame of the weights."""
     import_viser()
+    frame: Frame
     if input is None:
         name = weights or shipped_frames()[0]
         if name not in shipped_frames():
@@ -39,15 +38,16 @@ def view_frame(
                 f"take the weights of a shipped frame: {', '.join(shipped_frames())}"
             )
         cloud, title, weights = load_frame(name).depth.to_points(), f"{name}, shipped frame", name
+        frame, unit = "camera", ""
     elif weights is None:
         raise ValueError(
             f"{input} is given without weights; the model of its object is needed: give --weights, a file or one of "
             f"{', '.join(shipped_names())}"
         )
     else:
-        cloud, title = read_input(input, intrinsics, depth_scale, mask, frame, drop_invalid), input.name
+        seen = read_observation(input, reading or InputConfig(), isolation or IsolationConfig())
+        cloud, title, frame, unit = seen.cloud, seen.source, seen.frame, "m" if seen.unit_m == 1.0 else ""
     inspection = Inspection.of(cloud, load_model(weights), resolution, frame)
-    unit = "m" if input is not None and input.suffix.lower() == ".png" else ""
     server = start_server(port, "mereo")
     FramePage(server, inspection, title, f"{len(cloud):,} points · weights {weights}", unit)
     _serve(server)

@@ -1,0 +1,183 @@
+"""One frame from any kind of file, with the options that belong to it, and its size against that of training."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mereo import __main__ as command_line
+from mereo import commands
+from mereo.camera import Camera
+from mereo.files import read_point_cloud
+from mereo.input_config import InputConfig, IsolationConfig
+from mereo.observation import read_observation, size_warning
+from mereo.output import write_camera
+
+CAMERA = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """d.png shows 50 pixels at the value 2500; k.json is its camera."""
+    write_camera(tmp_path / "k.json", CAMERA)
+    depth = np.zeros((10, 20), dtype=np.uint16)
+    depth[2:7, 5:15] = 2500
+    Image.fromarray(depth).save(tmp_path / "d.png")
+    np.save(tmp_path / "d.npy", depth.astype(np.float32) / 5000)
+    return tmp_path
+
+
+def test_a_depth_image_becomes_the_points_it_shows(folder: Path) -> None:
+    seen = read_observation(folder / "d.png", InputConfig(intrinsics=folder / "k.json", depth_scale=5000.0))
+    points = seen.cloud.points
+    assert len(points) == 50 and seen.unit_m == 1.0 and seen.depth_m == (0.5, 0.5, 0.5)
+    np.testing.assert_allclose(points[:, 2], 0.5)
+    np.testing.assert_allclose(CAMERA.project(points)[0], [5.5, 2.5])
+    assert seen.size_m == pytest.approx((0.15, 4 / 60, 0.0))
+    assert str(seen).splitlines() == [
+        "the object has 50 points, depth 0.5 to 0.5 m (middle 0.5 m)",
+        "its visible part is 0.15 x 0.0667 x 0 m",
+    ]
+
+
+def test_the_depth_scale_of_the_intrinsics_is_for_integers_and_gives_way(folder: Path) -> None:
+    fields = json.loads((folder / "k.json").read_text())
+    (folder / "bop.json").write_text(json.dumps({**fields, "depth_scale": 0.2}))
+    for name, scale, expected in (
+        ("d.png", None, 0.5),
+        ("d.png", 2500.0, 1.0),
+        ("d.npy", None, 0.5),
+        ("d.npy", 0.5, 1),
+    ):
+        seen = read_observation(folder / name, InputConfig(intrinsics=folder / "bop.json", depth_scale=scale))
+        assert seen.depth_m[1] == pytest.approx(expected), (name, scale)
+
+
+def test_the_mask_and_the_crop_work_together(folder: Path) -> None:
+    mask = np.zeros((10, 20), np.uint8)
+    mask[:, :10] = 1
+    Image.fromarray(mask).save(folder / "m.png")
+    reading = InputConfig(intrinsics=folder / "k.json", mask=folder / "m.png", depth_scale=500.0)
+    seen = read_observation(folder / "d.png", reading)
+    assert len(seen.cloud) == 25
+    with pytest.raises(ValueError, match="the step 'depth range' leaves 0 of 25 points"):
+        read_observation(folder / "d.png", reading, IsolationConfig(depth_range=(1.0, 2.0)))
+
+
+@pytest.mark.parametrize(
+    "name, options, text",
+    [
+        ("d.png", {}, "is a depth image without intrinsics; they are needed: give --intrinsics FILE"),
+        (
+            "d.png",
+            {"intrinsics": Path("k.json"), "frame": "scanner"},
+            "is a depth image; those are always in the camera frame",
+        ),
+        ("d.png", {"intrinsics": Path("k.json"), "unit_m": 0.001}, "comes in metres: leave out --unit-m"),
+        ("d.png", {"intrinsics": Path("k.json"), "topic": "/d"}, "is no ROS recording and has no topics"),
+        (
+            "c.ply",
+            {"intrinsics": Path("k.json")},
+            "is read as a point cloud; leave out intrinsics, mask and depth scale",
+        ),
+        ("c.ply", {"mask": Path("m.png")}, "is read as a point cloud; leave out intrinsics, mask and depth scale"),
+        ("c.ply", {"depth_scale": 1000.0}, "is read as a point cloud; leave out intrinsics, mask and depth scale"),
+    ],
+)
+def test_contradictory_inputs(name: str, options: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        read_observation(Path(name), InputConfig(**options))
+
+
+def test_a_scan_has_no_depth(tmp_path: Path) -> None:
+    np.save(tmp_path / "c.npy", np.random.default_rng(0).normal(size=(100, 3)))
+    with pytest.raises(ValueError, match="scanner's frame, in which depth is not known.*crop with --box"):
+        read_observation(tmp_path / "c.npy", InputConfig(frame="scanner"), IsolationConfig(depth_range=(0.1, 1)))
+    seen = read_observation(tmp_path / "c.npy", InputConfig(frame="scanner"))
+    assert "depth" not in str(seen) and seen.facts()["depth_m"] is None
+
+
+def test_the_unit_of_a_cloud(tmp_path: Path) -> None:
+    """Boxes are in metres, points stay in the file's unit."""
+    points = np.random.default_rng(0).uniform((-100, -100, 500), (100, 100, 600), (400, 3))
+    np.save(tmp_path / "c.npy", points)
+    near = IsolationConfig(box=(-0.1, -0.1, 0.5, 0.1, 0.1, 0.55))
+    seen = read_observation(tmp_path / "c.npy", InputConfig(unit_m=0.001), near)
+    assert 150 < len(seen.cloud) < 250 and seen.cloud.points[:, 2].max() > 500
+    assert seen.depth_m[0] == pytest.approx(0.5, abs=0.01)
+    with pytest.raises(ValueError, match="the unit is 0 m; it must be positive: give 0.001 for millimetres"):
+        InputConfig(unit_m=0)
+
+
+def test_size_against_training(tmp_path: Path) -> None:
+    np.save(tmp_path / "c.npy", np.random.default_rng(0).uniform((0, 0, 1), (0.1, 0.05, 1.1), (400, 3)))
+    seen = read_observation(tmp_path / "c.npy")
+    for visible_m, fits in (([0.08, 0.2], True), ([0.15, 0.3], True), ([0.25, 0.5], False), ([0.01, 0.04], False)):
+        text = size_warning(seen, {"visible_m": visible_m})
+        assert (text is None) == fits, visible_m
+        assert fits or (text and "m in training: other things are in the cloud" in text and "--unit-m 0.001" in text)
+    assert size_warning(seen, {"scene": "bunny"}) is None and size_warning(seen, {"visible_m": None}) is None
+
+
+# --- Zivid -----------------------------------------------------------------------------------------------------------
+
+
+def test_zdf_is_an_organized_cloud_in_millimetres(tmp_path: Path) -> None:
+    netcdf = pytest.importorskip("netCDF4", reason="netCDF4 comes with the extra sensors")
+    points = np.random.default_rng(0).normal((0, 0, 700), 40, (6, 8, 3)).astype(np.float32)
+    points[1, 2] = np.nan
+    with netcdf.Dataset(tmp_path / "z.zdf", "w") as file:
+        group = file.createGroup("data")
+        for name, size in (("rows", 6), ("cols", 8), ("xyz", 3)):
+            group.createDimension(name, size)
+        group.createVariable("pointcloud", "f4", ("rows", "cols", "xyz"))[:] = points
+    with pytest.raises(ValueError, match="1 of 48 points without a measurement.*--drop-invalid"):
+        read_point_cloud(tmp_path / "z.zdf")
+    seen = read_observation(tmp_path / "z.zdf", InputConfig(drop_invalid=True))
+    np.testing.assert_array_equal(seen.cloud.points, np.delete(points.reshape(-1, 3), 10, axis=0))
+    assert seen.unit_m == 0.001 and 0.5 < seen.depth_m[1] < 0.9
+    with netcdf.Dataset(tmp_path / "other.zdf", "w") as file:
+        file.createGroup("nothing")
+    with pytest.raises(ValueError, match="other.zdf cannot be read as a point cloud"):
+        read_point_cloud(tmp_path / "other.zdf")
+
+
+def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, module, library in (("a.zdf", "point_formats", "netCDF4"), ("a.mcap", "recordings", "rosbags")):
+        (tmp_path / name).write_bytes(b"anything")
+        monkeypatch.setattr(f"mereo.{module}.find_spec", lambda _: None)
+        with pytest.raises(ImportError, match=rf"{name} needs {library}.*: pip install 'mereo\[sensors\]'"):
+            read_observation(tmp_path / name)
+
+
+# --- the command line ------------------------------------------------------------------------------------------------
+
+
+def test_the_options_of_reconstruct() -> None:
+    text = "reconstruct d.png --weights bunny --output o --intrinsics k.json --depth-range 0.4 0.9 --remove-plane"
+    command = command_line.parse(f"{text} --box -1 -2 0 1 2 3 --largest-cluster --cluster-gap 0.01".split())
+    assert isinstance(command, commands.Reconstruct)
+    assert command.reading == InputConfig(intrinsics=Path("k.json"))
+    assert command.isolation == IsolationConfig((0.4, 0.9), (-1, -2, 0, 1, 2, 3), True, False, True, 0.01)
+    command = command_line.parse(
+        ["reconstruct", "a.mcap", "--weights", "w", "--output", "o", "--topic", "/d", "--frame-index", "4"]
+    )
+    assert isinstance(command, commands.Reconstruct)
+    assert command.reading == InputConfig(topic="/d", frame_index=4) and not command.isolation.on
+
+
+@pytest.mark.parametrize(
+    "options, text",
+    [
+        ("--depth-range 0.9 0.4", "the depth range is 0.9 0.4"),
+        ("--box 0 0 0 1 1 0", "the box is 0 0 0 1 1 0"),
+        ("--unit-m -1", "the unit is -1.0 m"),
+    ],
+)
+def test_bad_options_are_one_line(options: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line.main(f"reconstruct c.npy --weights bunny --output o {options}".split()) == 2
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("mereo: error: ") and text in message and "\n" not in message

@@ -1,0 +1,198 @@
+"""ROS 1 bags, ROS 2 bags and MCAP files, written here by rosbags itself, give back depth and points."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mereo.camera import Camera, DepthImage
+from mereo.files import read_intrinsics
+from mereo.input_config import InputConfig
+from mereo.intrinsics import CameraWarning
+from mereo.observation import read_observation
+from mereo.recordings import recorded_frame, recorded_frames
+
+pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")
+
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
+DEPTH_MM = np.random.default_rng(0).integers(500, 2000, (3, 6, 8)).astype(np.uint16)
+DEPTH_MM[:, 0, 0] = 0
+STAMPS = (10**9, 2 * 10**9, 3 * 10**9)
+
+
+class Messages:
+    """Messages of one ROS version."""
+
+    def __init__(self, ros: int) -> None:
+        self.store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+        self.types: Any = self.store.types
+        self.ros = ros
+
+    def header(self) -> Any:
+        time = self.types["builtin_interfaces/msg/Time"](sec=1, nanosec=0)
+        more = {"seq": 0} if self.ros == 1 else {}
+        return self.types["std_msgs/msg/Header"](stamp=time, frame_id="camera", **more)
+
+    def image(self, values: np.ndarray, encoding: str, padding: int = 0, big: bool = False) -> Any:
+        rows = values.astype(values.dtype.newbyteorder(">" if big else "<")).view(np.uint8).reshape(len(values), -1)
+        rows = np.pad(rows, ((0, 0), (0, padding)))
+        height, width = values.shape[:2]
+        kind = self.types["sensor_msgs/msg/Image"]
+        return kind(
+            header=self.header(), height=height, width=width, encoding=encoding, is_bigendian=int(big),
+            step=rows.shape[1], data=rows.reshape(-1),
+        )  # fmt: skip
+
+    def info(self, focal: float = 10.0, distortion: float = 0.0) -> Any:
+        """Principal point 3.5, 2.5 with pixel centres at whole numbers is the middle of 8 x 6 pixels."""
+        matrix = np.array([focal, 0, 3.5, 0, 11.0, 2.5, 0, 0, 1.0])
+        projection = np.array([10.0, 0, 3.5, 0, 0, 11.0, 2.5, 0, 0, 0, 1.0, 0])
+        roi = self.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        values = {"d": np.array([distortion, 0, 0, 0, 0]), "k": matrix, "r": np.eye(3).ravel(), "p": projection}
+        values = {name.upper() if self.ros == 1 else name: value for name, value in values.items()}
+        kind = self.types["sensor_msgs/msg/CameraInfo"]
+        return kind(
+            header=self.header(), height=6, width=8, distortion_model="plumb_bob", binning_x=0, binning_y=0, roi=roi,
+            **values,
+        )  # fmt: skip
+
+    def cloud(self, points: np.ndarray) -> Any:
+        """Two rows; x, y, z as floats after four bytes of something else, and four of padding at the end of a row."""
+        field = self.types["sensor_msgs/msg/PointField"]
+        rows = np.zeros((2, len(points) // 2, 4), "<f4")
+        rows[..., 1:] = points.reshape(2, -1, 3)
+        data = np.pad(rows.view(np.uint8).reshape(2, -1), ((0, 0), (0, 4)))
+        kind = self.types["sensor_msgs/msg/PointCloud2"]
+        return kind(
+            header=self.header(), height=2, width=len(points) // 2, is_bigendian=False, point_step=16,
+            fields=[field(name, 4 * (i + 1), 7, 1) for i, name in enumerate("xyz")],
+            row_step=data.shape[1], data=data.reshape(-1), is_dense=False,
+        )  # fmt: skip
+
+
+def write_bag(path: Path, ros: int, topics: Callable[[Messages], dict[str, list[Any]]]) -> Path:
+    """``topics`` makes the messages of each topic; they are recorded a second apart."""
+    make = Messages(ros)
+    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    folder = path.with_suffix("") if ros == 2 else path
+    writer: Any = Writer1(folder) if ros == 1 else Writer2(folder, version=9, storage_plugin=plugin)
+    with writer:
+        for topic, messages in topics(make).items():
+            kind = messages[0].__msgtype__
+            connection = writer.add_connection(topic, kind, typestore=make.store)
+            serialize = make.store.serialize_ros1 if ros == 1 else make.store.serialize_cdr
+            for stamp, message in zip(STAMPS, messages, strict=False):
+                writer.write(connection, stamp, serialize(message, kind))
+    return next(folder.glob("*.mcap")) if path.suffix == ".mcap" else folder
+
+
+def depth_topics(make: Messages) -> dict[str, list[Any]]:
+    color = np.zeros((6, 8), np.uint8)
+    return {
+        "/camera/color/image_raw": [make.image(color, "mono8")],
+        "/camera/color/camera_info": [make.info(focal=99.0)],
+        "/camera/depth/image_raw": [make.image(depth, "16UC1", padding=6) for depth in DEPTH_MM],
+        "/camera/depth/camera_info": [make.info()] * 3,
+    }
+
+
+@pytest.mark.parametrize("name, ros", [("a.bag", 1), ("a.db3", 2), ("a.mcap", 2)])
+def test_the_depth_topic_is_found_and_read(tmp_path: Path, name: str, ros: int) -> None:
+    path = write_bag(tmp_path / name, ros, depth_topics)
+    frames = list(recorded_frames(path))
+    assert [frame.stamp_ns for frame in frames] == list(STAMPS)
+    for frame, depth in zip(frames, DEPTH_MM, strict=True):
+        content = frame.read()
+        assert isinstance(content, DepthImage) and content.camera == CAMERA
+        np.testing.assert_array_equal(content.depth, depth / 1000)
+    seen = read_observation(path, InputConfig(frame_index=2))
+    assert len(seen.cloud) == 47 and seen.unit_m == 1.0
+    assert seen.source == f"{path.name}, /camera/depth/image_raw at 3.000 s"
+
+
+def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
+    metres = (DEPTH_MM / np.float32(1000)).astype(np.float32)
+    metres[DEPTH_MM == 0] = np.nan
+    path = write_bag(
+        tmp_path / "a.bag", 1, lambda m: {"/d/image": [m.image(metres[0], "32FC1", big=True)], "/d/info": [m.info()]}
+    )
+    content = recorded_frame(path).read()
+    assert isinstance(content, DepthImage)
+    np.testing.assert_allclose(content.depth, DEPTH_MM[0] / 1000, rtol=1e-6)
+
+
+def test_point_clouds_keep_their_missing_points_until_asked(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).normal((0, 0, 2), 0.1, (80, 3)).astype(np.float32)
+    points[5] = np.nan
+    path = write_bag(tmp_path / "a.mcap", 2, lambda m: {"/points": [m.cloud(points)]})
+    np.testing.assert_array_equal(recorded_frame(path).read(), points.astype(np.float64))
+    with pytest.raises(ValueError, match="1 of 80 points without a measurement.*--drop-invalid"):
+        read_observation(path)
+    assert len(read_observation(path, InputConfig(drop_invalid=True)).cloud) == 79
+
+
+def test_distortion_counts_unless_the_topic_is_rectified(tmp_path: Path) -> None:
+    def topics(make: Messages) -> dict[str, list[Any]]:
+        image = make.image(DEPTH_MM[0], "16UC1")
+        info = make.info(focal=20.0, distortion=0.2)
+        return {"/d/image_raw": [image], "/d/image_rect": [image], "/d/camera_info": [info]}
+
+    path = write_bag(tmp_path / "a.bag", 1, topics)
+    with pytest.warns(CameraWarning, match="states lens distortion"):
+        content = recorded_frame(path, topic="/d/image_raw").read()
+    assert isinstance(content, DepthImage) and content.camera.focal_x_px == 20.0
+    content = recorded_frame(path, topic="/d/image_rect").read()
+    assert isinstance(content, DepthImage) and content.camera == CAMERA, "matrix P, not K"
+
+
+def test_one_broken_frame_stops_nothing(tmp_path: Path) -> None:
+    def topics(make: Messages) -> dict[str, list[Any]]:
+        good, odd = make.image(DEPTH_MM[0], "16UC1"), make.image(DEPTH_MM[0, :, :4], "16UC1")
+        return {"/d/image": [good, odd, good], "/d/camera_info": [make.info()]}
+
+    frames = list(recorded_frames(write_bag(tmp_path / "a.bag", 1, topics)))
+    with pytest.raises(ValueError, match=r"/d/image at 2000000000 ns cannot be read .*4 x 6 pixels.*: take another"):
+        frames[1].read()
+    assert isinstance(frames[2].read(), DepthImage)
+
+
+def test_what_a_recording_lacks_is_said(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", 1, depth_topics)
+    for options, expected in (
+        (
+            {"topic": "/nothing"},
+            "no images or clouds on topic '/nothing'; those it has are on: /camera/color",
+        ),
+        ({"frame_index": 3}, "has 3 frames; frame 3 is asked for"),
+        ({"frame_index": -1}, "the frame index is -1"),
+        ({"topic": "/camera/color/image_raw"}, "its encoding is 'mono8', not one of 16UC1"),
+        ({"frame": "scanner"}, "is a recording; those are always in the camera frame"),
+        ({"unit_m": 0.001}, "comes in metres: leave out --unit-m"),
+    ):
+        with pytest.raises(ValueError, match=expected) as caught:
+            read_observation(path, InputConfig(**options))  # type: ignore[arg-type]
+        assert "\n" not in str(caught.value)
+    blind = write_bag(tmp_path / "blind.bag", 1, lambda m: {"/d/image": [m.image(DEPTH_MM[0], "16UC1")]})
+    with pytest.raises(ValueError, match="has no CameraInfo.*--intrinsics"):
+        recorded_frame(blind)
+    (tmp_path / "k.json").write_text('{"fx": 10, "fy": 11, "cx": 3.5, "cy": 2.5, "width": 8, "height": 6}')
+    content = recorded_frame(blind, camera=read_intrinsics(tmp_path / "k.json").camera).read()
+    assert isinstance(content, DepthImage) and content.camera == CAMERA
+    color = write_bag(tmp_path / "color.bag", 1, lambda m: {"/c": [m.image(np.zeros((6, 8), np.uint8), "mono8")]})
+    with pytest.raises(ValueError, match=r"has neither depth images .* only /c \(sensor_msgs/msg/Image\)"):
+        recorded_frame(color)
+    (tmp_path / "damaged.bag").write_bytes(path.read_bytes()[:300])
+    (tmp_path / "noise.mcap").write_bytes(b"noise" * 50)
+    for name in ("damaged.bag", "noise.mcap"):
+        with pytest.raises(ValueError, match=f"{name} cannot be read as a ROS bag") as caught:
+            recorded_frame(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(FileNotFoundError, match="does not exist; a ROS bag is needed"):
+        recorded_frame(tmp_path / "no.bag")
