@@ -119,7 +119,9 @@ class LabPage:
             bounds = self.moment.view.mesh.transformed(T_world_camera).bounds
         toward, right = -T_world_camera[:3, 2], T_world_camera[:3, 0]
         direction = {"camera": toward + 0.2 * right, "side": right, "behind": -toward}[name]
-        self.stage.look_from(direction, bounds, 1.35 if self._shown.value != "side by side" else 2.2)
+        room = 1.35 if self._shown.value != "side by side" else 2.2
+        # up is where the depth image has it, so that a rolled camera's view looks like its image
+        self.stage.look_from(direction, bounds, room, -T_world_camera[:3, 1])
 
     # --- wishes -------------------------------------------------------------------------------------------------------
 

@@ -105,20 +105,25 @@ class Stage:
         return points / self.scale + self.center
 
     def look_from(
-        self, direction: Float[np.ndarray, "3"], bounds: Float[np.ndarray, "2 3"], room: float = 1.35
+        self,
+        direction: Float[np.ndarray, "3"],
+        bounds: Float[np.ndarray, "2 3"],
+        room: float = 1.35,
+        up: Float[np.ndarray, "3"] | None = None,
     ) -> None:
         """Turn every open page, and those to come, to what lies within ``bounds``, from this direction."""
+        up = self.up if up is None else up
         low, high = self.place(bounds)
         target = (low + high) / 2
         distance = room * float(np.linalg.norm(high - low)) / 2 / np.sin(FOV_RAD / 2)
         position = tuple(target + distance * direction / np.linalg.norm(direction))
         first = self.server.initial_camera
-        first.position, first.look_at, first.up = position, tuple(target), tuple(self.up)
+        first.position, first.look_at, first.up = position, tuple(target), tuple(up)
         first.fov = FOV_RAD
         for client in self.server.get_clients().values():
             with client.atomic():
                 client.camera.position, client.camera.look_at = position, tuple(target)
-                client.camera.up_direction = tuple(self.up)
+                client.camera.up_direction = tuple(up)
 
 
 class SegmentLayer:
