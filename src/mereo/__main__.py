@@ -17,6 +17,7 @@ from mereo.align_command import Align
 from mereo.bench_command import BenchCommand
 from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
 from mereo.experiment_command import Experiment
+from mereo.stream_command import StreamCommand
 from mereo.view_command import View
 
 Choice = TypeVar("Choice")
@@ -117,6 +118,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
         | Annotated[Align, subcommand("align")]
         | Annotated[View, subcommand("view")]
+        | Annotated[StreamCommand, subcommand("stream")]
         | Annotated[Experiment, subcommand("experiment")]
         | Annotated[BenchCommand, subcommand("bench")]
     )

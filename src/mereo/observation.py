@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from mereo.camera import DepthImage, PointCloud
+from mereo.camera import Camera, DepthImage, PointCloud
 from mereo.depth_formats import is_depth_image, metres, read_raw_depth
 from mereo.files import read_intrinsics, read_point_cloud, usable_depth, valid_points
 from mereo.input_config import Frame, InputConfig, IsolationConfig
 from mereo.isolation import IsolationStep, isolate
 from mereo.mesh_files import readable
-from mereo.recordings import is_recording, recorded_frame
+from mereo.recordings import RecordedFrame, is_recording, recorded_frame
 
 UNITS_M = {".zdf": 0.001}
 """Metres per unit of clouds whose format says it."""
@@ -175,12 +175,22 @@ def _read_depth(path: Path, reading: InputConfig) -> PointCloud:
 
 def _read_recording(path: Path, reading: InputConfig) -> tuple[PointCloud, str]:
     """The points, and which message they are."""
+    frame = recorded_frame(path, reading.frame_index or 0, *recording_options(reading))
+    return recorded_points(frame, path, reading), f"{path.name}, {frame.topic} at {frame.stamp_ns / 1e9:.3f} s"
+
+
+def recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
+    """Topic, camera and depth scale, as ``recorded_frames`` takes them."""
     own = None if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
     scale = own.depth_scale if own is not None and reading.depth_scale is None else reading.depth_scale
-    frame = recorded_frame(path, reading.frame_index or 0, reading.topic, own.camera if own else None, scale)
-    content, source = frame.read(), f"{path.name}, {frame.topic} at {frame.stamp_ns / 1e9:.3f} s"
+    return reading.topic, own.camera if own else None, scale
+
+
+def recorded_points(frame: RecordedFrame, path: Path, reading: InputConfig) -> PointCloud:
+    """The points of one message of the recording ``path``, in metres."""
+    content = frame.read()
     if isinstance(content, DepthImage):
-        return usable_depth(content, path, reading.mask).to_points(), source
+        return usable_depth(content, path, reading.mask).to_points()
     if reading.mask is not None:
         raise ValueError(f"{frame.topic} in {path} has point clouds; leave out the mask, or name an image's --topic")
-    return PointCloud(valid_points(content, path, reading.drop_invalid)), source
+    return PointCloud(valid_points(content, path, reading.drop_invalid))

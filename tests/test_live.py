@@ -1,0 +1,115 @@
+"""`mereo stream` on a recorded sequence of a deforming object, thirty frames a second."""
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mereo.camera import Camera, DepthImage
+from mereo.frame import inverse_rigid
+from mereo.freedoms import freedoms, random_state, set_value
+from mereo.input_config import InputConfig, IsolationConfig
+from mereo.live import stream_reconstructions
+from mereo.mesh import SegmentedMesh
+from mereo.output import write_camera
+from mereo.rendering import add_depth_noise, render_depth
+from mereo.scene import load_scene
+from mereo.stream_sources import frames_of
+
+FRAMES, BAD, RATE_HZ = 30, 12, 30.0
+UNIT_M = 0.005
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[SegmentedMesh]]:
+    """A rope that swings at one joint within a second, as depth images, one of them damaged; and the truth."""
+    folder = tmp_path_factory.mktemp("sequence")
+    scene, rng = load_scene("rope"), np.random.default_rng(0)
+    played = random_state(scene, 1_000_003)
+    freedom = next(f for f in freedoms(played) if f.high > f.low)
+    camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
+    T_camera_world = None
+    truth = []
+    for number in range(FRAMES):
+        share = 0.3 + 0.4 * number / FRAMES
+        state = set_value(scene, played, freedom, freedom.low + share * (freedom.high - freedom.low))
+        mesh = scene.deform(state.deformations).mesh
+        if T_camera_world is None:
+            T_camera_world = inverse_rigid(scene.workspace.sample(rng, mesh.bounds.mean(axis=0)))
+        truth.append(mesh.transformed(T_camera_world))
+        depth = add_depth_noise(render_depth(truth[-1], camera), 0.1, rng)
+        write_depth(folder / f"{number:03}.png", depth)
+    (folder / f"{BAD:03}.png").write_bytes(b"\x89PNG cut off")
+    write_camera(folder / "camera.json", camera)
+    return folder, truth
+
+
+def write_depth(path: Path, depth: DepthImage) -> None:
+    """Tenths of millimetres in 16 bits."""
+    Image.fromarray(np.rint(depth.depth * UNIT_M * 10_000).astype(np.uint16)).save(path)
+
+
+def read(folder: Path) -> InputConfig:
+    return InputConfig(intrinsics=folder / "camera.json", depth_scale=10_000.0)
+
+
+def test_every_frame_of_a_second_is_answered_but_the_bad_one(
+    sequence: tuple[Path, list[SegmentedMesh]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, truth = sequence
+    summary = stream_reconstructions(
+        str(folder), "rope", resolution=24, every_frame=True, reading=read(folder), surfaces=tmp_path / "glb"
+    )
+    assert (summary.answered, summary.failed, summary.dropped) == (FRAMES - 1, 1, 0)
+    out, err = capsys.readouterr()
+    lines = [json.loads(text) for text in out.splitlines()]
+    assert [one["frame"] for one in lines] == [f"{number:03}.png" for number in range(FRAMES)]
+    assert "error" in lines[BAD] and f"{BAD:03}.png" in lines[BAD]["error"]
+    assert len(list((tmp_path / "glb").iterdir())) == FRAMES - 1
+    assert "29 frames answered at" in err and "1 bad" in err
+    # the base of the rope is found where it is, in metres
+    base = truth[0].segments[0].vertices.mean(axis=0) * UNIT_M
+    found = np.array([one["segments"]["base"]["centroid"] for one in lines if "segments" in one])
+    assert np.median(np.linalg.norm(found - base, axis=1)) < 0.02
+
+
+def test_at_its_recorded_pace_the_latest_frame_wins(
+    sequence: tuple[Path, list[SegmentedMesh]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = sequence
+    summary = stream_reconstructions(str(folder), "rope", resolution=24, rate_hz=RATE_HZ, reading=read(folder))
+    assert summary.answered + summary.failed + summary.dropped == FRAMES
+    lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
+    assert lines[-1]["frame"] == f"{FRAMES - 1:03}.png"
+    times = [one["time_s"] for one in lines]
+    assert times == sorted(times)
+    assert lines[-1]["time_s"] == pytest.approx((FRAMES - 1) / RATE_HZ)
+
+
+def test_names_on_standard_input_are_frames(
+    sequence: tuple[Path, list[SegmentedMesh]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, _ = sequence
+    monkeypatch.setattr(sys, "stdin", io.StringIO(f"{folder / '000.png'}\n\n{folder / '001.png'}\n"))
+    frames = list(frames_of("-", read(folder), IsolationConfig()))
+    assert [Path(frame.name).name for frame in frames] == ["000.png", "001.png"]
+    assert len(frames[1].load()) > 32
+
+
+def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
+    reading, isolation = InputConfig(), IsolationConfig()
+    with pytest.raises(FileNotFoundError, match="does not exist; a folder of frames"):
+        frames_of(str(tmp_path / "nowhere"), reading, isolation)
+    with pytest.raises(ValueError, match="has no depth images or point clouds"):
+        frames_of(str(tmp_path), reading, isolation)
+    (tmp_path / "a.ply").write_text("ply")
+    with pytest.raises(ValueError, match="is a single file"):
+        frames_of(str(tmp_path / "a.ply"), reading, isolation)
+    with pytest.raises(ValueError, match="the rate is 0"):
+        frames_of(str(tmp_path), reading, isolation, 0)
+    with pytest.raises(ValueError, match="none of the 1 frames could be answered"):
+        stream_reconstructions(str(tmp_path), "rope")
