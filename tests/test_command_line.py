@@ -56,7 +56,7 @@ def test_help_is_instant_and_names_every_command() -> None:
         result = mereo("--help")
         seconds.append(time.perf_counter() - start)
     assert result.returncode == 0
-    names = ("demo", "doctor", "scene", "assets", "generate", "train", "evaluate", "reconstruct")
+    names = ("demo", "doctor", "scene", "assets", "generate", "train", "evaluate", "reconstruct", "align")
     assert all(f"• {name} " in result.stdout for name in names)
     assert min(seconds) < 0.5
 

@@ -80,6 +80,7 @@ def test_as_one_moves_all_by_one_motion(points: np.ndarray) -> None:
     mine = scan_of(moved(rest, true_poses()[[0, 2]]), NOISE)
     rough = Start(start().poses[[0, 2]], np.zeros(2, bool), "")
     base, peg = place(rest, mine, rough, as_one=True).segments
+    assert base.placed_by == peg.placed_by == "object"
     np.testing.assert_array_equal(base.T_scan_segment, peg.T_scan_segment)
     assert pose_error(base.T_scan_segment, true_poses()[0], middles()[0])[0] < 0.05
 

@@ -13,15 +13,18 @@ from analytic import AnalyticModel
 
 from mereo import assets
 from mereo.__main__ import main
+from mereo.mesh import SegmentedMesh
 from mereo.mesh_files import read_segmented_mesh
 from mereo.metrics import Scores
 from mereo.placement import Start, place
+from mereo.rough_start import start_from_model
 from mereo.scan_evaluation import evaluate_scans
 from mereo.scan_surface import moved
 from mereo.scan_truth import read_truth
 from mereo.scans import SCANS, bunny_posed, bunny_scan
 from mereo.scene import Scene, load_scene
 from mereo.solid import Solids
+from mereo.weights import load_model
 
 pytest.importorskip("small_gicp", reason="the extra align is not installed")
 
@@ -146,14 +149,24 @@ def test_the_rest_pose_is_exported(bar: tuple[Path, Scene, np.ndarray], capsys: 
 
 # --- the bunny's real scans ------------------------------------------------------------------------------------------
 
-TOLERANCE = {
-    "body": (0.25, 0.4),
-    "head": (0.7, 1.0),
-    "ear_left": (0.7, 1.0),
-    "ear_right": (0.7, 1.0),
-    "tail": (0.7, 1.0),
-}
+TOLERANCE = {"body": (0.25, 0.4), "tail": (0.7, 2.0)} | dict.fromkeys(("head", "ear_left", "ear_right"), (0.7, 1.0))
 """Millimetres at the segment's middle, and degrees, from the published pose; the scan lies 0.1 mm from the model."""
+
+
+def bunny_scale() -> float:
+    """Metres per scene unit."""
+    from mereo.scenes.bunny import model_to_scene
+
+    return 1 / model_to_scene()[1]
+
+
+def bunny_truth_pose(name: str) -> tuple[SegmentedMesh, np.ndarray]:
+    """The bunny at rest, and its published pose in a scan."""
+    from mereo.scenes.bunny import model_to_scene
+
+    T_model_scene = np.diag([bunny_scale()] * 3 + [1.0])
+    T_model_scene[:3, 3] = model_to_scene()[0]
+    return load_scene("bunny").rest, np.linalg.inv(assets.BUNNY_SCAN_POSES[name]) @ T_model_scene
 
 
 @pytest.mark.slow
@@ -164,13 +177,8 @@ def test_scans_of_the_bunny_come_back_to_their_published_pose(
 ) -> None:
     """From 15 to 20 degrees and a tenth of its size beside it."""
     require_asset("bunny/bunny.off"), require_asset(f"bunny/{name}.ply")
-    from mereo.scenes.bunny import model_to_scene
-
-    rest, (center, scale) = load_scene("bunny").rest, model_to_scene()
-    T_model_scene = np.diag([1 / scale] * 3 + [1.0])
-    T_model_scene[:3, 3] = center
-    true = np.linalg.inv(assets.BUNNY_SCAN_POSES[name]) @ T_model_scene
-    size = float(np.linalg.norm(rest.bounds[1] - rest.bounds[0])) / scale
+    rest, true = bunny_truth_pose(name)
+    size = float(np.linalg.norm(rest.bounds[1] - rest.bounds[0])) * bunny_scale()
     rough = perturbed(true, rest.bounds.mean(axis=0), 15 + 5 * seed, 0.1 * size, seed)
     placement = place(rest, bunny_scan(name)[0].points, Start(np.stack([rough] * 5), np.zeros(5, bool), ""), "scanner")
     assert placement.explained > 0.99
@@ -180,6 +188,21 @@ def test_scans_of_the_bunny_come_back_to_their_published_pose(
         assert not found.seen or 1000 * found.median < 0.15
     unseen = {"bun270": ["tail"], "chin": ["ear_left"]}
     assert [found.name for found in placement.segments if not found.seen] == unseen.get(name, [])
+
+
+@pytest.mark.slow
+def test_weights_give_a_start(require_asset: Callable[[str], Path]) -> None:
+    """Near enough for ICP: within 10 mm and 10 degrees of the published pose, body and head."""
+    require_asset("bunny/bunny.off"), require_asset("bunny/bun000.ply")
+    rest, true = bunny_truth_pose("bun000")
+    scan = bunny_scan("bun000")[0].points
+    start = start_from_model(load_model("bunny"), scan, "scanner", rest, bunny_scale())
+    assert "not independent" in start.how
+    for pose, segment in zip(start.poses[:2], rest.segments[:2], strict=True):
+        shift, turn_deg = pose_error(pose, true, segment.bounds.mean(axis=0))
+        assert 1000 * shift < 10 and turn_deg < 10
+    with pytest.raises(ValueError, match="give the scene's unit with --scene-unit-mm"):
+        start_from_model(load_model("bunny"), scan, "scanner", rest, None)
 
 
 def test_the_bunnys_scans_remain_what_scans_alone_means(require_asset: Callable[[str], Path]) -> None:

@@ -51,7 +51,8 @@ class PlacedSegment:
     Attributes:
         name: of the segment.
         T_scan_segment: from rest coordinates (scene units).
-        placed_by: "scan", "start", or "with NAME": at its place at rest relative to that segment.
+        placed_by: "scan"; "object": as one with it, as asked; "start"; or "with NAME": at its place at rest relative to
+            that segment.
         points: of the scan that lie on it.
         median, rms, p95: of their distances; NaN without points.
         shift: of its middle, from the start.
@@ -72,7 +73,8 @@ class PlacedSegment:
 
     @property
     def seen(self) -> bool:
-        return self.placed_by == "scan"
+        """Whether the scan was asked for its place."""
+        return self.placed_by in ("scan", "object")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +139,7 @@ def place(
     _check_explained(whole, scan)
     _check_runaway(rest, start.poses, whole, diagonal(rest))
     if as_one:
-        return _measured(rest, shown, points, scan, start, whole, ["scan"] * len(held))
+        return _measured(rest, shown, points, scan, start, whole, ["object"] * len(held))
     others = [[index] for index in range(len(held)) if not held[index]]
     each = register(shown, scan, whole.poses, others, SEGMENT_LIMITS, hold=True)
     _check_explained(each, scan)
