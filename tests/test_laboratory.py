@@ -49,7 +49,7 @@ def test_pictures_do_not_flicker_and_follow_a_slider() -> None:
 
 
 def test_what_cannot_be_shown_is_said_in_one_sentence() -> None:
-    laboratory = Laboratory(toy_scene(distance=(100.0, 90_000.0)), None)
+    laboratory = Laboratory(toy_scene(), None)
     played = random_state(laboratory.scene, 0)
     with pytest.raises(ValueError, match="the camera sees 0 points of the object; at least .* move the camera"):
         laboratory.look(played, CameraPlace(0.1, 0.0, 90_000.0))

@@ -119,7 +119,7 @@ class LabPage:
             bounds = self.moment.view.mesh.transformed(T_world_camera).bounds
         toward, right = -T_world_camera[:3, 2], T_world_camera[:3, 0]
         direction = {"camera": toward + 0.2 * right, "side": right, "behind": -toward}[name]
-        room = 1.35 if self._shown.value != "side by side" else 2.2
+        room = 1.35 if self._shown.value != "side by side" else 2.4
         # up is where the depth image has it, so that a rolled camera's view looks like its image
         self.stage.look_from(direction, bounds, room, -T_world_camera[:3, 1])
 
@@ -209,7 +209,7 @@ class LabPage:
         with self._drawing, self.server.atomic():
             mode, T_world_camera = self._shown.value, moment.view.T_world_camera
             # side by side: both give way, along the camera's horizon
-            aside = (1.05 if mode == "side by side" else 0.0) * T_world_camera[:3, 0]
+            aside = (1.2 if mode == "side by side" else 0.0) * T_world_camera[:3, 0]
             self._draw_camera(moment.view, -aside)
             if mode == "reconstruction":
                 self.true.clear_from()
