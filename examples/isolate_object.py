@@ -55,7 +55,7 @@ def crowded_bunny(output: Path) -> None:
     scan, truth, _ = scan_in_camera(SCAN)
     crowded = PointCloud(crowd(scan.points, np.random.default_rng(0)))
     near, far = scan.points[:, 2].min() - 0.05, scan.points[:, 2].max() + 0.05
-    config = IsolationConfig(depth_range=(near, far), remove_plane=True, largest_cluster=True, cluster_gap=0.02)
+    config = IsolationConfig(depth_range=(near, far), remove_plane=True, largest_cluster=True, cluster_gap=0.05)
     isolated, steps = isolate(crowded, config)
     for step in steps:
         print(f"  {step}")

@@ -63,7 +63,7 @@ def test_the_mask_and_the_crop_work_together(folder: Path) -> None:
     reading = InputConfig(intrinsics=folder / "k.json", mask=folder / "m.png", depth_scale=500.0)
     seen = read_observation(folder / "d.png", reading)
     assert len(seen.cloud) == 25
-    with pytest.raises(ValueError, match="the step 'depth range' leaves 0 of 25 points"):
+    with pytest.raises(ValueError, match="the step 'depth range' leaves 0 of 25 points, which reach"):
         read_observation(folder / "d.png", reading, IsolationConfig(depth_range=(1.0, 2.0)))
 
 

@@ -49,7 +49,7 @@ class IsolationConfig:
         remove_outliers: leave out points whose neighbours are unusually far.
         largest_cluster: keep only the largest group of points that hang together. A part that something else in front
             cuts off is lost, unless `cluster_gap` reaches it.
-        cluster_gap: with `largest_cluster`, also keep groups nearer than this to it, in metres.
+        cluster_gap: with `largest_cluster`, also keep groups (of 32 points or more) nearer than this to it, in metres.
     """
 
     depth_range: tuple[float, float] | None = None

@@ -92,9 +92,10 @@ def isolate(
         keep, detail = step(points)
         left = int(keep.sum())
         if left < MIN_POINTS:
+            corners = " to ".join(_numbers(corner * unit_m) for corner in (points.min(axis=0), points.max(axis=0)))
             raise ValueError(
-                f"the step {name!r} leaves {left} of {len(points)} points; the object needs at least {MIN_POINTS}: "
-                f"{CURES[name]}"
+                f"the step {name!r} leaves {left} of {len(points)} points, which reach from {corners} m; the object "
+                f"needs at least {MIN_POINTS}: {CURES[name]}"
             )
         if left < len(points) or name != "thinning":
             done.append(IsolationStep(name, len(points), left, detail))
@@ -103,12 +104,16 @@ def isolate(
 
 
 CURES = {
-    "depth range": "widen --depth-range, in metres",
-    "box": "widen --box, in metres in the input's frame",
+    "depth range": "widen --depth-range",
+    "box": "widen --box",
     "plane": "leave out --remove-plane, or crop with --box first",
     "outliers": "leave out --remove-outliers, or crop with --box first",
     "largest cluster": "leave out --largest-cluster, or crop with --box first",
 }
+
+
+def _numbers(position: Float[np.ndarray, "3"]) -> str:
+    return f"({', '.join(f'{value:.3g}' for value in position)})"
 
 
 def _steps(
@@ -178,12 +183,16 @@ def clusters(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 
 
 def _largest_cluster(points: Float[np.ndarray, "n 3"], gap: float) -> Keep:
-    """With the clusters nearer than ``gap`` to it, those nearer than ``gap`` to them, and so on."""
+    """With the clusters nearer than ``gap`` to it, those nearer than ``gap`` to them, and so on.
+
+    Clusters of fewer than ``MIN_POINTS`` are floating points and do not count.
+    """
     label = clusters(points)
     keep, sizes = label == 0, np.bincount(label)
-    while gap > 0 and not keep.all():
-        distance = cKDTree(points[keep]).query(points[~keep], distance_upper_bound=gap)[0]
-        near = np.unique(label[~keep][np.isfinite(distance)])
+    parts = sizes[label] >= MIN_POINTS
+    while gap > 0 and (rest := parts & ~keep).any():
+        distance = cKDTree(points[keep]).query(points[rest], distance_upper_bound=gap)[0]
+        near = np.unique(label[rest][np.isfinite(distance)])
         if len(near) == 0:
             break
         keep |= np.isin(label, near)
