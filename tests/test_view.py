@@ -63,19 +63,19 @@ def server() -> Iterator[object]:
 @needs_browser
 def test_the_page_of_a_frame_shows_every_segment_and_answers(tmp_path: Path, server: object) -> None:
     page = FramePage(server, toy_inspection(), "toy <frame>", "closed form", "mm")
-    with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (900, 640)) as browser:  # type: ignore[attr-defined]
+    with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (760, 480)) as browser:  # type: ignore[attr-defined]
         until(lambda: "toy <frame>" in browser.text())
         browser.still()
         assert {"box_0", "box_1", "box_2", "ball", "Probe"} <= set(browser.text().split("\n"))
 
         def all_shown() -> bool:
-            shown = browser.screenshot()[:, :560]
+            shown = browser.screenshot()[:, :420]
             Image.fromarray(shown).save(tmp_path / "page.png")
             return all(pixels_of(shown, segment.color) > 150 for segment in page.mesh.segments)
 
         until(all_shown)
         # the middle of the stage lies in the middle box: a click there asks the model
-        browser.click(280, 320)
+        browser.click(220, 250)
         until(lambda: "the nearest surface" in browser.text())
         assert re.search(r"box_\d at -?[\d.]+", browser.text())
         page.coloring.value = "distance"

@@ -59,7 +59,8 @@ class Call:
 class Recorder(np.random.Generator):
     """A generator that records its draws, and takes those that it is given.
 
-    Methods that are not here (``gamma``, ``spawn``, ...) work and depend on the seed alone; they get no slider.
+    Methods that are not here (``gamma``, ``spawn``, ...), choices without replacement and draws into an array that is
+    given work, and depend on the seed alone; they get no slider.
     """
 
     def __init__(self, seed: int, given: Mapping[Key, Shares], most: int | None = None) -> None:
@@ -95,6 +96,8 @@ class Recorder(np.random.Generator):
         return _plain(np.asarray(low, dtype=float) + shares * (np.asarray(high, dtype=float) - low))
 
     def random(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
+        if out is not None:
+            return super().random(size, dtype, out)
         shape = _shape(size)
         return _plain(self._take("uniform", shape, 0.0, 1.0).reshape(shape).astype(dtype))
 
@@ -103,6 +106,8 @@ class Recorder(np.random.Generator):
         return _plain(loc + scale * ndtri(self._take("normal", shape, -np.inf, np.inf)).reshape(shape))
 
     def standard_normal(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
+        if out is not None:
+            return super().standard_normal(size, dtype, out)
         shape = _shape(size)
         return _plain(ndtri(self._take("normal", shape, -np.inf, np.inf)).reshape(shape).astype(dtype))
 

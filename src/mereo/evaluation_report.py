@@ -37,7 +37,7 @@ th:first-child, td:first-child { text-align: left; padding-left: 0; }
 .swatch { width: 14px; height: 14px; border-radius: 4px; display: inline-block; margin-right: 9px; vertical-align: -2px; }
 .bar { display: inline-block; width: 120px; height: 6px; border-radius: 3px; background: var(--line); margin-right: 8px; vertical-align: 2px; overflow: hidden; }
 .bar i { display: block; height: 100%; background: rgb(var(--accent)); }
-.long { max-height: 460px; overflow: auto; } .cm td { text-align: center; }
+.long { max-height: 360px; overflow: auto; } .cm td { text-align: center; } .cm td:first-child { text-align: left; }
 img { width: 100%; border-radius: 8px; background: #fff; display: block; }
 footer { color: var(--soft); font-size: 13px; }
 """  # noqa: E501 (lines of CSS)
@@ -66,8 +66,8 @@ def write_evaluation_report(
             f"<h1>{escape(title)}</h1>",
             f"<p>{escape('  ·  '.join(shown))}</p>",
             _overall(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]),
-            f'<div class="pair">{_segments(metrics["per_segment"], colors)}',
-            f"{_confusion(('empty', *names), metrics['confusion'])}</div>{_examples(metrics['per_example'])}",
+            f'<div class="pair">{_segments(metrics["per_segment"], colors)}{_examples(metrics["per_example"])}</div>',
+            _confusion(("empty", *names), metrics["confusion"]),
         )
     )
     words = escape(str(metrics.get("definition", "")))
@@ -109,7 +109,9 @@ def _confusion(classes: Sequence[str], confusion: Int[np.ndarray, "c c"]) -> str
     head = "".join(f"<th>{escape(name)}</th>" for name in classes)
     rows = "".join(
         f"<tr><td>{escape(name)}</td>"
-        + "".join(f'<td style="background:rgb(var(--accent) / {share:.3f})">{_percent(share)}</td>' for share in row)
+        + "".join(
+            f'<td style="background:rgb(var(--accent) / {0.7 * share:.3f})">{_percent(share)}</td>' for share in row
+        )
         + f"<td>{count:,}</td></tr>"
         for name, row, count in zip(classes, shares, confusion.sum(axis=1), strict=True)
     )

@@ -226,7 +226,7 @@ def set_value(scene: Scene, played: Played, freedom: Freedom, value: float) -> P
     given = {**played.remembered, call.key: shares}
     try:
         result = _played(scene, played.seed, given, turns, played)
-    except OutOfDraws:
+    except (OutOfDraws, ValueError):  # a scene that gives up raises ValueError
         raise Refused(_refusal(freedom)) from None
     taken = next((c for c in result.calls if c.key == call.key), None)
     if taken is None or not np.allclose(taken.shares, shares, atol=1e-6):

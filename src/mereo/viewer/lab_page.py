@@ -26,7 +26,7 @@ from mereo.viewer.stage import CLOUD_COLOR, CLOUD_SIZE, SegmentControls, Segment
 
 SHOWN = ("reconstruction", "truth", "side by side")
 COLORINGS = ("segment", "error", "confidence", "distance")
-QUICK, FINE = (48, 32), (96, 64)
+QUICK, FINE = (32, 24), (96, 64)
 """Resolution of surfaces and cells of the score, while a slider moves and when it rests."""
 
 HISTORY = 60
