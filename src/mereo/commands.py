@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mereo.config import GenerateConfig, Sensor, SensorConfig, TrainConfig
+from mereo.writers import FilesConfig
 
 Preset = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
 
@@ -194,6 +195,7 @@ class Reconstruct:
         mask: image that is not 0 on the object.
         frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
         drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
+        files: which files, and in which unit.
         force: replace an existing output folder.
     """
 
@@ -206,6 +208,7 @@ class Reconstruct:
     mask: Path | None = None
     frame: Literal["camera", "scanner"] = "camera"
     drop_invalid: bool = False
+    files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
     force: bool = False
 
     def run(self) -> None:
@@ -221,6 +224,7 @@ class Reconstruct:
             mask=self.mask,
             frame=self.frame,
             drop_invalid=self.drop_invalid,
+            files=self.files,
             force=self.force,
         )
 

@@ -23,16 +23,19 @@ from mereo.camera import PointCloud
 from mereo.extraction import LabelGrid, extract_whole, locate
 from mereo.files import read_camera, read_depth_image, read_point_cloud
 from mereo.frame import inverse_rigid, rigid, transform_points
-from mereo.measurement import FoundSegment, measure
+from mereo.measurement import FoundSegment, SegmentedCloud, measure, segment_points
 from mereo.mesh import PALETTE, Color, SegmentedMesh
 from mereo.mesh_files import readable
 from mereo.model import Model
-from mereo.output import GLTF_CAMERA_ROTATION, new_directory, write_json, write_labels_npz, write_segments_glb
+from mereo.output import new_directory
 from mereo.pictures import render_cloud_and_segments
 from mereo.refinement import Field
 from mereo.report import write_report
 from mereo.scans import SCANNER_TO_CAMERA, scanner_to_camera
 from mereo.weights import load_model
+from mereo.writers import DEFAULT_FILES, FilesConfig
+from mereo.writers.formats import Results, chosen_formats, write_formats
+from mereo.writers.glb import GLTF_CAMERA_ROTATION
 
 Frame = Literal["camera", "scanner"]
 
@@ -52,6 +55,7 @@ class Reconstruction:
         timings_s: seconds of each stage.
         evaluated: points at which the network was asked for surfaces.
         clipped: whether a segment still reached the largest box and was closed there.
+        observed: the segment of each input point, where it was asked for.
     """
 
     surfaces: SegmentedMesh
@@ -60,10 +64,15 @@ class Reconstruction:
     timings_s: dict[str, float]
     evaluated: int
     clipped: bool
+    observed: SegmentedCloud | None = None
 
 
 def reconstruct(
-    cloud: PointCloud | Float[np.ndarray, "n 3"], model: Model, resolution: int = 128, frame: Frame = "camera"
+    cloud: PointCloud | Float[np.ndarray, "n 3"],
+    model: Model,
+    resolution: int = 128,
+    frame: Frame = "camera",
+    label_points: bool = False,
 ) -> Reconstruction:
     """All segments of the object that ``cloud`` shows.
 
@@ -73,6 +82,7 @@ def reconstruct(
         resolution: cells along the longest side of the object's box.
         frame: the cloud's axes: "camera" is x right, y down, z forward from the camera at the origin; "scanner" is y
             up, z toward the scanner.
+        label_points: also say on which segment each point of the cloud lies (``Reconstruction.observed``).
 
     Raises ``ValueError`` for unusable clouds, and where the model finds no segment at all.
     """
@@ -80,7 +90,8 @@ def reconstruct(
     timings: dict[str, float] = {}
     T_camera_input = scanner_to_camera(points) if frame == "scanner" else np.eye(4)
     with _timed(timings, "encode"):
-        code = model.encode(PointCloud(transform_points(T_camera_input, points)))
+        seen = transform_points(T_camera_input, points)
+        code = model.encode(PointCloud(seen))
     field: Field = partial(model.logits, code)
     names, colors = segment_names(model)
     with _timed(timings, "locate"):
@@ -89,8 +100,12 @@ def reconstruct(
         found = extract_whole(field, box, resolution, names, colors, model.nested if "ce" in model.loss else ())
     with _timed(timings, "measure"):
         segments = measure(found, model, code)
+    observed = None
+    if label_points:
+        with _timed(timings, "points"):
+            observed = segment_points(field(seen), points, names, colors)
     clipped = bool(found.grid.touched_sides().any())
-    result = Reconstruction(found.surfaces, found.grid, segments, timings, found.evaluated, clipped)
+    result = Reconstruction(found.surfaces, found.grid, segments, timings, found.evaluated, clipped, observed)
     return result if frame == "camera" else _turned_back(result, inverse_rigid(T_camera_input))
 
 
@@ -164,34 +179,42 @@ def write_reconstruction(
     output_dir: str | Path,
     *,
     frame: Frame = "camera",
+    files: FilesConfig = DEFAULT_FILES,
     force: bool = False,
     **facts: object,
 ) -> None:
-    """Write segments.glb, labels.npz, summary.json, preview.png and report.html into a new directory, all or nothing.
+    """Write preview.png, report.html and ``files`` into a new directory, all or nothing.
 
-    ``facts`` (``title``, ``unit``, ...) are added to the summary and shown in the report. Raises ``FileExistsError``
-    for a directory with content unless ``force``.
+    By default these are segments.glb, labels.npz and summary.json; ``mereo.writers.formats.WRITERS`` names all. The
+    format "points" needs ``reconstruct(..., label_points=True)``. ``facts`` (``title``, ``unit``, ...) are added to the
+    summary and shown in the report. Raises ``FileExistsError`` for a directory with content unless ``force``, and
+    ``ImportError`` where a format's extra is missing.
     """
     with new_directory(output_dir, force) as directory:
-        _write_files(directory, result, cloud, frame, facts)
+        _write_files(directory, result, cloud, frame, files, facts)
 
 
 def _write_files(
-    directory: Path, result: Reconstruction, cloud: PointCloud, frame: Frame, facts: dict[str, object]
+    directory: Path,
+    result: Reconstruction,
+    cloud: PointCloud,
+    frame: Frame,
+    files: FilesConfig,
+    facts: dict[str, object],
 ) -> None:
     started = time.perf_counter()
-    grid = result.labels
+    formats = chosen_formats(files.formats)
     to_viewer = GLTF_CAMERA_ROTATION if frame == "camera" else np.eye(3)
-    write_segments_glb(directory / "segments.glb", result.surfaces, to_viewer)
-    write_labels_npz(directory / "labels.npz", grid.labels, grid.origin, grid.spacing, grid.names)
+    results = Results.of(result.surfaces, result.labels, result.observed, to_viewer, files)
+    write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
     to_camera = rigid(np.eye(3) if frame == "camera" else SCANNER_TO_CAMERA, np.zeros(3))
     seen = PointCloud(transform_points(to_camera, cloud.points))
     title = str(facts.get("title", "mereo reconstruction"))
     render_cloud_and_segments(directory / "preview.png", seen, result.surfaces.transformed(to_camera), title)
     timings_s = {**result.timings_s, "write": time.perf_counter() - started}
-    summary = summarize(replace(result, timings_s=timings_s), frame=frame, **facts)
+    summary = summarize(replace(result, timings_s=timings_s), frame=frame, unit_m=files.unit_m, **facts)
     write_report(directory / "report.html", cloud, result.surfaces, summary, to_viewer)
-    write_json(directory / "summary.json", summary)
+    write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
 
 
 def reconstruct_file(
@@ -205,15 +228,19 @@ def reconstruct_file(
     mask: str | Path | None = None,
     frame: Frame = "camera",
     drop_invalid: bool = False,
+    files: FilesConfig = DEFAULT_FILES,
     force: bool = False,
 ) -> Reconstruction:
     """``mereo reconstruct``: read a point cloud or a depth image, reconstruct, write a new directory, print a table."""
+    formats = chosen_formats(files.formats)  # a missing extra is said before the work, not after
+    if intrinsics is not None and files.unit_m != 1.0:
+        raise ValueError(f"{input} is a depth image, whose results are in metres: leave out --unit-m, or give 1")
     with new_directory(output, force) as directory:
         cloud = read_input(Path(input), intrinsics, depth_scale, mask, frame, drop_invalid)
         model = load_model(weights)
-        result = reconstruct(cloud, model, resolution, frame)
+        result = reconstruct(cloud, model, resolution, frame, label_points="points" in formats)
         facts = {"title": Path(input).name, "weights": str(weights), "resolution": resolution, "points": len(cloud)}
-        _write_files(directory, result, cloud, frame, facts)
+        _write_files(directory, result, cloud, frame, files, facts)
     print_segments(result, f"{Path(input).name}, {len(cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result

@@ -1,0 +1,34 @@
+"""Files for other programs: one module per format, and ``formats`` with the table of them all.
+
+What is written where, in which frame and unit, and why: docs/design/0012-files-out.md. This module imports nothing
+heavy, because the command line reads its options from here.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Format = Literal["glb", "ply", "obj", "stl", "npz", "vti", "nifti", "seg.nrrd", "points", "json"]
+
+
+@dataclass(frozen=True)
+class FilesConfig:
+    """Which files a reconstruction becomes.
+
+    Attributes:
+        formats: surfaces as glb, ply, obj, stl; labels as npz, vti (ParaView), nifti, seg.nrrd (3D Slicer); points,
+            the observed ones with their segments; json, the figures; or all.
+        unit_m: metres per unit of the input, 0.001 for a point cloud in millimetres: GLB files are in metres, NIfTI
+            and seg.nrrd in millimetres.
+        millimetres: write ply, obj, stl, vti and points.ply, which have no unit, in millimetres and not in the input's.
+    """
+
+    formats: tuple[Format | Literal["all"], ...] = ("glb", "npz", "json")
+    unit_m: float = 1.0
+    millimetres: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.unit_m < float("inf"):
+            raise ValueError(f"the unit is {self.unit_m} metres; it must be positive: give 0.001 for millimetres")
+
+
+DEFAULT_FILES = FilesConfig()
