@@ -111,6 +111,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
+        | Annotated[commands.Export, subcommand("export")]
         | Annotated[Experiment, subcommand("experiment")]
     )
 

@@ -229,6 +229,28 @@ class Reconstruct:
         )
 
 
+@dataclass(frozen=True)
+class Export:
+    """Write weights as two graphs, encoder and query, for ONNX Runtime (no torch needed) or for torch.export.
+
+    Attributes:
+        weights: a shipped name or a file.
+        output: folder to create; for ONNX with mereo_onnx.py, which runs the graphs with numpy and onnxruntime alone.
+        format: onnx, or torch for .pt2 files.
+        force: replace an existing output folder.
+    """
+
+    weights: Positional[str]
+    output: Path
+    format: Literal["onnx", "torch"] = "onnx"
+    force: bool = False
+
+    def run(self) -> None:
+        from mereo.export import export_weights
+
+        export_weights(self.weights, self.output, self.format, self.force)
+
+
 def part_of(shard: str) -> tuple[int, int]:
     """``"1/4"`` is part 1 of 4, counted from 0."""
     part, _, parts = shard.partition("/")

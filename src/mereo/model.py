@@ -196,13 +196,7 @@ class Model:
         """Segment, probabilities, signed distance and direction at each point."""
 
         def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            logits = self._class_logits(prediction, queries)
-            distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
-            # a head that no term of the loss has trained says nothing
-            if "l1" not in self.loss:
-                distance = torch.full_like(distance, torch.nan)
-            if "cd" not in self.loss:
-                direction = torch.full_like(direction, torch.nan)
+            logits, distance, direction = self.respond(prediction, queries)
             return logits.softmax(dim=-1), distance, direction
 
         probability, distance, direction = self._chunked(code, points, answer)
@@ -216,6 +210,20 @@ class Model:
     def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
         """Class logits only: what surface extraction needs."""
         return self._chunked(code, points, lambda *found: (self._class_logits(*found),))[0]
+
+    def respond(
+        self, prediction: Prediction, queries: Float[Tensor, "b q 3"]
+    ) -> tuple[Float[Tensor, "b q c"], Float[Tensor, "b q"], Float[Tensor, "b q 3"]]:
+        """Class logits, signed distance and unit direction at normalized queries, in normalized units.
+
+        A head that no term of the loss has trained says nothing: it is NaN.
+        """
+        distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
+        if "l1" not in self.loss:
+            distance = torch.full_like(distance, torch.nan)
+        if "cd" not in self.loss:
+            direction = torch.full_like(direction, torch.nan)
+        return self._class_logits(prediction, queries), distance, direction
 
     def _class_logits(self, prediction: Prediction, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q c"]:
         logits = prediction.logits
