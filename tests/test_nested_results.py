@@ -18,13 +18,13 @@ from test_training import SMALL
 from toy_data import write_toy_dataset
 
 from mereo.camera import PointCloud
-from mereo.output import OUTER_OPACITY
 from mereo.overlap import check_overlap
 from mereo.pictures import render_cloud_and_segments
 from mereo.reconstruction import Reconstruction, reconstruct, write_reconstruction
 from mereo.solid import Solids
 from mereo.training import train
 from mereo.weights import load_model, save_model
+from mereo.writers.glb import OUTER_OPACITY
 
 NESTED = (("core", "organ"),)
 CENTER, RADIUS = (0.0, 0.0, 5.0), 1.0

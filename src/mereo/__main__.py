@@ -119,6 +119,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[Align, subcommand("align")]
         | Annotated[View, subcommand("view")]
         | Annotated[StreamCommand, subcommand("stream")]
+        | Annotated[commands.Export, subcommand("export")]
         | Annotated[Experiment, subcommand("experiment")]
         | Annotated[BenchCommand, subcommand("bench")]
     )

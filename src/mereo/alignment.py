@@ -3,6 +3,7 @@
 Notation: b clouds, n points, q queries.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -31,9 +32,11 @@ class Alignment:
             return directions @ self.rotation
 
 
-def exact(tensor: Tensor) -> torch.autocast:
+def exact(tensor: Tensor) -> AbstractContextManager[object]:
     """Switches autocast off: in bfloat16 a coordinate near 1 would be off by up to 0.004, more than sensor noise."""
-    return torch.autocast(tensor.device.type, enabled=False)
+    device = tensor.device.type
+    # where it is off already nothing is done, because an exported graph would keep the switch, which ONNX does not know
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 @torch.no_grad()

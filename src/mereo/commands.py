@@ -6,12 +6,13 @@
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from mereo.config import GenerateConfig, PresetName, Sensor, SensorConfig, TrainConfig
 from mereo.input_config import InputConfig, IsolationConfig
+from mereo.writers import FilesConfig
 
 
 @dataclass(frozen=True)
@@ -193,6 +194,7 @@ class Reconstruct:
         resolution: grid cells along the longest side.
         reading: how the frame is read.
         isolation: what of the frame is left out.
+        files: which files, and in which unit.
         force: replace an existing output folder.
     """
 
@@ -202,6 +204,7 @@ class Reconstruct:
     resolution: int = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
     force: bool = False
 
     def run(self) -> None:
@@ -214,8 +217,31 @@ class Reconstruct:
             resolution=self.resolution,
             reading=self.reading,
             isolation=self.isolation,
+            files=self.files,
             force=self.force,
         )
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write weights as two graphs, encoder and query, for ONNX Runtime (no torch needed) or for torch.export.
+
+    Attributes:
+        weights: a shipped name or a file.
+        output: folder to create; for ONNX with mereo_onnx.py, which runs the graphs with numpy and onnxruntime alone.
+        format: onnx, or torch for .pt2 files.
+        force: replace an existing output folder.
+    """
+
+    weights: Positional[str]
+    output: Path
+    format: Literal["onnx", "torch"] = "onnx"
+    force: bool = False
+
+    def run(self) -> None:
+        from mereo.export import export_weights
+
+        export_weights(self.weights, self.output, self.format, self.force)
 
 
 def part_of(shard: str) -> tuple[int, int]:

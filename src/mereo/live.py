@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from mereo.input_config import InputConfig, IsolationConfig
-from mereo.output import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.reconstruction import Reconstruction, reconstruct
 from mereo.stream import Counter, Outcome, Summary, stream
 from mereo.stream_sources import STANDARD_INPUT, frames_of
 from mereo.weights import load_model
+from mereo.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 
 
 def stream_reconstructions(

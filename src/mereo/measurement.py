@@ -1,13 +1,14 @@
-"""Segments in numbers: volume, place, and how sure the model is."""
+"""Segments in numbers: volume, place, and how sure the model is; and the segment of each observed point."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from scipy import ndimage
+from scipy.special import expit, logsumexp, softmax
 
 from mereo.extraction import Extraction, LabelGrid
-from mereo.mesh import Segment
+from mereo.mesh import Color, Segment
 from mereo.model import EncodedCloud, Model
 
 CONFIDENCE_VOXELS = 2000
@@ -36,6 +37,46 @@ class FoundSegment:
     confidence: float
     voxels: int
     components: int
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedCloud:
+    """The observed points and the segment that each lies on.
+
+    Attributes:
+        points: in the input's frame and units.
+        labels: of the most likely segment, from 1 up. Empty space does not compete: a point on the surface is half in
+            it, so it would win every second time.
+        confidence: probability of that segment among the segments.
+        occupancy: probability of any segment against empty space: about a half on the surface of the object, near 0 at
+            points that are not on it.
+        names, colors: of the segments; ``names[k]`` has label k + 1.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+    confidence: Float[np.ndarray, " n"]
+    occupancy: Float[np.ndarray, " n"]
+    names: tuple[str, ...]
+    colors: tuple[Color, ...]
+
+
+def segment_points(
+    logits: Float[np.ndarray, "n c"],
+    points: Float[np.ndarray, "n 3"],
+    names: tuple[str, ...],
+    colors: tuple[Color, ...],
+) -> SegmentedCloud:
+    """The segments of points from the model's logits there, of empty space first."""
+    parts = logits[:, 1:].astype(np.float64)
+    return SegmentedCloud(
+        points=points,
+        labels=(parts.argmax(axis=1) + 1).astype(np.uint8),
+        confidence=softmax(parts, axis=1).max(axis=1),
+        occupancy=expit(logsumexp(parts, axis=1) - logits[:, 0]),
+        names=names,
+        colors=colors,
+    )
 
 
 def measure(found: Extraction, model: Model, code: EncodedCloud) -> tuple[FoundSegment, ...]:

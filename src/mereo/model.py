@@ -135,13 +135,7 @@ class Model:
         """Segment, probabilities, signed distance and direction at each point."""
 
         def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            logits = self.class_logits(prediction, queries)
-            distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
-            # a head that no term of the loss has trained says nothing
-            if "l1" not in self.loss:
-                distance = torch.full_like(distance, torch.nan)
-            if "cd" not in self.loss:
-                direction = torch.full_like(direction, torch.nan)
+            logits, distance, direction = self.respond(prediction, queries)
             return logits.softmax(dim=-1), distance, direction
 
         probability, distance, direction = self._chunked(code, points, answer)
@@ -166,6 +160,20 @@ class Model:
             return (prediction.rest,)
 
         return self._chunked(code, points, rest)[0].astype(np.float64)
+
+    def respond(
+        self, prediction: Prediction, queries: Float[Tensor, "b q 3"]
+    ) -> tuple[Float[Tensor, "b q c"], Float[Tensor, "b q"], Float[Tensor, "b q 3"]]:
+        """Class logits, signed distance and unit direction at normalized queries, in normalized units.
+
+        A head that no term of the loss has trained says nothing: it is NaN.
+        """
+        distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
+        if "l1" not in self.loss:
+            distance = torch.full_like(distance, torch.nan)
+        if "cd" not in self.loss:
+            direction = torch.full_like(direction, torch.nan)
+        return self.class_logits(prediction, queries), distance, direction
 
     def class_logits(self, prediction: Prediction, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q c"]:
         """Logits of empty space and each segment; ``queries`` are normalized."""

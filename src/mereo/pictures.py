@@ -15,11 +15,11 @@ from mereo.config import GenerateConfig
 from mereo.error_pictures import ErrorCase, error_picture
 from mereo.frame import rigid, transform_points
 from mereo.mesh import Segment, SegmentedMesh
-from mereo.output import GLTF_CAMERA_ROTATION
 from mereo.scene import Scene
 from mereo.shading import Viewpoint, shade
 from mereo.sheets import Picture, cloud_picture, contact_sheet, depth_to_rgb, enlarge, legend, save_png
 from mereo.synthesis import View, example_rng, sample_view
+from mereo.writers.glb import GLTF_CAMERA_ROTATION
 
 __all__ = [
     "ErrorCase",

@@ -24,16 +24,19 @@ from mereo.extraction import LabelGrid, extract_whole, locate
 from mereo.frame import inverse_rigid, rigid, transform_points
 from mereo.input_config import Frame, InputConfig, IsolationConfig
 from mereo.isolation import STRAY_SHARE, stray_share
-from mereo.measurement import FoundSegment, measure
+from mereo.measurement import FoundSegment, SegmentedCloud, measure, segment_points
 from mereo.mesh import PALETTE, Color, SegmentedMesh
 from mereo.model import Model
 from mereo.observation import SizeWarning, read_observation, size_warning
-from mereo.output import GLTF_CAMERA_ROTATION, new_directory, write_json, write_labels_npz, write_segments_glb
+from mereo.output import new_directory
 from mereo.pictures import render_cloud_and_segments
 from mereo.refinement import Field
 from mereo.report import write_report
 from mereo.scans import SCANNER_TO_CAMERA, scanner_to_camera
 from mereo.weights import load_model
+from mereo.writers import DEFAULT_FILES, FilesConfig
+from mereo.writers.formats import Results, chosen_formats, write_formats
+from mereo.writers.glb import GLTF_CAMERA_ROTATION
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Where segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one lies behind it."""
@@ -51,6 +54,7 @@ class Reconstruction:
         timings_s: seconds of each stage.
         evaluated: points at which the network was asked for surfaces.
         clipped: whether a segment still reached the largest box and was closed there.
+        observed: the segment of each input point, where it was asked for.
     """
 
     surfaces: SegmentedMesh
@@ -59,10 +63,15 @@ class Reconstruction:
     timings_s: dict[str, float]
     evaluated: int
     clipped: bool
+    observed: SegmentedCloud | None = None
 
 
 def reconstruct(
-    cloud: PointCloud | Float[np.ndarray, "n 3"], model: Model, resolution: int = 128, frame: Frame = "camera"
+    cloud: PointCloud | Float[np.ndarray, "n 3"],
+    model: Model,
+    resolution: int = 128,
+    frame: Frame = "camera",
+    label_points: bool = False,
 ) -> Reconstruction:
     """All segments of the object that ``cloud`` shows.
 
@@ -72,6 +81,7 @@ def reconstruct(
         resolution: cells along the longest side of the object's box.
         frame: the cloud's axes: "camera" is x right, y down, z forward from the camera at the origin; "scanner" is y
             up, z toward the scanner.
+        label_points: also say on which segment each point of the cloud lies (``Reconstruction.observed``).
 
     Raises ``ValueError`` for unusable clouds, and where the model finds no segment at all.
     """
@@ -79,7 +89,8 @@ def reconstruct(
     timings: dict[str, float] = {}
     T_camera_input = scanner_to_camera(points) if frame == "scanner" else np.eye(4)
     with _timed(timings, "encode"):
-        code = model.encode(PointCloud(transform_points(T_camera_input, points)))
+        seen = transform_points(T_camera_input, points)
+        code = model.encode(PointCloud(seen))
     field: Field = partial(model.logits, code)
     names, colors = segment_names(model)
     with _timed(timings, "locate"):
@@ -88,8 +99,12 @@ def reconstruct(
         found = extract_whole(field, box, resolution, names, colors, model.nested if "ce" in model.loss else ())
     with _timed(timings, "measure"):
         segments = measure(found, model, code)
+    observed = None
+    if label_points:
+        with _timed(timings, "points"):
+            observed = segment_points(field(seen), points, names, colors)
     clipped = bool(found.grid.touched_sides().any())
-    result = Reconstruction(found.surfaces, found.grid, segments, timings, found.evaluated, clipped)
+    result = Reconstruction(found.surfaces, found.grid, segments, timings, found.evaluated, clipped, observed)
     return result if frame == "camera" else _turned_back(result, inverse_rigid(T_camera_input))
 
 
@@ -163,34 +178,44 @@ def write_reconstruction(
     output_dir: str | Path,
     *,
     frame: Frame = "camera",
+    files: FilesConfig = DEFAULT_FILES,
+    unit_m: float = 1.0,
     force: bool = False,
     **facts: object,
 ) -> None:
-    """Write segments.glb, labels.npz, summary.json, preview.png and report.html into a new directory, all or nothing.
+    """Write preview.png, report.html and ``files`` into a new directory, all or nothing.
 
-    ``facts`` (``title``, ``unit``, ...) are added to the summary and shown in the report. Raises ``FileExistsError``
-    for a directory with content unless ``force``.
+    By default these are segments.glb, labels.npz and summary.json; ``mereo.writers.formats.WRITERS`` names all. The
+    format "points" needs ``reconstruct(..., label_points=True)``. ``facts`` (``title``, ``unit``, ...) are added to the
+    summary and shown in the report. Raises ``FileExistsError`` for a directory with content unless ``force``, and
+    ``ImportError`` where a format's extra is missing.
     """
     with new_directory(output_dir, force) as directory:
-        _write_files(directory, result, cloud, frame, facts)
+        _write_files(directory, result, cloud, frame, files, unit_m, facts)
 
 
 def _write_files(
-    directory: Path, result: Reconstruction, cloud: PointCloud, frame: Frame, facts: dict[str, object]
+    directory: Path,
+    result: Reconstruction,
+    cloud: PointCloud,
+    frame: Frame,
+    files: FilesConfig,
+    unit_m: float,
+    facts: dict[str, object],
 ) -> None:
     started = time.perf_counter()
-    grid = result.labels
+    formats = chosen_formats(files.formats)
     to_viewer = GLTF_CAMERA_ROTATION if frame == "camera" else np.eye(3)
-    write_segments_glb(directory / "segments.glb", result.surfaces, to_viewer)
-    write_labels_npz(directory / "labels.npz", grid.labels, grid.origin, grid.spacing, grid.names)
+    results = Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, unit_m)
+    write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
     to_camera = rigid(np.eye(3) if frame == "camera" else SCANNER_TO_CAMERA, np.zeros(3))
     seen = PointCloud(transform_points(to_camera, cloud.points))
     title = str(facts.get("title", "mereo reconstruction"))
     render_cloud_and_segments(directory / "preview.png", seen, result.surfaces.transformed(to_camera), title)
     timings_s = {**result.timings_s, "write": time.perf_counter() - started}
-    summary = summarize(replace(result, timings_s=timings_s), frame=frame, **facts)
+    summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
     write_report(directory / "report.html", cloud, result.surfaces, summary, to_viewer)
-    write_json(directory / "summary.json", summary)
+    write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
 
 
 def reconstruct_file(
@@ -201,9 +226,11 @@ def reconstruct_file(
     resolution: int = 128,
     reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
     isolation: IsolationConfig = IsolationConfig(),  # noqa: B008
+    files: FilesConfig = DEFAULT_FILES,
     force: bool = False,
 ) -> Reconstruction:
     """``mereo reconstruct``: read one frame of a sensor, reconstruct, write a new directory, print what was found."""
+    formats = chosen_formats(files.formats)  # a missing extra is said before the work, not after
     with new_directory(output, force) as directory:
         seen = read_observation(input, reading, isolation)
         print(seen)
@@ -214,9 +241,9 @@ def reconstruct_file(
         warning = size_warning(seen, model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
-        result = reconstruct(seen.cloud, model, resolution, seen.frame)
+        result = reconstruct(seen.cloud, model, resolution, seen.frame, label_points="points" in formats)
         facts = {"title": seen.source, "weights": str(weights), "resolution": resolution, "points": len(seen.cloud)}
-        _write_files(directory, result, seen.cloud, seen.frame, {**facts, **seen.facts()})
+        _write_files(directory, result, seen.cloud, seen.frame, files, seen.unit_m, {**facts, **seen.facts()})
     print_segments(result, f"{seen.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result

@@ -17,7 +17,8 @@ from jaxtyping import Float, Int, UInt16
 
 from mereo.camera import PointCloud
 from mereo.mesh import Segment, SegmentedMesh
-from mereo.output import GLTF_CAMERA_ROTATION, OUTER_OPACITY, atomic_file
+from mereo.output import atomic_file
+from mereo.writers.glb import GLTF_CAMERA_ROTATION, OUTER_OPACITY
 
 BUDGET_BYTES = 5_000_000
 CLOUD_POINTS = 60_000

@@ -13,7 +13,7 @@ from mereo.camera import PointCloud
 from mereo.files import read_point_cloud
 from mereo.frame import rigid, transform_points
 from mereo.mesh import SegmentedMesh
-from mereo.output import GLTF_CAMERA_ROTATION, new_directory, write_segments_glb
+from mereo.output import new_directory
 from mereo.pictures import CAMERA_VIEWS
 from mereo.placement import Placement, Start, place
 from mereo.registration import load_icp
@@ -25,6 +25,7 @@ from mereo.shading import Canvas, Triangles, Viewpoint
 from mereo.sheets import Picture, contact_sheet, legend, save_png
 from mereo.solid import Solids
 from mereo.weights import load_model
+from mereo.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 
 UNITS_M: Mapping[str, float] = MappingProxyType({"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254})
 """Metres in each unit that a scan may have."""

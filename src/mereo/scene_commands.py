@@ -106,15 +106,16 @@ class SceneExport:
     def run(self) -> None:
         import numpy as np
 
-        from mereo.output import write_mesh_ply, write_segments_glb
         from mereo.scene import load_scene
+        from mereo.writers.glb import write_segments_glb
+        from mereo.writers.ply import write_segments_ply
 
         suffix = self.output.suffix.lower()
         if suffix not in (".ply", ".glb"):
             raise ValueError(f"{self.output} has the suffix {suffix!r}; it must be .ply or .glb: rename it")
         rest = load_scene(self.scene).rest
         if suffix == ".ply":
-            write_mesh_ply(self.output, rest)
+            write_segments_ply(self.output, rest)
         else:
             write_segments_glb(self.output, rest, np.eye(3))
         print(f"wrote {self.output}")

@@ -6,6 +6,7 @@ Notation: b clouds, m points of a level, c channels, z latent channels.
 from dataclasses import dataclass
 from itertools import pairwise
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -24,6 +25,12 @@ class Encoding:
 
     latent: Float[Tensor, "b z"]
     levels: tuple[Level, ...]
+
+
+def share(count: int, ratio: float) -> int:
+    """``max(1, int(count * ratio))``, which also works on the sizes that an exported graph leaves open."""
+    found: int = torch.sym_max(1, torch.sym_int(count * ratio))
+    return found
 
 
 class SharedMLP(nn.Module):

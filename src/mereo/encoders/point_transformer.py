@@ -99,7 +99,7 @@ class PointTransformer(nn.Module):
         features = self.blocks[0](cloud, self.enter(cloud), _smallest(distances, max(1, self.neighbors // 2)))
         levels: list[Level] = []
         for down, block in zip(self.down, self.blocks[1:], strict=True):
-            before, count = count, max(1, count // STRIDE)
+            before, count = count, torch.sym_max(1, count // STRIDE)
             features = down(features, _smallest(distances[:, :count, :before], self.neighbors))
             features = block(cloud[:, :count], features, _smallest(distances[:, :count, :count], self.neighbors))
             levels.append(Level(cloud[:, :count], features))
@@ -108,4 +108,4 @@ class PointTransformer(nn.Module):
 
 
 def _smallest(distances: Float[Tensor, "b m n"], count: int) -> Int[Tensor, "b m k"]:
-    return distances.topk(min(count, distances.shape[2]), dim=2, largest=False).indices
+    return distances.topk(torch.sym_min(count, distances.shape[2]), dim=2, largest=False).indices

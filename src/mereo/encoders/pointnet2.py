@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mereo.config import NetworkConfig
-from mereo.encoders.encoding import Encoding, Level, SharedMLP
+from mereo.encoders.encoding import Encoding, Level, SharedMLP, share
 from mereo.neighbors import ball_query, gather
 
 
@@ -40,8 +40,8 @@ class PointNet2(nn.Module):
         self.pool = SharedMLP((config.mlp2[-1] + 3, *config.mlp_global))
 
     def forward(self, cloud: Float[Tensor, "b n 3"]) -> Encoding:
-        count1 = max(1, int(cloud.shape[1] * self.ratio1))
-        count2 = max(1, int(count1 * self.ratio2))
+        count1 = share(cloud.shape[1], self.ratio1)
+        count2 = share(count1, self.ratio2)
         level1 = self.level1(cloud, None, count1)
         level2 = self.level2(level1.centers, level1.features, count2)
         latent = self.pool(torch.cat([level2.features, level2.centers], dim=-1)).amax(dim=1)

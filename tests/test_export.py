@@ -1,0 +1,223 @@
+"""Exported networks answer as the network does: ONNX Runtime, torch.export, and the runner without torch."""
+
+import ast
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from exported import CASES, NAMES, model_of, seen
+
+from mereo.__main__ import parse
+from mereo.commands import Export
+from mereo.config import PRESETS
+from mereo.export import ANSWERS, RUNNER, code_tensors, export_weights
+from mereo.mereo_onnx import prepare
+from mereo.mesh import PALETTE
+from mereo.model import Model, Network
+from mereo.ordering import farthest_point_order
+from mereo.weights import load_model, save_model
+
+TOLERANCE = 1e-4
+
+SHIPPED = "bunny"
+
+
+def ordered(count: int) -> torch.Tensor:
+    points = seen(count, 5)
+    return torch.from_numpy(points[farthest_point_order(points, count)])[None]
+
+
+def asked(count: int) -> torch.Tensor:
+    return 3.0 * torch.rand(1, count, 3, generator=torch.Generator().manual_seed(1)) - 1.5
+
+
+def answers_of(model: Model, cloud: torch.Tensor, points: torch.Tensor) -> tuple[np.ndarray, ...]:
+    with torch.inference_mode():
+        code = model.network.encode(cloud, torch.tensor([[0.1, -0.2, -8.0]]))
+        return tuple(part.numpy() for part in model.respond(model.network.query(code, points), points))
+
+
+def agree(found: dict[str, Any], expected: tuple[np.ndarray, ...]) -> None:
+    for name, wanted in zip(ANSWERS, expected, strict=True):
+        got = np.asarray(found[name])
+        assert got.shape == wanted.shape
+        np.testing.assert_allclose(got, wanted, atol=TOLERANCE, rtol=0, err_msg=name)
+    assert np.asarray(found["logits"]).std() > 100 * TOLERANCE, "the comparison would be empty"
+
+
+# --- torch.export ----------------------------------------------------------------------------------------------------
+
+
+def export(case: str, place: Path, kind: str) -> tuple[Model, Path]:
+    """By the command, in a process of its own: the tests' shape checks know no sizes that are left open."""
+    weights = case
+    if case != SHIPPED:
+        weights = str(place / "w.safetensors")
+        config, loss = CASES.get(case) or (PRESETS[case].network, "ce+l1+cd")
+        save_model(model_of(config, loss), Path(weights))
+    command = [sys.executable, "-m", "mereo", "export", weights, "--output", str(place / "out"), "--format", kind]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 0 and "wrote" in run.stdout and run.stderr == "", run.stderr
+    return load_model(weights), place / "out"
+
+
+@pytest.mark.parametrize("case", ["plain", pytest.param("everything", marks=pytest.mark.slow)])
+def test_a_reloaded_torch_program_answers_as_the_network(tmp_path: Path, case: str) -> None:
+    model, folder = export(case, tmp_path, "torch")
+    assert sorted(path.name for path in folder.iterdir()) == ["encoder.pt2", "model.json", "query.pt2"]
+    encoder, query = (torch.export.load(folder / f"{name}.pt2").module() for name in ("encoder", "query"))
+    wanted = json.loads((folder / "model.json").read_text())["query_inputs"]
+    for points, queries in ((model.network.config.points, 1), (model.network.config.points + 31, 50)):
+        cloud, places = ordered(points), asked(queries)
+        given = {**encoder(cloud), "cloud": cloud, "viewpoint": torch.tensor([[0.1, -0.2, -8.0]])}
+        found = query(places, {name: given[name] for name in wanted})
+        agree(found, answers_of(model, cloud, places))
+
+
+def test_an_autodecoder_is_refused(tmp_path: Path) -> None:
+    config = replace(PRESETS["tiny"].network, encoder="autodecoder", local_neighbors=0)
+    save_model(Model(Network(config, 3).eval(), NAMES, PALETTE[:3]), tmp_path / "w.safetensors")
+    with pytest.raises(
+        ValueError, match=r"an autodecoder's, which finds the code .* by gradient steps; .*: train with"
+    ):
+        export_weights(tmp_path / "w.safetensors", tmp_path / "out", "torch")
+    assert [path.name for path in tmp_path.iterdir()] == ["w.safetensors"]
+
+
+def test_missing_packages_are_named_with_their_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mereo.export.find_spec", lambda name: None if name == "onnxscript" else object())
+    with pytest.raises(ImportError, match=r"onnxscript is needed to export to ONNX: pip install 'mereo\[onnx\]'"):
+        export_weights(SHIPPED, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_line() -> None:
+    command = parse(["export", "bunny", "--output", "o", "--format", "torch"])
+    assert command == Export("bunny", Path("o"), "torch")
+
+
+# --- the runner, without a graph -------------------------------------------------------------------------------------
+
+
+def raw_cloud(count: int, seed: int = 0) -> np.ndarray:
+    """In metres, a tenth of a metre wide, some points twice."""
+    points = np.concatenate([seen(count - 5, seed), seen(count - 5, seed)[:5]])
+    return np.random.default_rng(seed).permutation(0.05 * points.astype(np.float64) + [0.1, -0.2, 0.7])
+
+
+@pytest.mark.parametrize("count", [40, 256, 1500, 5000])
+def test_the_runner_prepares_clouds_as_the_model_does(count: int) -> None:
+    """Bit by bit: few points are repeated, many are ordered, very many are thinned first."""
+    model = model_of(*CASES["everything"])
+    settings = {"points": 256, "dense_factor": 8, "fewest_points_of_a_cloud": 32}
+    found, center, scale = prepare(raw_cloud(count), settings)
+    code = model.encode(raw_cloud(count))
+    np.testing.assert_array_equal(found, code.code.cloud[0].numpy())
+    np.testing.assert_array_equal(center, code.normalizer.center)
+    assert scale == code.normalizer.scale
+
+
+@pytest.mark.parametrize(
+    "cloud, text",
+    [
+        (np.zeros((40, 2)), r"has shape \(40, 2\); it must be \[n, 3\]"),
+        (np.full((40, 3), np.nan), "it must be .* of finite numbers"),
+        (np.ones((31, 3)), "has 31 points; the encoder needs at least 32"),
+        (-np.ones((40, 3)), "points have z <= 0, behind the camera"),
+        (np.ones((40, 3)), "all points coincide"),
+    ],
+)
+def test_the_runner_refuses_unusable_clouds(cloud: np.ndarray, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        prepare(cloud, {"points": 256, "dense_factor": 8, "fewest_points_of_a_cloud": 32})
+
+
+def test_the_runner_is_short_and_needs_numpy_and_onnxruntime_only() -> None:
+    source = RUNNER.read_text(encoding="utf-8")
+    assert len(source.splitlines()) < 150
+    tree = ast.parse(source, feature_version=(3, 8))
+    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert imported - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}
+
+
+# --- ONNX ------------------------------------------------------------------------------------------------------------
+
+SIZES = ("paper", "large")
+"""Presets at full size; `base` is what the shipped weights are."""
+
+
+@pytest.fixture(scope="module", params=[*CASES, *SIZES, SHIPPED])
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Model, Path]:
+    """A model, and the folder of its graphs as the command writes it."""
+    for package in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(package, reason=f"{package} is not installed: pip install 'mereo[onnx]'")
+    return export(request.param, tmp_path_factory.mktemp(request.param), "onnx")
+
+
+@pytest.mark.slow
+def test_onnx_graphs_answer_as_the_network(exported: tuple[Model, Path]) -> None:
+    import onnxruntime
+
+    model, folder = exported
+    encoder, query = (onnxruntime.InferenceSession(folder / f"{name}.onnx") for name in ("encoder", "query"))
+    names = [output.name for output in encoder.get_outputs()]
+    for points, queries in ((model.network.config.points, 1), (model.network.config.points + 31, 300)):
+        cloud, places = ordered(points), asked(queries)
+        given = dict(zip(names, encoder.run(names, {"cloud": cloud.numpy()}), strict=True))
+        with torch.inference_mode():
+            code = code_tensors(model.network.encode(cloud, torch.zeros(1, 3)))
+        for name, tensor in code.items():
+            np.testing.assert_allclose(given[name], tensor.numpy(), atol=TOLERANCE, err_msg=name)
+        given |= {"cloud": cloud.numpy(), "viewpoint": np.array([[0.1, -0.2, -8.0]], np.float32)}
+        given["points"] = places.numpy()
+        found = query.run(ANSWERS, {entry.name: given[entry.name] for entry in query.get_inputs()})
+        agree(dict(zip(ANSWERS, found, strict=True)), answers_of(model, cloud, places))
+
+
+ALONE = """
+import runpy, sys
+sys.modules["torch"] = sys.modules["mereo"] = None  # importing either is now an error
+sys.argv = ["mereo_onnx.py", "frame.npy", "--points", "queries.npy", "-o", "out.npz"]
+runpy.run_path("mereo_onnx.py", run_name="__main__")
+"""
+
+
+@pytest.mark.slow
+def test_the_runner_answers_as_the_model_without_torch(exported: tuple[Model, Path]) -> None:
+    """The whole path from a raw cloud in metres, in another process."""
+    model, folder = exported
+    cloud = raw_cloud(3000)
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    size = float((high - low).max())
+    queries = np.random.default_rng(2).uniform(low - 0.3 * size, high + 0.3 * size, (20_000, 3))
+    np.save(folder / "frame.npy", cloud)
+    np.save(folder / "queries.npy", queries)
+    run = subprocess.run([sys.executable, "-c", ALONE], cwd=folder, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    expected = model.query(model.encode(cloud), queries)
+    with np.load(folder / "out.npz") as found:
+        assert (found["labels"] == expected.label).mean() >= 0.999
+        assert len(np.unique(found["labels"])) > 1
+        # a query may have another nearest point by rounding, where two are as near
+        for name, wanted, unit in (("distances", expected.distance, size), ("directions", expected.direction, 1.0)):
+            np.testing.assert_array_equal(np.isnan(found[name]), np.isnan(wanted))
+            difference = np.abs(np.nan_to_num(found[name]) - np.nan_to_num(wanted))
+            assert (difference <= TOLERANCE * unit).mean() >= 0.999, f"{name}: {difference.max()}"
+        assert tuple(found["names"]) == (model.names if model.segmented else ("object",))
+
+
+@pytest.mark.slow
+def test_the_folder_says_what_it_holds(exported: tuple[Model, Path]) -> None:
+    model, folder = exported
+    assert {"encoder.onnx", "query.onnx", "model.json", "mereo_onnx.py"} <= {path.name for path in folder.iterdir()}
+    settings = json.loads((folder / "model.json").read_text())
+    assert settings["points"] == model.network.config.points
+    assert settings["names"] == (list(model.names) if model.segmented else ["object"])
+    assert len(settings["colors"]) == len(settings["names"])

@@ -1,0 +1,173 @@
+"""Surfaces as other programs read them: positions, frame, labels, names and colours, through trimesh and VTK."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from written_results import CENTER, COLORS, NAMES, SIDES, segments
+
+from mereo.files import read_segmented_mesh
+from mereo.mesh import SegmentedMesh
+from mereo.writers.glb import write_segments_glb
+from mereo.writers.obj import write_segments_obj
+from mereo.writers.ply import write_segments_ply
+from mereo.writers.stl import stl_name, write_segments_stl
+
+BOX = np.stack([CENTER - SIDES / 2, CENTER + SIDES / 2])
+
+
+# --- GLB -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_glb_gives_back_names_colours_and_vertices(tmp_path: Path) -> None:
+    mesh = segments()
+    write_segments_glb(tmp_path / "s.glb", mesh)
+    back = read_segmented_mesh(tmp_path / "s.glb")
+    assert back.names == ("zebra head", "Öhrchen")
+    assert back.colors == (COLORS[0], COLORS[2])
+    for found, written in zip(back.segments, (mesh.segments[0], mesh.segments[2]), strict=True):
+        np.testing.assert_allclose(found.vertices, written.vertices, atol=1e-7)
+        np.testing.assert_array_equal(found.faces, written.faces)
+
+
+def test_other_programs_see_the_glb_y_up_in_metres(tmp_path: Path) -> None:
+    mesh = segments()
+    write_segments_glb(tmp_path / "s.glb", mesh, unit_m=0.001)
+    scene = trimesh.load_scene(tmp_path / "s.glb", process=False)
+    node, key = scene.graph["zebra head"]
+    np.testing.assert_allclose(node, np.diag([0.001, -0.001, -0.001, 1.0]))
+    # camera (0.1, 0.2, 0.5): y down and z forward become y up and z toward the viewer
+    place = trimesh.transform_points(scene.geometry["Öhrchen"].vertices, scene.graph["Öhrchen"][0])
+    np.testing.assert_allclose(place.mean(axis=0), 0.001 * CENTER * [1, -1, -1], atol=1e-9)
+    # glTF factors are linear light: viewers turn them back into the segment's sRGB colour
+    linear = np.asarray(scene.geometry[key].visual.material.baseColorFactor[:3]) / 255.0
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(255 * srgb, (86, 180, 233), atol=1.5)
+    assert scene.geometry[key].visual.material.doubleSided
+
+
+def test_the_glb_is_valid_gltf(tmp_path: Path) -> None:
+    write_segments_glb(tmp_path / "s.glb", segments(), np.eye(3))
+    data = (tmp_path / "s.glb").read_bytes()
+    assert data[:4] == b"glTF"
+    assert int.from_bytes(data[8:12], "little") == len(data)
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length])
+    assert length % 4 == 0
+    assert document["scenes"] == [{"nodes": [0]}]
+    assert document["nodes"][0]["matrix"] == np.eye(4).ravel().tolist()
+    assert sum(view["byteLength"] for view in document["bufferViews"]) == document["buffers"][0]["byteLength"]
+    assert document["accessors"][0]["count"] == 162
+    np.testing.assert_allclose(document["accessors"][0]["max"], [0.11, 0.16, 0.51], atol=1e-6)
+
+
+@pytest.mark.parametrize("write", [write_segments_glb, write_segments_ply, write_segments_obj, write_segments_stl])
+def test_results_without_surfaces_are_refused(tmp_path: Path, write: Callable[[Path, SegmentedMesh], None]) -> None:
+    with pytest.raises(ValueError, match="all segments are without faces"):
+        write(tmp_path / "s", SegmentedMesh((segments().segments[1],)))
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- PLY -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_ply_has_positions_labels_and_colours_of_vertices_and_faces(tmp_path: Path) -> None:
+    mesh = segments()
+    write_segments_ply(tmp_path / "s.ply", mesh)
+    found = trimesh.load_mesh(tmp_path / "s.ply", process=False)
+    raw = found.metadata["_ply_raw"]
+    for element, count in (("vertex", len(found.vertices)), ("face", len(found.faces))):
+        data = raw[element]["data"]
+        assert data.dtype["label"] == np.uint8 and len(data) == count
+        assert set(np.unique(data["label"])) == {1, 3}
+        colors = np.stack([data[channel] for channel in ("red", "green", "blue")], axis=1)
+        np.testing.assert_array_equal(colors, np.array(COLORS)[data["label"] - 1])
+    label = raw["vertex"]["data"]["label"]
+    np.testing.assert_allclose(found.vertices[label == 1], mesh.segments[0].vertices, atol=1e-7)
+    box = found.vertices[label == 3]
+    np.testing.assert_allclose([box.min(axis=0), box.max(axis=0)], BOX, atol=1e-7)
+    of_faces = raw["face"]["data"]["label"]
+    np.testing.assert_array_equal(label[found.faces], np.repeat(of_faces[:, None], 3, axis=1))
+    assert found.submesh([np.flatnonzero(of_faces == 3)], append=True).volume == pytest.approx(SIDES.prod(), rel=1e-5)
+
+
+def test_the_header_of_a_ply_names_the_labels(tmp_path: Path) -> None:
+    write_segments_ply(tmp_path / "s.ply", segments())
+    head = (tmp_path / "s.ply").read_bytes().partition(b"end_header")[0].decode("ascii")
+    rows = [
+        json.loads(line.removeprefix("comment segment ")) for line in head.splitlines() if "comment segment" in line
+    ]
+    assert [(row["label"], row["name"], tuple(row["color"])) for row in rows] == [
+        (index + 1, name, color) for index, (name, color) in enumerate(zip(NAMES, COLORS, strict=True))
+    ]
+
+
+# --- OBJ -------------------------------------------------------------------------------------------------------------
+
+
+def test_an_obj_gives_back_names_and_vertices(tmp_path: Path) -> None:
+    mesh = segments()
+    write_segments_obj(tmp_path / "s.obj", mesh)
+    back = read_segmented_mesh(tmp_path / "s.obj")
+    assert back.names == (NAMES[0], NAMES[2])
+    for found, written in zip(back.segments, (mesh.segments[0], mesh.segments[2]), strict=True):
+        np.testing.assert_allclose(found.vertices, written.vertices, atol=1e-9)
+        np.testing.assert_array_equal(found.faces, written.faces)
+
+
+def test_other_programs_see_the_obj_in_its_colours(tmp_path: Path) -> None:
+    """trimesh splits at materials; each is one segment, at its place, in its colour."""
+    write_segments_obj(tmp_path / "s.obj", segments())
+    scene = trimesh.load_scene(tmp_path / "s.obj", process=False, split_object=True, group_material=False)
+    parts = {part.visual.material.name: part for part in scene.geometry.values()}
+    assert set(parts) == {"label_1", "label_3"}
+    for label in (1, 3):
+        np.testing.assert_allclose(parts[f"label_{label}"].visual.material.diffuse[:3], COLORS[label - 1], atol=1)
+    np.testing.assert_allclose(parts["label_3"].bounds, BOX, atol=1e-7)
+    assert parts["label_3"].volume == pytest.approx(SIDES.prod())
+
+
+def test_half_an_obj_never_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mereo.writers.obj._object", full)
+    with pytest.raises(OSError, match="disk is full"):
+        write_segments_obj(tmp_path / "s.obj", segments())
+    assert list(tmp_path.iterdir()) == [], "its material library neither"
+
+
+# --- STL -------------------------------------------------------------------------------------------------------------
+
+
+def test_stl_files_are_closed_solids_at_their_place(tmp_path: Path) -> None:
+    write_segments_stl(tmp_path / "stl", segments())
+    assert sorted(path.name for path in (tmp_path / "stl").iterdir()) == ["1-zebra-head.stl", "3-Öhrchen.stl"]
+    box = trimesh.load_mesh(tmp_path / "stl/3-Öhrchen.stl")
+    assert box.is_watertight and box.volume == pytest.approx(SIDES.prod(), rel=1e-5)
+    np.testing.assert_allclose(box.bounds, BOX, atol=1e-7)
+    raw = trimesh.load_mesh(tmp_path / "stl/3-Öhrchen.stl", process=False)
+    np.testing.assert_allclose(np.abs(raw.face_normals).max(axis=1), 1.0, atol=1e-5)
+    outward = raw.triangles_center - CENTER
+    assert (np.einsum("ij,ij->i", raw.face_normals, outward) > 0).all()
+
+
+def test_stl_names_are_safe_and_distinct() -> None:
+    assert stl_name(1, "../../etc/passwd") == "1-etc-passwd.stl"
+    assert stl_name(2, "a b") != stl_name(3, "a/b")
+    assert stl_name(4, "//") == "4.stl"
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "stl"])
+def test_vtk_sees_the_surfaces_where_they_are(tmp_path: Path, suffix: str) -> None:
+    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[vtk]'")
+    writers = {"ply": write_segments_ply, "obj": write_segments_obj, "stl": write_segments_stl}
+    writers[suffix](tmp_path / f"s.{suffix}", segments())
+    found = pyvista.read(tmp_path / (f"s.{suffix}" if suffix != "stl" else "s.stl/3-Öhrchen.stl"))
+    box = BOX if suffix == "stl" else segments().merged()[0]
+    np.testing.assert_allclose(np.reshape(found.bounds, (3, 2)).T, [box.min(axis=0), box.max(axis=0)], atol=1e-6)
+    if suffix == "ply":
+        assert {tuple(color[:3]) for color in found.point_data["RGB"]} == {COLORS[0], COLORS[2]}
