@@ -20,8 +20,7 @@ SMALL = NetworkConfig(
 """The paper's structure in small: no alignment, no local features, no template."""
 
 CASES: dict[str, tuple[NetworkConfig, str]] = {
-    "plain": (replace(SMALL, sight_neighbors=4), "ce+l1"),
-    "distance-only": (SMALL, "l1"),
+    "plain": (replace(SMALL, sight_neighbors=4), "l1"),
     "everything": (TINY, "ce+l1+cd"),
     "transformer": (
         replace(TINY, encoder="point-transformer", points=320, transformer_widths=(8, 16, 24, 32, 40)),

@@ -13,7 +13,7 @@ import torch
 PURPOSES: dict[str, str] = {
     "view": "the pages of `mereo view`",
     "track": "training curves in TensorBoard",
-    "vtk": "smooth surfaces from label volumes",
+    "vtk": "tests that read written files with VTK",
     "onnx": "networks for other runtimes",
     "cad": "3MF files",
     "medical": "NIfTI and NRRD volumes",

@@ -41,6 +41,9 @@ RUNNER = Path(__file__).with_name("mereo_onnx.py")
 EXAMPLE_QUERIES = 24
 """Of the traced example; any number may follow."""
 
+FIXED_SIZE = ("latent1", "latent2", "rotation", "shift", "viewpoint")
+"""Code tensors whose size does not depend on the number of points."""
+
 UNBOUNDED = 2.0**60
 """torch's upper bound of an open size is infinite or the largest integer."""
 
@@ -129,7 +132,7 @@ def export_graphs(model: Model) -> Graphs:
         outputs = tuple(code)
         if config.sight_neighbors:
             code |= {"cloud": cloud, "viewpoint": torch.tensor([[0.1, -0.2, -8.0]])}
-        open_sizes = {name: {1: Open} if name.startswith(("c", "features")) else None for name in code}
+        open_sizes = {name: None if name in FIXED_SIZE else {1: Open} for name in code}
         points = _example_points(EXAMPLE_QUERIES)
         asked = torch.export.export(query, (points, code), dynamic_shapes=({1: Open}, open_sizes), strict=False)
     (bounds,) = traced.range_constraints.values()

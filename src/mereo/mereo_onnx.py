@@ -12,6 +12,7 @@ Written for Python 3.8 and later, because robots' computers are slow to change.
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -113,15 +114,20 @@ def main() -> int:
         "--model", default=str(Path(__file__).parent), help="folder of the graphs; default: of this file"
     )
     options = parser.parse_args()
+    partial = Path(options.output + ".partial.npz")
     try:
         runner = Runner(options.model)
-        labels, distances, directions = runner(np.load(options.cloud), np.load(options.points))
-    except (ValueError, OSError) as error:
+        answers = dict(
+            zip(("labels", "distances", "directions"), runner(*map(np.load, (options.cloud, options.points))))
+        )
+        np.savez_compressed(partial, names=np.array(runner.names), **answers)
+        os.replace(partial, options.output)
+    except (ValueError, OSError, ImportError) as error:
         print(f"mereo_onnx: error: {error}", file=sys.stderr)
         return 2
-    np.savez_compressed(
-        options.output, labels=labels, distances=distances, directions=directions, names=np.array(runner.names)
-    )
+    finally:
+        if partial.exists():
+            partial.unlink()
     return 0
 
 
