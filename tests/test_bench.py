@@ -64,7 +64,7 @@ def test_work_is_bound_by_operations_or_bytes() -> None:
 
 
 def test_a_fitted_network_knows_its_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "STEPS", 30)
+    monkeypatch.setattr(fitting, "STEPS", 60)
     monkeypatch.setattr(fitting, "QUERIES", 512)
     frame = load_frame("rope")
     model = fitting.fitted_model("tiny", frame)

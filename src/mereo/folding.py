@@ -19,6 +19,7 @@ from mereo.encoders.encoding import SharedMLP
 AnyModule = TypeVar("AnyModule", bound=nn.Module)
 
 
+@torch.inference_mode(False)  # a search for codes needs gradients, which tensors of inference mode cannot give
 @torch.no_grad()
 def fold_batch_norm(network: AnyModule) -> AnyModule:
     """A copy for inference whose decoders and shared layers have no normalization left.

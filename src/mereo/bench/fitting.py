@@ -37,6 +37,8 @@ def fitted_model(preset: str, frame: Frame) -> Model:
         return torch.from_numpy(queries)[None], torch.from_numpy(grid.labels[tuple(chosen.T)].astype(np.int64))
 
     network.train()
+    if network.aligner is not None:
+        network.aligner.eval()  # one frame teaches no alignment: any that stays the same will do
     for _ in range(STEPS):
         queries, labels = draw()
         loss = nn.functional.cross_entropy(network(cloud, viewpoint, queries)[0][0], labels)
@@ -45,7 +47,7 @@ def fitted_model(preset: str, frame: Frame) -> Model:
         optimizer.step()
     # so few steps leave the running statistics behind: take them anew
     for norm in network.modules():
-        if isinstance(norm, nn.BatchNorm1d):
+        if isinstance(norm, nn.BatchNorm1d) and norm.training:
             norm.reset_running_stats()
             norm.momentum = None  # a plain mean of what follows
     with torch.no_grad():
