@@ -8,9 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mereo.config import PRESETS
+from mereo.extraction import LabelGrid
+from mereo.frame import Normalizer
 from mereo.frames import Frame
 from mereo.mesh import PALETTE
-from mereo.model import Model
+from mereo.model import Box, Model
 from mereo.network import Network
 
 STEPS, QUERIES = 200, 2048
@@ -26,6 +28,7 @@ def fitted_model(preset: str, frame: Frame) -> Model:
     network = Network(replace(PRESETS[preset].network, dropout=0.0), len(grid.names))
     model = Model(network, grid.names, tuple(PALETTE[i % len(PALETTE)] for i in range(len(grid.names))))
     cloud, normalizer = model.normalized_cloud(frame.depth.to_points())
+    model = replace(model, domain=_domain(grid, normalizer))
     viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32))
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
     cells = [np.argwhere(kept & mask) for mask in (grid.labels > 0, grid.labels == 0)]
@@ -55,3 +58,10 @@ def fitted_model(preset: str, frame: Frame) -> Model:
             network(cloud, viewpoint, draw()[0])
     network.eval().requires_grad_(False)
     return model
+
+
+def _domain(grid: LabelGrid, normalizer: Normalizer) -> Box:
+    """The box that the frame teaches, normalized; as from a trained network nothing is answered beyond it."""
+    corners = normalizer.apply(np.stack([grid.origin, grid.origin + grid.spacing * grid.labels.shape]))
+    (x0, y0, z0), (x1, y1, z1) = corners.tolist()
+    return (x0, y0, z0), (x1, y1, z1)
