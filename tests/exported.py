@@ -7,7 +7,8 @@ import torch
 
 from mereo.config import PRESETS, NetworkConfig
 from mereo.mesh import PALETTE
-from mereo.model import Model, Network
+from mereo.model import Model
+from mereo.network import Network
 from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 
 NAMES = ("head", "left ear", "tail")

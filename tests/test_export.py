@@ -20,7 +20,8 @@ from mereo.config import PRESETS
 from mereo.export import ANSWERS, RUNNER, code_tensors, export_weights
 from mereo.mereo_onnx import main, prepare
 from mereo.mesh import PALETTE
-from mereo.model import Model, Network
+from mereo.model import Model
+from mereo.network import Network
 from mereo.ordering import farthest_point_order
 from mereo.weights import load_model, save_model
 

@@ -15,6 +15,7 @@ from mereo.files import read_point_cloud
 from mereo.input_config import InputConfig, IsolationConfig
 from mereo.observation import read_observation, size_warning
 from mereo.output import write_camera
+from mereo.weights import load_model
 
 CAMERA = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
 
@@ -120,6 +121,15 @@ def test_size_against_training(tmp_path: Path) -> None:
         assert (text is None) == fits, visible_m
         assert fits or (text and "m in training: other things are in the cloud" in text and "--unit-m 0.001" in text)
     assert size_warning(seen, {"scene": "bunny"}) is None and size_warning(seen, {"visible_m": None}) is None
+
+
+def test_shipped_bunny_weights_know_the_bunny_size(tmp_path: Path) -> None:
+    """The Stanford Bunny is 15 cm long; the same cloud read as millimetres cannot be it."""
+    np.save(tmp_path / "c.npy", np.random.default_rng(0).uniform((0, 0, 1), (0.15, 0.15, 1.1), (400, 3)))
+    provenance = load_model("bunny").provenance
+    assert size_warning(read_observation(tmp_path / "c.npy"), provenance) is None
+    text = size_warning(read_observation(tmp_path / "c.npy", InputConfig(unit_m=0.001)), provenance)
+    assert text is not None and "m long, but 0.12 to 0.254 m in training" in text
 
 
 # --- Zivid -----------------------------------------------------------------------------------------------------------

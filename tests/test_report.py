@@ -3,21 +3,19 @@
 import base64
 import json
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from browser import BROWSER
 from PIL import Image
 from scipy.spatial import cKDTree
 
 from mereo.camera import PointCloud
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.report import BUDGET_BYTES, cluster, write_report
-
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 def ball(name: str, shift: float, color: tuple[int, int, int], level: int = 3) -> Segment:

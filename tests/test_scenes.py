@@ -34,6 +34,9 @@ PRESSED = {
 """Segments that may press into each other a little: the ears' roots are side by side and bend alone; at groin and knee
 flat triangles cut across the crease between neighbours."""
 
+LENGTHS_M = {"bunny": 0.156, "liver": 0.202, "tumor": 0.202, "liver-simulated": 0.202, "skull": 0.236, "human": 1.68}
+"""Longest side of the rest pose's box, of objects that have a true size."""
+
 _LIVER = ("liver/lapgym_liver_visual.stl", "liver/lapgym_gallbladder_visual.stl")
 NEEDED_ASSETS = {
     "bunny": ("bunny/bunny.off",),
@@ -197,6 +200,15 @@ def test_label_grid_adds_up_to_the_volumes(scene: Scene) -> None:
     cell = np.prod([axis[1] - axis[0] for axis in axes])
     for index, volume in enumerate(scene.rest.owned_volumes):
         assert abs((grid == index + 1).sum() * cell / volume - 1) < 0.06
+
+
+def test_true_size_where_it_is_known(scene: Scene) -> None:
+    if scene.name not in LENGTHS_M:
+        assert scene.unit_m is None
+        return
+    assert scene.unit_m is not None
+    low, high = scene.rest.bounds
+    assert (high - low).max() * scene.unit_m == pytest.approx(LENGTHS_M[scene.name], rel=0.02)
 
 
 def test_workspace_is_a_cone_of_the_stated_aperture_and_distance() -> None:

@@ -21,7 +21,8 @@ from mereo.config import PRESETS
 from mereo.extraction import LabelGrid
 from mereo.inspection import Inspection
 from mereo.laboratory import Laboratory
-from mereo.model import Answer, Model, Network
+from mereo.model import Answer, Model
+from mereo.network import Network
 from mereo.reconstruction import Reconstruction
 from mereo.viewer import stage, words
 from mereo.viewer.frame_page import FramePage

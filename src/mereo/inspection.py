@@ -11,7 +11,7 @@ from mereo.input_config import Frame
 from mereo.mesh import SegmentedMesh
 from mereo.model import Answer, EncodedCloud, Model
 from mereo.reconstruction import Reconstruction, reconstruct, segment_names
-from mereo.scans import scanner_to_camera
+from mereo.scans import into_camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Inspection:
     def of(cls, cloud: PointCloud, model: Model, resolution: int = 128, frame: Frame = "camera") -> "Inspection":
         """Reconstruct a cloud. Raises as ``reconstruct`` does."""
         result = reconstruct(cloud, model, resolution, frame)
-        T_camera_input = scanner_to_camera(cloud.points) if frame == "scanner" else np.eye(4)
+        T_camera_input = into_camera(cloud.points, frame)
         code = model.encode(PointCloud(transform_points(T_camera_input, cloud.points)))
         return cls(cloud, result, model, code, T_camera_input)
 

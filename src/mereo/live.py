@@ -8,14 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mereo.input_config import InputConfig, IsolationConfig
 from mereo.reconstruction import Reconstruction, reconstruct
 from mereo.stream import Counter, Outcome, Summary, stream
 from mereo.stream_sources import STANDARD_INPUT, frames_of
 from mereo.weights import load_model
-from mereo.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
+from mereo.writers.glb import viewer_rotation, write_segments_glb
 
 
 def stream_reconstructions(
@@ -41,7 +39,7 @@ def stream_reconstructions(
     pace = not every_frame and source != STANDARD_INPUT
     outcomes: Iterator[Outcome[Reconstruction]] = stream(frames, answer, recorded_pace=pace, every_frame=every_frame)
     counter, last_error = Counter(), ""
-    to_viewer = GLTF_CAMERA_ROTATION if reading.frame == "camera" else np.eye(3)
+    to_viewer = viewer_rotation(reading.frame)
     try:
         for outcome in outcomes:
             counter.add(outcome)

@@ -21,7 +21,7 @@ from rich.table import Table
 
 from mereo.camera import PointCloud
 from mereo.extraction import LabelGrid, extract_whole, locate
-from mereo.frame import inverse_rigid, rigid, transform_points
+from mereo.frame import inverse_rigid, transform_points
 from mereo.input_config import Frame, InputConfig, IsolationConfig
 from mereo.isolation import STRAY_SHARE, stray_share
 from mereo.measurement import FoundSegment, SegmentedCloud, measure, segment_points
@@ -32,11 +32,11 @@ from mereo.output import new_directory
 from mereo.pictures import render_cloud_and_segments
 from mereo.refinement import Field
 from mereo.report import write_report
-from mereo.scans import SCANNER_TO_CAMERA, scanner_to_camera
+from mereo.scans import camera_axes, into_camera
 from mereo.weights import load_model
 from mereo.writers import DEFAULT_FILES, FilesConfig
 from mereo.writers.formats import Results, chosen_formats, write_formats
-from mereo.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.writers.glb import viewer_rotation
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Where segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one lies behind it."""
@@ -87,7 +87,7 @@ def reconstruct(
     """
     points = np.asarray(cloud.points if isinstance(cloud, PointCloud) else cloud, dtype=np.float64)
     timings: dict[str, float] = {}
-    T_camera_input = scanner_to_camera(points) if frame == "scanner" else np.eye(4)
+    T_camera_input = into_camera(points, frame)
     with _timed(timings, "encode"):
         seen = transform_points(T_camera_input, points)
         code = model.encode(PointCloud(seen))
@@ -205,10 +205,10 @@ def _write_files(
 ) -> None:
     started = time.perf_counter()
     formats = chosen_formats(files.formats)
-    to_viewer = GLTF_CAMERA_ROTATION if frame == "camera" else np.eye(3)
+    to_viewer = viewer_rotation(frame)
     results = Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, unit_m)
     write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
-    to_camera = rigid(np.eye(3) if frame == "camera" else SCANNER_TO_CAMERA, np.zeros(3))
+    to_camera = camera_axes(frame)
     seen = PointCloud(transform_points(to_camera, cloud.points))
     title = str(facts.get("title", "mereo reconstruction"))
     render_cloud_and_segments(directory / "preview.png", seen, result.surfaces.transformed(to_camera), title)

@@ -3,7 +3,7 @@
 Every ``COARSE``-th node is evaluated; cells that may hold a change of label are halved until one step wide; all
 other nodes take the label of the cell they lie in. Which cells may hold one?
 
-- Those whose corners differ (``_changing_cells``), and at the first level all cells around them.
+- Those whose corners differ (``changing_cells``), and at the first level all cells around them.
 - Those where the lead of the winning class falls so steeply that it may vanish inside (``_sloping_cells``), except
   beside a surface that is already known.
 - Then no evaluated node may contradict the label assumed beside it; where one does, that neighbour is evaluated too,
@@ -87,7 +87,7 @@ def sample_coarse_to_fine(
     labels, rows = labels.reshape(lattice), rows.reshape(lattice)
     step = COARSE
     while step > 1:
-        changing, sloping = _changing_cells(labels), _sloping_cells(rows, evaluate.logits())
+        changing, sloping = changing_cells(labels), _sloping_cells(rows, evaluate.logits())
         if step == COARSE:
             active = _over_neighbors(changing | sloping, np.logical_or)
         else:  # beside a surface that is known the lead is small because of it, and `_follow` watches there
@@ -102,9 +102,9 @@ def _all_nodes(shape: tuple[int, int, int]) -> Int[np.ndarray, "n 3"]:
     return np.indices(shape).reshape(3, -1).T
 
 
-def _changing_cells(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "i j k"]:
+def changing_cells(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "i j k"]:
     """Cells whose eight corners do not all have one label."""
-    return _over_corners(labels, np.maximum) != _over_corners(labels, np.minimum)
+    return over_corners(labels, np.maximum) != over_corners(labels, np.minimum)
 
 
 def _sloping_cells(rows: Int[np.ndarray, "x y z"], logits: Float[np.ndarray, "m c"]) -> Bool[np.ndarray, "i j k"]:
@@ -123,10 +123,10 @@ def _sloping_cells(rows: Int[np.ndarray, "x y z"], logits: Float[np.ndarray, "m 
         before[axis], after[axis] = (1, 0), (0, 1)
         change += np.maximum(np.pad(steps, before), np.pad(steps, after))
     # NaN compares as False: a cell all of whose corners were skipped stays as it is
-    return _over_corners(lead <= REACH * 0.5 * change, np.logical_or)
+    return over_corners(lead <= REACH * 0.5 * change, np.logical_or)
 
 
-def _over_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
+def over_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
     """``combine`` over the eight corners of each cell."""
     for axis in range(3):
         count = values.shape[axis]

@@ -24,7 +24,7 @@ from mereo.model import Model
 from mereo.placement import Start, scale_of
 from mereo.rest_pose import rest_frame
 from mereo.scan_surface import diagonal
-from mereo.scans import scanner_to_camera
+from mereo.scans import into_camera
 
 LEAST_PAIRS = 3
 
@@ -195,7 +195,7 @@ def start_from_model(
             f"the weights know the segments {', '.join(model.names)}, the scene has {', '.join(rest.names)}; they must "
             "be the same in the same order: use the weights of this object"
         )
-    T_camera_scan = scanner_to_camera(points) if frame == "scanner" else np.eye(4)
+    T_camera_scan = into_camera(points, frame)
     code = model.encode(transform_points(T_camera_scan, points))
     guessed = model.rest(code, code.cloud)
     if guessed is None or not model.segmented:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from mereo.camera import PointCloud
 from mereo.files import read_point_cloud
-from mereo.frame import rigid, transform_points
+from mereo.frame import transform_points
 from mereo.mesh import SegmentedMesh
 from mereo.output import new_directory
 from mereo.pictures import CAMERA_VIEWS
@@ -19,13 +19,13 @@ from mereo.placement import Placement, Start, place
 from mereo.registration import load_icp
 from mereo.rough_start import read_start, start_from_model
 from mereo.scan_truth import TRUTH, ScanFile, write_truth
-from mereo.scans import SCANNER_TO_CAMERA
+from mereo.scans import camera_axes
 from mereo.scene import Scene, load_scene
 from mereo.shading import Canvas, Triangles, Viewpoint
 from mereo.sheets import Picture, contact_sheet, legend, save_png
 from mereo.solid import Solids
 from mereo.weights import load_model
-from mereo.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
+from mereo.writers.glb import viewer_rotation, write_segments_glb
 
 UNITS_M: Mapping[str, float] = MappingProxyType({"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254})
 """Metres in each unit that a scan may have."""
@@ -72,8 +72,7 @@ def align_file(
         rough = _start(start, weights, cloud, scan, loaded.rest, scale)
         placement = place(loaded.rest, cloud.points, rough, scan.frame, as_one=as_one, hold=hold)
         write_truth(directory, output, scan, scene, loaded.rest, placement, rough.how)
-        to_viewer = GLTF_CAMERA_ROTATION if scan.frame == "camera" else np.eye(3)
-        write_segments_glb(directory / "segments.glb", placement.mesh, to_viewer, UNITS_M[scan.unit])
+        write_segments_glb(directory / "segments.glb", placement.mesh, viewer_rotation(scan.frame), UNITS_M[scan.unit])
         save_png(directory / "overlay.png", overlay(placement, cloud, scan))
     print_placement(placement, f"{scan.path.name}, {len(cloud)} points", scan.unit)
     print(f"wrote {output}; look at {output / 'overlay.png'}, then: mereo evaluate WEIGHTS --scans {output / TRUTH}")
@@ -132,7 +131,7 @@ def print_placement(placement: Placement, title: str, unit: str) -> None:
 
 def overlay(placement: Placement, cloud: PointCloud, scan: ScanFile) -> Picture:
     """The scan on the placed segments (top), and its distance from them (bottom), as seen by the scanner and others."""
-    to_camera = rigid(np.eye(3) if scan.frame == "camera" else SCANNER_TO_CAMERA, np.zeros(3))
+    to_camera = camera_axes(scan.frame)
     mesh = placement.mesh.transformed(to_camera)
     chosen = np.random.default_rng(0).permutation(len(cloud))[:SHOWN_POINTS]
     points = transform_points(to_camera, cloud.points[chosen])

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from mereo.frame import transform_points
 from mereo.mesh import Segment, SegmentedMesh
 from mereo.solid import Solids
+from mereo.thinning import first_in_cell
 
 Poses = Float[np.ndarray, "s 4 4"]
 """``T_scan_segment`` of each segment, in label order."""
@@ -36,9 +37,7 @@ def diagonal(mesh: SegmentedMesh) -> float:
 
 def thinned(points: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, "p 3"]:
     """One of the points in each cell of a grid: their mean would lie off a curved surface."""
-    cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    return points[np.sort(first)]
+    return points[first_in_cell(points - points.min(axis=0), spacing)]
 
 
 def exposed(rest: SegmentedMesh) -> SegmentedMesh:

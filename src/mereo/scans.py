@@ -40,6 +40,16 @@ def scanner_to_camera(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 
     return rigid(SCANNER_TO_CAMERA, target - SCANNER_TO_CAMERA @ normalizer.center)
 
 
+def into_camera(points: Float[np.ndarray, "n 3"], frame: Frame) -> Float[np.ndarray, "4 4"]:
+    """``T_camera_input`` of a cloud in either frame; see ``scanner_to_camera``."""
+    return scanner_to_camera(points) if frame == "scanner" else np.eye(4)
+
+
+def camera_axes(frame: Frame) -> Float[np.ndarray, "4 4"]:
+    """Turns a frame's axes into a camera's, about its own origin: for looking, where the distance does not matter."""
+    return rigid(SCANNER_TO_CAMERA if frame == "scanner" else np.eye(3), np.zeros(3))
+
+
 def bunny_scan(name: str) -> tuple[PointCloud, Float[np.ndarray, "4 4"]]:
     """A real scan in its scanner frame, metres, and ``T_model_scan`` into the frame of bunny.off.
 
@@ -83,7 +93,7 @@ class PosedScan:
 
     def in_camera(self) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
         """Cloud and truth in a camera frame, and ``T_camera_scan``."""
-        T_camera_scan = scanner_to_camera(self.cloud.points) if self.frame == "scanner" else np.eye(4)
+        T_camera_scan = into_camera(self.cloud.points, self.frame)
         cloud = PointCloud(transform_points(T_camera_scan, self.cloud.points))
         return cloud, self.truth.transformed(T_camera_scan), T_camera_scan
 

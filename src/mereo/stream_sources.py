@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -60,11 +60,8 @@ def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamF
             yield StreamFrame(name, time.perf_counter() - start, _loader(Path(name), reading, isolation))
 
 
-def _loader(file: Path, reading: InputConfig, isolation: IsolationConfig) -> "partial[PointCloud]":
-    def load(file: Path) -> PointCloud:
-        return read_observation(file, reading, isolation).cloud
-
-    return partial(load, file)
+def _loader(file: Path, reading: InputConfig, isolation: IsolationConfig) -> Callable[[], PointCloud]:
+    return lambda: read_observation(file, reading, isolation).cloud
 
 
 def _recorded(path: Path, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame]:

@@ -25,19 +25,20 @@ def thin_to_grid(points: Float[np.ndarray, "n 3"], limit: int) -> Int[np.ndarray
         return np.arange(limit)
     # a surface through a cube of c^3 cells occupies about c^2 of them
     cell = side / np.sqrt(limit)
-    while len(rows := _first_in_cell(points - low, cell)) > limit:
+    while len(rows := first_in_cell(points - low, cell)) > limit:
         cell *= np.sqrt(len(rows) / limit) * 1.02
     while True:
         finer = cell / np.sqrt(limit / max(len(rows), 1)) * 1.05
         if len(rows) >= 0.5 * limit or finer < side * 1e-6:
             return rows
-        found = _first_in_cell(points - low, finer)
+        found = first_in_cell(points - low, finer)
         if len(found) > limit:
             return rows
         cell, rows = finer, found
 
 
-def _first_in_cell(offsets: Float[np.ndarray, "n 3"], cell: float) -> Int[np.ndarray, " m"]:
+def first_in_cell(offsets: Float[np.ndarray, "n 3"], cell: float) -> Int[np.ndarray, " m"]:
+    """Rows of the first point in each occupied cell of a grid, in their order; ``offsets`` are not negative."""
     index = np.floor(offsets / cell).astype(np.int64)
     counts = index.max(axis=0) + 1
     key = (index[:, 0] * counts[1] + index[:, 1]) * counts[2] + index[:, 2]

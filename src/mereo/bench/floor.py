@@ -34,10 +34,13 @@ class Work:
         return max(self.operations / machine.operations, self.bytes / machine.bandwidth)
 
 
-def synchronize(device: torch.device) -> None:
-    """Wait until the device has done what it was asked."""
+def seconds(work: Callable[[], object], device: torch.device) -> float:
+    """How long ``work`` takes, until the device has done what it was asked."""
+    start = time.perf_counter()
+    work()
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+    return time.perf_counter() - start
 
 
 def measure_machine(device: torch.device, dtype: torch.dtype = torch.float32) -> Machine:
@@ -51,13 +54,7 @@ def measure_machine(device: torch.device, dtype: torch.dtype = torch.float32) ->
 
 
 def _median(work: Callable[[], object], device: torch.device, repeats: int = 15) -> float:
-    seconds = []
-    for _ in range(repeats + 2):
-        start = time.perf_counter()
-        work()
-        synchronize(device)
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds[2:])
+    return statistics.median([seconds(work, device) for _ in range(repeats + 2)][2:])
 
 
 def count_operations(work: Callable[[], object]) -> int:

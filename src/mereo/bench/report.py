@@ -3,7 +3,6 @@
 import os
 import platform
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import torch
 
 from mereo.bench.fitting import fitted_model
 from mereo.bench.floor import Machine, measure_machine
-from mereo.bench.stages import Bench, Stage
+from mereo.bench.stages import Bench, Stage, random_points
 from mereo.config import Precision
 from mereo.frames import Frame, load_frame, shipped_frames
 from mereo.hardware import has_amx, pick_precision
@@ -94,11 +93,9 @@ def _facts(subject: str, device: torch.device, dtype: torch.dtype, machine: Mach
 
 def _cost(exact: Model, fast: Model, frame: Frame) -> Cost:
     cloud = frame.depth.to_points()
-    grid = frame.truth.grid
-    points = grid.origin + np.random.default_rng(1).random((40_000, 3)) * grid.spacing * grid.labels.shape
-    code, other = exact.encode(cloud), fast.encode(cloud)
-    ask = partial(exact.query, code), partial(fast.query, other)
-    one, two = (query(points) for query in ask)
+    points = random_points(frame, 40_000, seed=1)
+    code = exact.encode(cloud)
+    one, two = exact.query(code, points), fast.query(fast.encode(cloud), points)
     change = np.abs(one.distance - two.distance).mean() * code.normalizer.scale
     return Cost(float((one.label != two.label).mean()), float(change))
 

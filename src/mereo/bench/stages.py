@@ -1,25 +1,22 @@
 """The stages of an answer, each timed against its floor and, where there is one, the rival."""
 
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
-from mereo.bench.floor import Machine, Work, count_operations, synchronize
+from mereo.bench.floor import Machine, Work, count_operations, seconds
 from mereo.bench.rival import Rival
 from mereo.extraction import extract_dense, extract_whole, locate
 from mereo.frame import Normalizer
 from mereo.frames import Frame
-from mereo.model import Model
+from mereo.model import EncodedCloud, Model
 from mereo.reconstruction import SEARCH_BOX
-from mereo.refinement import sample_coarse_to_fine
-
-SEED = 0
+from mereo.refinement import changing_cells, over_corners, sample_coarse_to_fine, sample_dense
 
 
 @dataclass(frozen=True)
@@ -82,9 +79,8 @@ class Bench:
 
     def queries(self, count: int) -> Stage:
         """Class logits at random points of the object's box."""
-        code = self.model.encode(self.frame.depth.to_points())
-        points = self._random_points(count)
-        ours = partial(self.model.logits, code, points)
+        points = random_points(self.frame, count)
+        ours = partial(self.model.logits, self._code, points)
         rival = partial(self._rival().logits, points) if self.rival else None
         if rival is not None:
             self._compare(ours(), rival())
@@ -92,7 +88,7 @@ class Bench:
 
     def whole_frame(self) -> Stage:
         """Depth image to labels of 10,000 and then 40,000 points, as in the authors' follow-up."""
-        coarse, fine = self._random_points(10_000), self._random_points(40_000)
+        coarse, fine = random_points(self.frame, 10_000), random_points(self.frame, 40_000)
 
         def ours() -> None:
             code = self.model.encode(self.frame.depth.to_points())
@@ -110,20 +106,21 @@ class Bench:
         """The labels of the evaluation's grid, 100^3 cells."""
         grid = self.frame.truth.grid
         x, y, z = grid.labels.shape
-        field = partial(self.model.logits, self.model.encode(self.frame.depth.to_points()))
+        field = partial(self.model.logits, self._code)
 
         def ours() -> UInt8[np.ndarray, "x y z"]:
             return sample_coarse_to_fine(field, grid.origin, grid.spacing, (x, y, z)).labels
 
         work = self._grid_work(ours())
-        rival = partial(self._dense_labels, self._rival()) if self.rival else None
+        rival = (
+            partial(sample_dense, self._rival().logits, grid.origin, grid.spacing, (x, y, z)) if self.rival else None
+        )
         return self._stage(f"labels, {x} x {y} x {z}", work, ours, rival, once=True)
 
     def surfaces(self) -> Stage:
         """Closed meshes of all segments, 128 cells along the longest side; finding the object's box is in it."""
         model = self.model
-        code = model.encode(self.frame.depth.to_points())
-        field, search = partial(model.logits, code), code.normalizer.invert(SEARCH_BOX)
+        field, search = partial(model.logits, self._code), self._code.normalizer.invert(SEARCH_BOX)
 
         def ours() -> UInt8[np.ndarray, "x y z"]:
             found = extract_whole(field, locate(field, search), 128, model.names, model.colors, model.nested)
@@ -136,9 +133,12 @@ class Bench:
 
     # --- parts ---------------------------------------------------------------------------------------------------
 
+    @cached_property
+    def _code(self) -> EncodedCloud:
+        return self.model.encode(self.frame.depth.to_points())
+
     def _warm_up(self) -> None:
-        code = self.model.encode(self.frame.depth.to_points())
-        self.model.logits(code, self._random_points(8192))
+        self.model.logits(self._code, random_points(self.frame, 8192))
 
     def _input(self) -> tuple[torch.Tensor, Normalizer]:
         cloud, normalizer = self.model.normalized_cloud(self.frame.depth.to_points())
@@ -147,21 +147,10 @@ class Bench:
     def _rival(self) -> Rival:
         return Rival(self.model, *self._input())
 
-    def _random_points(self, count: int) -> Float[np.ndarray, "n 3"]:
-        grid = self.frame.truth.grid
-        size = grid.spacing * grid.labels.shape
-        return grid.origin + np.random.default_rng(SEED).random((count, 3)) * size
-
-    def _dense_labels(self, rival: Rival) -> UInt8[np.ndarray, "x y z"]:
-        grid = self.frame.truth.grid
-        nodes = np.indices(grid.labels.shape).reshape(3, -1).T
-        return rival.logits(grid.positions(nodes)).argmax(axis=1).astype(np.uint8).reshape(grid.labels.shape)
-
     def _grid_work(self, labels: UInt8[np.ndarray, "x y z"]) -> Work:
         """Asking the corners of every cell that holds a change of label, and nothing else."""
-        code = self.model.encode(self.frame.depth.to_points())
-        points = self._random_points(4096)
-        each = count_operations(lambda: self.model.logits(code, points)) / len(points)
+        points = random_points(self.frame, 4096)
+        each = count_operations(lambda: self.model.logits(self._code, points)) / len(points)
         return Work(each * int(needed_nodes(labels).sum()), float(labels.nbytes))
 
     def _network_stage(self, name: str, ours: Callable[[], object], rival: Callable[[], object] | None = None) -> Stage:
@@ -177,11 +166,11 @@ class Bench:
         once: bool = False,
     ) -> Stage:
         """Ours and the rival's take turns, so that a busy machine slows both."""
-        mine, theirs = [], []
+        mine, theirs, device = [], [], self.model.device
         for repeat in range(self.repeats):
-            mine.append(self._seconds(ours))
+            mine.append(seconds(ours, device))
             if rival is not None and not (once and repeat):
-                theirs.append(self._seconds(rival))
+                theirs.append(seconds(rival, device))
         slowest = float(np.quantile(mine, 0.99))
         return Stage(
             name,
@@ -190,12 +179,6 @@ class Bench:
             work.seconds(self.machine),
             statistics.median(theirs) if theirs else None,
         )
-
-    def _seconds(self, work: Callable[[], object]) -> float:
-        start = time.perf_counter()
-        work()
-        synchronize(self.model.device)
-        return time.perf_counter() - start
 
     @staticmethod
     def _compare(ours: Float[np.ndarray, "n c"], theirs: Float[np.ndarray, "n c"]) -> None:
@@ -207,14 +190,14 @@ class Bench:
             raise RuntimeError(f"{wrong} of {len(ours)} labels differ between the model and the rival; they must agree")
 
 
+def random_points(frame: Frame, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+    """Places in the box of the frame's object."""
+    grid = frame.truth.grid
+    return grid.origin + np.random.default_rng(seed).random((count, 3)) * grid.spacing * grid.labels.shape
+
+
 def needed_nodes(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """Corners of the cells whose corners do not all have one label."""
-    needed = np.zeros(labels.shape, dtype=bool)
-    low, high = labels[:-1, :-1, :-1].copy(), labels[:-1, :-1, :-1].copy()
-    corners = [np.s_[a : a - 1 or None, b : b - 1 or None, c : c - 1 or None] for a, b, c in np.ndindex(2, 2, 2)]
-    for corner in corners:
-        np.minimum(low, labels[corner], out=low)
-        np.maximum(high, labels[corner], out=high)
-    for corner in corners:
-        needed[corner] |= low != high
+    around = np.pad(changing_cells(labels), 1)  # cells beyond the grid change nothing
+    needed: np.ndarray = over_corners(around, np.logical_or)
     return needed

@@ -27,6 +27,8 @@ SHORTEST_SIDE_MM = 162.68
 MM = SHORTEST_SIDE / SHORTEST_SIDE_MM
 """Scene units per millimetre."""
 
+UNIT_M = 0.001 / MM
+
 CENTER_MM = (-3.333, -3.867, 0.0)
 """Middle of the liver's box in the frame of the source."""
 

@@ -187,4 +187,5 @@ def scene() -> Scene:
         sample_deformations=sample_deformations,
         workspace=Workspace(aperture_rad=WHOLE_SPHERE_RAD, any_roll=True, fov_rad=float(np.deg2rad(26.0))),
         source="Stanford Computer Graphics Laboratory, Stanford 3D Scanning Repository: research use, not commercial",
+        unit_m=1 / model_to_scene()[1],
     )

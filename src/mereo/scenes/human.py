@@ -38,7 +38,7 @@ from scipy.spatial.distance import cdist
 from mereo.deformation import Compose, Deformation, jacobian_determinant
 from mereo.scene import Scene, Workspace
 from mereo.scenes._human_joints import JOINTS, NAMES, part_axes, rotations, turn_limits
-from mereo.scenes._human_parts import base, rest_mesh, to_scene
+from mereo.scenes._human_parts import SCALE, base, rest_mesh, to_scene
 from mereo.scenes._human_skin import PosedBody, share_field
 from mereo.solid import label_grid
 from mereo.warps import SmoothField
@@ -139,4 +139,5 @@ def scene() -> Scene:
         sample_deformations=sample_deformations,
         workspace=Workspace(fov_rad=float(np.deg2rad(50.0))),
         source="MakeHuman base mesh, default skeleton and skin weights, MakeHuman community: CC0 1.0",
+        unit_m=0.1 / SCALE,
     )

@@ -24,7 +24,7 @@ import numpy as np
 from mereo.deformation import Deformation
 from mereo.mesh import SegmentedMesh
 from mereo.scene import Scene
-from mereo.scenes._liver_parts import SOURCE, WORKSPACE, organs, sample_field
+from mereo.scenes._liver_parts import SOURCE, UNIT_M, WORKSPACE, organs, sample_field
 
 
 def rest_mesh() -> SegmentedMesh:
@@ -40,4 +40,4 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 def scene() -> Scene:
     """Liver & Gallbladder; needs the assets `liver/lapgym_liver_visual.stl` and `lapgym_gallbladder_visual.stl`."""
-    return Scene("liver", rest_mesh(), sample_deformations, WORKSPACE, SOURCE)
+    return Scene("liver", rest_mesh(), sample_deformations, WORKSPACE, SOURCE, unit_m=UNIT_M)

@@ -17,12 +17,13 @@ What makes it hard: as in `liver`, and the states are finitely many. A network m
 test seeds, which are states never seen, show it.
 """
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from mereo.mesh import SegmentedMesh
 from mereo.scene import Scene
-from mereo.scenes._liver_parts import MM, SOURCE, WORKSPACE, organs
+from mereo.scenes._liver_parts import MM, SOURCE, UNIT_M, WORKSPACE, organs
 from mereo.simulated import load_states
 
 STATES = Path(__file__).parent.parent / "states" / "liver.npz"
@@ -33,4 +34,5 @@ def scene() -> Scene:
     """The simulated liver; needs the same assets as the scene `liver`."""
     rest = SegmentedMesh(organs())
     states = load_states(STATES, rest, scale=MM)
-    return states.scene("liver-simulated", rest, WORKSPACE, f"{SOURCE}; states simulated with MuJoCo")
+    liver = states.scene("liver-simulated", rest, WORKSPACE, f"{SOURCE}; states simulated with MuJoCo")
+    return replace(liver, unit_m=UNIT_M)

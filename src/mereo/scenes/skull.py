@@ -39,6 +39,9 @@ from mereo.scenes._solids import Vector, segment_of, union
 UNITS = 3.2342
 """Scene units per unit of the source, where the skull is 6.184 wide."""
 
+UNIT_M = 0.008
+"""The source gives no size; so, the skull is 16 cm wide, as an adult's."""
+
 CENTER = (7.825, -0.298, 0.237)
 """Middle of the skull's box in scene units, before it is moved to the origin."""
 
@@ -205,4 +208,5 @@ def scene() -> Scene:
         sample_deformations=sample_deformations,
         workspace=Workspace(fov_rad=float(np.deg2rad(22.0))),
         source="SOFA framework, LGPL-2.1-or-later; teeth seated and jaw closed by mereo",
+        unit_m=UNIT_M,
     )

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from mereo.deformation import Compose, Deformation, Localized
 from mereo.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.scene import Scene
-from mereo.scenes._liver_parts import MM, SOURCE, WORKSPACE, organs, sample_field, to_scene
+from mereo.scenes._liver_parts import MM, SOURCE, UNIT_M, WORKSPACE, organs, sample_field, to_scene
 
 CENTER_MM = (-18.7, 24.0, 57.0)
 """In the source's frame; the liver's deepest point, 41 mm from its surface, is near."""
@@ -95,4 +95,5 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 def scene() -> Scene:
     """The tumour in the liver; needs the same assets as the scene `liver`."""
-    return Scene("tumor", rest_mesh(), sample_deformations, WORKSPACE, f"{SOURCE}; the tumour is modelled in mereo")
+    source = f"{SOURCE}; the tumour is modelled in mereo"
+    return Scene("tumor", rest_mesh(), sample_deformations, WORKSPACE, source, unit_m=UNIT_M)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mereo.input_config import Frame
 from mereo.mesh import Segment, SegmentedMesh
 from mereo.mesh_files import VIEWER_ROOT
 from mereo.output import atomic_file
@@ -18,6 +19,11 @@ OUTER_OPACITY = 0.35
 
 GLTF_CAMERA_ROTATION = np.diag([1.0, -1.0, -1.0])
 """Half a turn about x: from the camera frame (y down, z forward) to glTF (y up, z toward the viewer)."""
+
+
+def viewer_rotation(frame: Frame) -> Float[np.ndarray, "3 3"]:
+    """From the input's axes to glTF's, which a scanner's already are."""
+    return GLTF_CAMERA_ROTATION if frame == "camera" else np.eye(3)
 
 
 def write_segments_glb(
