@@ -157,7 +157,7 @@ def test_from_file_to_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cloud, model = scene("camera")
-    monkeypatch.setattr("mereo.reconstruction.load_model", lambda _: model)
+    monkeypatch.setattr("mereo.reconstruction.load_for", lambda *_: model)
     np.save(tmp_path / "cloud.npy", cloud)
     result = reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "out", resolution=16)
     assert summarize(result)["segments"][0]["name"] == "big"
@@ -173,7 +173,7 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     """Strays beside the object are pointed out, and left out when asked; the summary says so."""
     cloud, model = scene("camera")
     np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
-    monkeypatch.setattr("mereo.reconstruction.load_model", lambda _: replace(model, provenance={"visible_m": [2, 3]}))
+    monkeypatch.setattr("mereo.reconstruction.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
     read = partial(reconstruct_file, tmp_path / "cloud.npy", "any", resolution=16)
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
         read(output=tmp_path / "crowded")

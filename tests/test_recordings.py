@@ -1,11 +1,14 @@
 """ROS 1 bags, ROS 2 bags and MCAP files, written here by rosbags itself, give back depth and points."""
 
+import struct
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mereo.camera import Camera, DepthImage
 from mereo.files import read_intrinsics
@@ -49,6 +52,13 @@ class Messages:
             header=self.header(), height=height, width=width, encoding=encoding, is_bigendian=int(big),
             step=rows.shape[1], data=rows.reshape(-1),
         )  # fmt: skip
+
+    def compressed(self, values: np.ndarray, format_: str, quantization: tuple[float, float] = (0.0, 0.0)) -> Any:
+        """As compressed_depth_image_transport writes it: 12 bytes, then a 16-bit PNG."""
+        png = BytesIO()
+        Image.fromarray(values.astype(np.uint16)).save(png, format="PNG")
+        data = np.frombuffer(struct.pack("<iff", 0, *quantization) + png.getvalue(), np.uint8)
+        return self.types["sensor_msgs/msg/CompressedImage"](header=self.header(), format=format_, data=data)
 
     def info(self, focal: float = 10.0, distortion: float = 0.0) -> Any:
         """Principal point 3.5, 2.5 with pixel centres at whole numbers is the middle of 8 x 6 pixels."""
@@ -126,6 +136,48 @@ def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
     content = recorded_frame(path).read()
     assert isinstance(content, DepthImage)
     np.testing.assert_allclose(content.depth, DEPTH_MM[0] / 1000, rtol=1e-6)
+
+
+def test_compressed_depth_is_found_beside_compressed_colour(tmp_path: Path) -> None:
+    def topics(make: Messages) -> dict[str, list[Any]]:
+        return {
+            "/camera/color/image_raw/compressed": [make.compressed(DEPTH_MM[0], "bgr8; jpeg compressed bgr8")],
+            "/camera/depth/image_raw/compressedDepth": [
+                make.compressed(depth, "16UC1; compressedDepth png") for depth in DEPTH_MM
+            ],
+            "/camera/depth/camera_info": [make.info()],
+        }
+
+    frames = list(recorded_frames(write_bag(tmp_path / "a.mcap", 2, topics)))
+    for frame, depth in zip(frames, DEPTH_MM, strict=True):
+        content = frame.read()
+        assert isinstance(content, DepthImage) and content.camera == CAMERA
+        np.testing.assert_array_equal(content.depth, depth / 1000)
+
+
+def test_compressed_floats_are_inverse_depth(tmp_path: Path) -> None:
+    """The transport's own formulas: a = z0 (z0 + 1) and b = 1 - a / zmax give a / z + b in 16 bits."""
+    a, b = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0
+    metres = np.where(DEPTH_MM[0] > 0, DEPTH_MM[0] / 1000, 1.0)
+    stored = np.where(DEPTH_MM[0] > 0, np.round(a / metres + b), 0)
+    format_ = "32FC1; compressedDepth"
+    path = write_bag(
+        tmp_path / "a.bag", 1, lambda m: {"/d/c": [m.compressed(stored, format_, (a, b))], "/d/info": [m.info()]}
+    )
+    content = recorded_frame(path).read()
+    assert isinstance(content, DepthImage)
+    np.testing.assert_allclose(content.depth, DEPTH_MM[0] / 1000, rtol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "format_", ["16UC1; compressedDepth rvl", "rgb8; jpeg compressed bgr8", "8UC1; compressedDepth"]
+)
+def test_other_compressions_are_refused(tmp_path: Path, format_: str) -> None:
+    path = write_bag(
+        tmp_path / "a.bag", 1, lambda m: {"/d/c": [m.compressed(DEPTH_MM[0], format_)], "/d/info": [m.info()]}
+    )
+    with pytest.raises(ValueError, match=f"its format is '{format_}', not PNG-compressed depth"):
+        recorded_frame(path, topic="/d/c").read()
 
 
 def test_point_clouds_keep_their_missing_points_until_asked(tmp_path: Path) -> None:

@@ -30,13 +30,10 @@ class BenchCommand:
     output: Path | None = None
 
     def run(self) -> None:
-        import torch
-
         from mereo.bench.report import benchmark
+        from mereo.hardware import find_device
 
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise ValueError("the device is cuda, but torch sees no CUDA device; leave out --device to time the CPU")
         if self.repeats < 1:
             raise ValueError(f"{self.repeats} repeats are asked for; at least 1 is needed: 7 are usual")
-        device = torch.device(self.device)
+        device = find_device(self.device)
         benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.output)

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mereo.config import GenerateConfig, PresetName, Sensor, SensorConfig, TrainConfig
+from mereo.inference_config import EXACT, InferenceConfig
 from mereo.input_config import InputConfig, IsolationConfig
 from mereo.writers import FilesConfig
 
@@ -152,6 +153,7 @@ class Evaluate:
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
         noise_std: Gaussian noise on the depth, standard deviation in scene units.
         terms: what else is wrong with the depth image.
+        inference: where and how exactly the network computes.
     """
 
     weights: Positional[str]
@@ -163,6 +165,7 @@ class Evaluate:
     sensor: Sensor = "paper"
     noise_std: float = 0.1
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = EXACT
 
     def run(self) -> None:
         from mereo.evaluation import evaluate_weights, markdown_table
@@ -170,15 +173,23 @@ class Evaluate:
         settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)
         if self.scans is not None:
             from mereo.scan_evaluation import evaluate_scans
-            from mereo.weights import load_model
+            from mereo.weights import load_for
 
             if settings != GenerateConfig():
                 raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
 
-            print(markdown_table(evaluate_scans(load_model(self.weights), self.output, truths=self.scans)))
+            print(
+                markdown_table(evaluate_scans(load_for(self.weights, self.inference), self.output, truths=self.scans))
+            )
             return
         evaluate_weights(
-            self.weights, self.output, examples=self.examples, seed=self.seed, scene=self.scene, settings=settings
+            self.weights,
+            self.output,
+            examples=self.examples,
+            seed=self.seed,
+            scene=self.scene,
+            settings=settings,
+            inference=self.inference,
         )
 
 
@@ -194,6 +205,7 @@ class Reconstruct:
         resolution: grid cells along the longest side.
         reading: how the frame is read.
         isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
         files: which files, and in which unit.
         force: replace an existing output folder.
     """
@@ -204,6 +216,7 @@ class Reconstruct:
     resolution: int = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
     files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
     force: bool = False
 
@@ -217,6 +230,7 @@ class Reconstruct:
             resolution=self.resolution,
             reading=self.reading,
             isolation=self.isolation,
+            inference=self.inference,
             files=self.files,
             force=self.force,
         )

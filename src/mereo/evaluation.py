@@ -21,6 +21,7 @@ from mereo.config import TEST_SEED_START, GenerateConfig
 from mereo.error_pictures import ErrorCase, error_picture
 from mereo.evaluation_report import write_evaluation_report
 from mereo.frames import TruthGrid, truth_grid
+from mereo.inference_config import EXACT, InferenceConfig
 from mereo.mesh import Color, SegmentedMesh
 from mereo.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.model import Model
@@ -29,7 +30,7 @@ from mereo.reconstruction import segment_names
 from mereo.refinement import sample_coarse_to_fine
 from mereo.scene import SCENES, Scene, load_scene
 from mereo.synthesis import example_rng, sample_view
-from mereo.weights import load_model
+from mereo.weights import load_for
 
 CELLS = 100
 """The paper's grid along each axis."""
@@ -213,10 +214,11 @@ def evaluate_weights(
     scene: str | None = None,
     cells: int = CELLS,
     settings: GenerateConfig | None = None,
+    inference: InferenceConfig = EXACT,
 ) -> Evaluation:
     """``mereo evaluate``: write metrics.json, table.md, errors.png, report.html; print the table."""
     with new_directory(output) as directory:
-        model = load_model(weights)
+        model = load_for(weights, inference)
         settings = settings or GenerateConfig()
         evaluation = evaluate(model, scene, examples=examples, seed=seed, cells=cells, progress=True, settings=settings)
         facts = {
@@ -225,6 +227,8 @@ def evaluate_weights(
             "seed": seed,
             "noise_std": settings.noise_std,
             "sensor": asdict(settings.sensor),
+            "device": model.device.type,
+            "precision": model.working_precision,
             "trained": model.provenance,
         }
         write_evaluation(directory, evaluation, facts)

@@ -7,6 +7,7 @@ import sys
 import torch
 
 from mereo.config import Precision
+from mereo.inference_config import Device
 
 
 def pick_device(rank: int = 0) -> torch.device:
@@ -14,6 +15,13 @@ def pick_device(rank: int = 0) -> torch.device:
     if torch.cuda.is_available():
         return torch.device("cuda", rank % torch.cuda.device_count())
     return torch.device("cpu")
+
+
+def find_device(device: Device) -> torch.device:
+    """The device that was asked for; ``ValueError`` for CUDA where torch sees none."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("the device is cuda, but torch sees no CUDA device; leave out --device to use the CPU")
+    return torch.device("cpu") if device == "cpu" else pick_device()
 
 
 def has_amx() -> bool:

@@ -8,11 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mereo.inference_config import InferenceConfig
 from mereo.input_config import InputConfig, IsolationConfig
 from mereo.reconstruction import Reconstruction, reconstruct
 from mereo.stream import Counter, Outcome, Summary, stream
 from mereo.stream_sources import STANDARD_INPUT, frames_of
-from mereo.weights import load_model
+from mereo.weights import load_for
 from mereo.writers.glb import viewer_rotation, write_segments_glb
 
 
@@ -26,13 +27,14 @@ def stream_reconstructions(
     surfaces: Path | None = None,
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
+    inference: InferenceConfig | None = None,
 ) -> Summary:
     """Print a line of JSON for each answered or bad frame, and the summary at the end or after Ctrl-C.
 
     Raises ``ValueError`` where not one frame could be answered.
     """
     reading, isolation = reading or InputConfig(), isolation or IsolationConfig()
-    model = load_model(weights)
+    model = load_for(weights, inference or InferenceConfig())
     frames = frames_of(source, reading, isolation, rate_hz)
     answer = partial(reconstruct, model=model, resolution=resolution, frame=reading.frame)
     # what is written to standard input arrives when it does

@@ -109,6 +109,11 @@ class Model:
     def device(self) -> torch.device:
         return next(self.network.parameters()).device
 
+    @property
+    def working_precision(self) -> str:
+        """Of the products on this machine: float32 or bfloat16."""
+        return str(pick_precision(self.precision, self.device) or torch.float32).removeprefix("torch.")
+
     def encode(self, cloud: PointCloud | Float[np.ndarray, "n 3"]) -> EncodedCloud:
         """Points in a camera frame (z forward), any unit, any density. Raises ``ValueError`` on unusable clouds."""
         cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))

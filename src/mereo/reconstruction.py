@@ -22,6 +22,7 @@ from rich.table import Table
 from mereo.camera import PointCloud
 from mereo.extraction import LabelGrid, extract_whole, locate
 from mereo.frame import inverse_rigid, transform_points
+from mereo.inference_config import InferenceConfig
 from mereo.input_config import Frame, InputConfig, IsolationConfig
 from mereo.isolation import STRAY_SHARE, stray_share
 from mereo.measurement import FoundSegment, SegmentedCloud, measure, segment_points
@@ -33,7 +34,7 @@ from mereo.pictures import render_cloud_and_segments
 from mereo.refinement import Field
 from mereo.report import write_report
 from mereo.scans import camera_axes, into_camera
-from mereo.weights import load_model
+from mereo.weights import load_for
 from mereo.writers import DEFAULT_FILES, FilesConfig
 from mereo.writers.formats import Results, chosen_formats, write_formats
 from mereo.writers.glb import viewer_rotation
@@ -226,6 +227,7 @@ def reconstruct_file(
     resolution: int = 128,
     reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
     isolation: IsolationConfig = IsolationConfig(),  # noqa: B008
+    inference: InferenceConfig = InferenceConfig(),  # noqa: B008
     files: FilesConfig = DEFAULT_FILES,
     force: bool = False,
 ) -> Reconstruction:
@@ -237,12 +239,13 @@ def reconstruct_file(
         apart = 0.0 if isolation.largest_cluster else stray_share(seen.cloud)
         if apart > STRAY_SHARE:
             print(f"{apart:.1%} of it lies apart from the largest group; if that is not the object: --largest-cluster")
-        model = load_model(weights)
+        model = load_for(weights, inference)
         warning = size_warning(seen, model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
         result = reconstruct(seen.cloud, model, resolution, seen.frame, label_points="points" in formats)
         facts = {"title": seen.source, "weights": str(weights), "resolution": resolution, "points": len(seen.cloud)}
+        facts |= {"device": model.device.type, "precision": model.working_precision}
         _write_files(directory, result, seen.cloud, seen.frame, files, seen.unit_m, {**facts, **seen.facts()})
     print_segments(result, f"{seen.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")

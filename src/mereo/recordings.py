@@ -2,7 +2,7 @@
 
 A message is only decoded when it is asked for, so that a reader may skip what comes too fast, and a broken message
 stops nothing but itself. Depth follows ROS REP 118: 16UC1 in millimetres with 0, or 32FC1 in metres with NaN, where
-nothing was measured.
+nothing was measured; compressed depth that of ROS's compressed_depth_image_transport.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,18 +10,25 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
+from io import BytesIO
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from PIL import Image
 
 from mereo.camera import Camera, DepthImage
 from mereo.depth_formats import metres
 from mereo.intrinsics import camera_from_fields, warn_of_distortion
 
 IMAGE, CLOUD, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+FRAMES = (IMAGE, COMPRESSED, CLOUD)
+
+COMPRESSED_DEPTH, COMPRESSED_HEADER = "compressedDepth", 12
+"""Of a compressed image's format, where it is depth; and the bytes before its PNG: a number and two quantizations."""
 
 DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
@@ -78,13 +85,14 @@ def recorded_frames(
         raise ImportError(f"{path} needs rosbags, which is not installed: pip install 'mereo[sensors]'")
     with closing(_open(path)) as reader:
         topic = topic or _depth_topic(reader, path)
-        connections = [c for c in reader.connections if c.topic == topic and c.msgtype in (IMAGE, CLOUD)]
+        connections = [c for c in reader.connections if c.topic == topic and c.msgtype in FRAMES]
         if not connections:
-            known = ", ".join(sorted({c.topic for c in reader.connections if c.msgtype in (IMAGE, CLOUD)})) or "none"
+            known = ", ".join(sorted({c.topic for c in reader.connections if c.msgtype in FRAMES})) or "none"
             raise ValueError(f"{path} has no images or clouds on topic {topic!r}; those it has are on: {known}")
         decode: Callable[[Any], Content] = _cloud_points
-        if connections[0].msgtype == IMAGE:
-            decode = partial(_depth_image, camera=camera or _camera(reader, topic, path), depth_scale=depth_scale)
+        if connections[0].msgtype != CLOUD:
+            image = _depth_image if connections[0].msgtype == IMAGE else _compressed_depth
+            decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=depth_scale)
         store, ros2 = reader.typestore, reader.is2
         for connection, stamp_ns, data in reader.messages(connections):
             message = partial(store.deserialize_cdr if ros2 else store.deserialize_ros1, data, connection.msgtype)
@@ -124,17 +132,21 @@ def _open(path: Path) -> Any:
 
 
 def _depth_topic(reader: Any, path: Path) -> str:
-    """The first image topic whose first message is a depth image, else the first cloud topic."""
-    images = sorted({c.topic for c in reader.connections if c.msgtype == IMAGE})
+    """The first image topic whose first message is a depth image, else a compressed one, else the first of clouds."""
+    images, compressed, clouds = (
+        sorted({c.topic for c in reader.connections if c.msgtype == kind and c.msgcount}) for kind in FRAMES
+    )
     for topic in images:
         if _first(reader, topic).encoding in DEPTH_ENCODINGS:
             return topic
-    clouds = sorted({c.topic for c in reader.connections if c.msgtype == CLOUD})
+    for topic in compressed:
+        if COMPRESSED_DEPTH in _first(reader, topic).format:
+            return topic
     if not clouds:
         have = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in reader.connections})) or "nothing"
         raise ValueError(
             f"{path} has neither depth images ({', '.join(DEPTH_ENCODINGS)}) nor point clouds, only {have}: record the "
-            "uncompressed depth topic and its camera_info"
+            "depth topic and its camera_info"
         )
     return clouds[0]
 
@@ -186,6 +198,24 @@ def _depth_image(message: Any, camera: Camera, depth_scale: float | None) -> Dep
     rows = np.asarray(message.data, dtype=np.uint8)[: message.height * message.step].reshape(message.height, -1)
     raw = np.ascontiguousarray(rows[:, : message.width * value.itemsize]).view(value).astype(kind)
     return DepthImage(metres(raw, depth_scale if kind == "u2" else None), camera)
+
+
+def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -> DepthImage:
+    """16UC1 as it is; 32FC1 as inverse depth in 16 bits, ``a / (value - b)`` metres, 0 where nothing was measured."""
+    encoding, _, codec = (part.strip() for part in message.format.partition(";"))
+    if not codec.startswith(COMPRESSED_DEPTH) or encoding not in DEPTH_ENCODINGS or codec.endswith("rvl"):
+        raise ValueError(
+            f"its format is {message.format!r}, not PNG-compressed depth ('16UC1; compressedDepth png' or 32FC1)"
+        )
+    data = np.asarray(message.data, dtype=np.uint8).tobytes()
+    with Image.open(BytesIO(data[COMPRESSED_HEADER:]), formats=("PNG",)) as image:
+        raw = np.asarray(image).astype(np.uint16)
+    if DEPTH_ENCODINGS[encoding] == "u2":
+        return DepthImage(metres(raw, depth_scale), camera)
+    a, b = np.frombuffer(data[4:COMPRESSED_HEADER], "<f4").astype(np.float64)
+    with np.errstate(divide="ignore"):
+        depth = np.where(raw > 0, a / (raw - b), 0.0)
+    return DepthImage(depth, camera)
 
 
 def _cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from mereo.inference_config import InferenceConfig
 from mereo.input_config import InputConfig, IsolationConfig
 
 
@@ -25,6 +26,7 @@ class StreamCommand:
         surfaces: folder for the surfaces of each answered frame, one GLB file each.
         reading: how a frame is read.
         isolation: what is left out of it.
+        inference: where and how exactly the network computes.
     """
 
     source: Positional[str]
@@ -35,6 +37,7 @@ class StreamCommand:
     surfaces: Path | None = None
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
 
     def run(self) -> None:
         from mereo.live import stream_reconstructions
@@ -48,4 +51,5 @@ class StreamCommand:
             surfaces=self.surfaces,
             reading=self.reading,
             isolation=self.isolation,
+            inference=self.inference,
         )

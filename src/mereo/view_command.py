@@ -6,6 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from mereo.inference_config import InferenceConfig
 from mereo.input_config import InputConfig, IsolationConfig
 
 
@@ -19,6 +20,9 @@ class View:
         scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
         port: where the page is, on this machine only (127.0.0.1); 0 takes any that is free.
         resolution: grid cells along the longest side.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
     """
 
     input: Positional[Path | None] = None
@@ -28,6 +32,7 @@ class View:
     resolution: int = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
 
     def run(self) -> None:
         from mereo.viewer.serve import view_frame, view_scene
@@ -35,7 +40,7 @@ class View:
         if self.scene is not None:
             if self.input is not None:
                 raise ValueError(f"both {self.input} and --scene {self.scene} are given; one can be shown: drop one")
-            view_scene(self.scene, self.weights, port=self.port)
+            view_scene(self.scene, self.weights, port=self.port, inference=self.inference)
             return
         view_frame(
             self.input,
@@ -44,4 +49,5 @@ class View:
             resolution=self.resolution,
             reading=self.reading,
             isolation=self.isolation,
+            inference=self.inference,
         )

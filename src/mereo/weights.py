@@ -1,7 +1,7 @@
 """Trained models on disk: one safetensors file whose header holds everything needed to run without the dataset."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -9,6 +9,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from mereo.encoders.autodecoder import CODES
+from mereo.hardware import find_device
+from mereo.inference_config import InferenceConfig
 from mereo.model import Model
 from mereo.network import Network, config_from_dict
 from mereo.output import atomic_file
@@ -59,6 +61,11 @@ def find_weights(name: str | Path) -> Path:
             f"names: {', '.join(shipped_names()) or 'none'}"
         )
     return path
+
+
+def load_for(name: str | Path, inference: InferenceConfig) -> Model:
+    """``load_model``, on the device and in the precision that are asked for."""
+    return replace(load_model(name, find_device(inference.device)), precision=inference.precision)
 
 
 def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from mereo.frames import load_frame, shipped_frames
+from mereo.inference_config import InferenceConfig
 from mereo.input_config import Frame, InputConfig, IsolationConfig
 from mereo.inspection import Inspection
 from mereo.laboratory import Laboratory
@@ -13,7 +14,7 @@ from mereo.scene import load_scene
 from mereo.viewer.frame_page import FramePage
 from mereo.viewer.lab_page import LabPage
 from mereo.viewer.stage import import_viser, start_server, stop_server
-from mereo.weights import load_model, shipped_names
+from mereo.weights import load_for, shipped_names
 
 PORT = 8080
 
@@ -26,6 +27,7 @@ def view_frame(
     resolution: int = 128,
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
+    inference: InferenceConfig | None = None,
 ) -> None:
     """Show a frame and its reconstruction; without ``input`` the shipped frame of the weights."""
     import_viser()
@@ -47,18 +49,18 @@ def view_frame(
     else:
         seen = read_observation(input, reading or InputConfig(), isolation or IsolationConfig())
         cloud, title, frame, unit = seen.cloud, seen.source, seen.frame, "m" if seen.unit_m == 1.0 else ""
-    inspection = Inspection.of(cloud, load_model(weights), resolution, frame)
+    inspection = Inspection.of(cloud, load_for(weights, inference or InferenceConfig()), resolution, frame)
     server = start_server(port, "mereo")
     FramePage(server, inspection, title, f"{len(cloud):,} points · weights {weights}", unit)
     _serve(server)
 
 
-def view_scene(name: str, weights: str | None, *, port: int = PORT) -> None:
+def view_scene(name: str, weights: str | None, *, port: int = PORT, inference: InferenceConfig | None = None) -> None:
     """The laboratory of a scene; without ``weights`` the shipped ones, where there are any."""
     import_viser()
     scene = load_scene(name)
     known = weights or (scene.name if scene.name in shipped_names() else None)
-    laboratory = Laboratory(scene, None if known is None else load_model(known))
+    laboratory = Laboratory(scene, None if known is None else load_for(known, inference or InferenceConfig()))
     facts = f"weights {known}" if known else "no weights: states and depth images only"
     server = start_server(port, "mereo")
     page = LabPage(server, laboratory, f"Laboratory: {scene.name}", facts)
