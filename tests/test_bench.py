@@ -12,7 +12,7 @@ from mereo.bench import fitting
 from mereo.bench.floor import Machine, Work, count_operations
 from mereo.bench.report import table
 from mereo.bench.rival import Rival, farthest_points
-from mereo.bench.stages import Bench, Stage, needed_nodes
+from mereo.bench.stages import Bench, Stage, needed_nodes, random_points
 from mereo.config import PRESETS
 from mereo.frames import load_frame
 from mereo.ordering import farthest_point_order
@@ -73,6 +73,14 @@ def test_a_fitted_network_knows_its_frame(monkeypatch: pytest.MonkeyPatch) -> No
     labels = model.query(model.encode(frame.depth.to_points()), grid.positions(cells)).label
     assert (labels > 0).mean() > 0.5
     assert model.network.config == replace(PRESETS["tiny"].network, dropout=0.0)
+
+
+def test_a_frame_by_fixed_shapes_is_what_the_model_answers() -> None:
+    """What CUDA times for a whole frame, step by step on this CPU."""
+    bench = Bench(load_model("rope"), load_frame("rope"), MACHINE)
+    points = random_points(bench.frame, 500)
+    expected = bench.model.logits(bench._code, points).argmax(axis=1)
+    assert (bench._by_graphs(points[:100], points)() == expected).mean() > 0.99
 
 
 def test_the_table_names_ratio_and_floor() -> None:

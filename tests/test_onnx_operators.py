@@ -5,7 +5,8 @@ import torch
 import torch.nn.functional as F
 
 from mereo.alignment import fit_rigid
-from mereo.onnx_operators import svd3, trilinear
+from mereo.onnx_operators import trilinear
+from mereo.svd import svd3
 
 
 def matrices(count: int) -> torch.Tensor:

@@ -119,7 +119,7 @@ class Model:
         cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
         ordered, normalizer = self.normalized_cloud(cloud)
         seen = ordered[0, : len(cloud)].numpy().astype(np.float64)
-        with self._inference_mode():
+        with self.answering():
             viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32))
             code = self.inference.encode(ordered.to(self.device), viewpoint.to(self.device))
         return EncodedCloud(code, normalizer, normalizer.invert(seen))
@@ -188,14 +188,20 @@ class Model:
             logits = torch.stack([prediction.distance, -prediction.distance], dim=-1)
         if self.domain is None:
             return logits
-        low, high = torch.tensor(self.domain, device=queries.device)
+        low, high = self._limits
         outside = ((queries < low) | (queries > high)).any(dim=-1)
         surely_empty = torch.zeros_like(logits[0, 0])
         surely_empty[0] = SURE_LOGIT
         return torch.where(outside[..., None], surely_empty, logits)
 
+    @cached_property
+    def _limits(self) -> Float[Tensor, "2 3"]:
+        """The domain's corners, made once: an upload for every chunk would wait for the device."""
+        return torch.tensor(self.domain, device=self.device)
+
     @contextmanager
-    def _inference_mode(self) -> Iterator[None]:
+    def answering(self) -> Iterator[None]:
+        """Around whatever the network computes for a user: no gradients, in the model's precision."""
         dtype = pick_precision(self.precision, self.device)
         with torch.inference_mode(), torch.autocast(self.device.type, dtype, enabled=dtype is not None):
             yield
@@ -209,7 +215,7 @@ class Model:
         normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
         size = CUDA_QUERY_CHUNK if self.device.type == "cuda" else CPU_QUERY_CHUNK
         chunks = []
-        with self._inference_mode():
+        with self.answering():
             for start in range(0, max(len(normalized), 1), size):
                 queries = torch.from_numpy(normalized[start : start + size])[None].to(self.device)
                 chunks.append([part[0].cpu() for part in answer(self.inference.query(code.code, queries), queries)])

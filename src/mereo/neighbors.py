@@ -5,6 +5,11 @@ farthest-point sample of size m, so the centres of every set-abstraction level a
 first K neighbours in order" are a well-spread subset of a crowded ball.
 """
 
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -41,13 +46,24 @@ def nearest(queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], cou
     """Indices of the ``count`` nearest points to each query, nearest first; ties in any order.
 
     On a CPU by a k-d tree per cloud, which is exact and six times faster than all distances and a selection; on a
-    GPU, and where the graph is traced, by those.
+    GPU by a kernel that never writes the distances (``gpu.kernels``); where the graph is traced, by those.
     """
     count = min(count, points.shape[1])
+    if queries.is_cuda and not torch.compiler.is_compiling():
+        kernels = gpu_kernels()
+        if kernels is not None and points.shape[1] <= kernels.MOST_COMPARED:
+            found: Tensor = kernels.nearest(queries, points, count)
+            return found
     if queries.device.type == "cpu" and not torch.compiler.is_compiling():
         each = [_by_tree(q, p, count) for q, p in zip(queries.detach().numpy(), points.detach().numpy(), strict=True)]
         return torch.from_numpy(np.stack(each))
     return squared_distances(queries, points).topk(count, dim=-1, largest=False).indices
+
+
+@cache
+def gpu_kernels() -> ModuleType | None:
+    """``mereo.gpu.kernels``; None without Triton, which PyTorch's CUDA builds for Linux bring."""
+    return import_module("mereo.gpu.kernels") if find_spec("triton") is not None else None
 
 
 def _by_tree(queries: Float[np.ndarray, "q d"], points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, "q k"]:

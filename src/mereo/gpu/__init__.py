@@ -1,0 +1,1 @@
+"""What a GPU needs to answer within milliseconds: two kernels, and frames of fixed shapes as CUDA graphs."""
