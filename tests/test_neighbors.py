@@ -1,9 +1,12 @@
 """Ball query and nearest neighbours against slow references."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 
-from mereo.neighbors import ball_query, gather, nearest, squared_distances
+from mereo.neighbors import _by_rank, ball_query, gather, nearest, squared_distances
 
 
 def random_points(batch: int, count: int, seed: int = 0) -> torch.Tensor:
@@ -50,10 +53,37 @@ def test_gather_equals_indexing() -> None:
     assert torch.equal(gather(values, index), expected)
 
 
-def test_nearest_finds_the_same_where_the_graph_is_traced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ball_query_finds_the_same_on_every_device() -> None:
+    points = random_points(3, 400, 5)
+    for radius, limit in ((0.2, 8), (0.5, 24), (0.01, 4)):
+        assert torch.equal(
+            ball_query(points[:, :90], points, radius, limit), _by_rank(points[:, :90], points, radius, limit)
+        )
+
+
+COMPILED = """
+import torch
+from mereo.neighbors import ball_query, nearest
+
+points, queries = torch.rand(2, 60, 3), torch.rand(2, 40, 3)
+def both(points, queries):
+    return ball_query(points[:, :20], points, 0.4, 8), nearest(queries, points, 3)
+found, expected = torch.compile(both, fullgraph=True)(points, queries), both(points, queries)
+assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+"""
+
+
+@pytest.mark.slow
+def test_compiled_networks_call_the_same_searches() -> None:
+    """In a process of its own: the shape checks of these tests cannot be compiled."""
+    done = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_nearest_finds_the_same_in_exported_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
     queries, points = random_points(2, 40, 3), random_points(2, 30, 4)
     by_tree = nearest(queries, points, 40)
-    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    monkeypatch.setattr("mereo.neighbors.is_exporting", lambda: True)
     assert by_tree.shape == (2, 40, 30)
     assert torch.equal(nearest(queries, points, 40), by_tree)
     assert nearest(queries[..., :2], points[..., :2], 1).shape == (2, 40, 1)
