@@ -17,6 +17,7 @@ from mereo.align_command import Align
 from mereo.bench_command import BenchCommand
 from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
 from mereo.experiment_command import Experiment
+from mereo.release_command import Release
 from mereo.stream_command import StreamCommand
 from mereo.view_command import View
 
@@ -122,6 +123,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[commands.Export, subcommand("export")]
         | Annotated[Experiment, subcommand("experiment")]
         | Annotated[BenchCommand, subcommand("bench")]
+        | Annotated[Release, subcommand("release")]
     )
 
 

@@ -241,6 +241,8 @@ class Trainer:
                 network.decoder.head.bias[: len(offsets)] += offsets.to(self.device)
         provenance: dict[str, object] = {
             "scene": manifest["scene"],
+            "source": manifest.get("source"),
+            "data": manifest["settings"],
             "training_seed": manifest["seed"],
             "training_examples": manifest["examples"],
             "steps": self.step,

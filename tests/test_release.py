@@ -1,0 +1,71 @@
+"""Weights to hand on: what is in the file, and what the card says of it."""
+
+import json
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mereo import __main__ as command_line
+from mereo.release import card, release
+from mereo.weights import load_model, save_model
+
+TEST = {
+    "seed": 1_000_000,
+    "noise_std": 0.1,
+    "examples": 128,
+    "iou": 0.923,
+    "miou": 0.798,
+    "per_segment": {"body": 0.93, "head": 0.878, "ear_left": 0.685, "ear_right": 0.719, "tail": None},
+}
+
+
+def evaluation(folder: Path, **changes: object) -> Path:
+    folder.mkdir()
+    (folder / "metrics.json").write_text(json.dumps({**TEST, **changes}))
+    return folder
+
+
+def test_the_file_answers_as_the_weights_and_the_card_knows_it(tmp_path: Path) -> None:
+    model = load_model("bunny")
+    recipe = {**model.provenance["recipe"], "init": "/home/someone/runs/first/weights.safetensors"}  # type: ignore[dict-item]
+    save_model(replace(model, provenance={**model.provenance, "recipe": recipe}), tmp_path / "w.safetensors")
+    scans = evaluation(tmp_path / "scans", scans=["bun000", "chin"])
+    path = release(tmp_path / "w.safetensors", "bunny-2", tmp_path / "out", [evaluation(tmp_path / "test"), scans])
+    assert path == tmp_path / "out/bunny-2.safetensors"
+    assert path.stat().st_size < 0.55 * (tmp_path / "w.safetensors").stat().st_size
+    released = load_model(path)
+    points = np.random.default_rng(0).normal((0, 0, 0.6), 0.04, (600, 3))
+    np.testing.assert_array_equal(
+        released.logits(released.encode(points), points), model.logits(model.encode(points), points)
+    )
+    assert released.provenance["recipe"]["init"] == "weights.safetensors"  # type: ignore[index]
+    text = (tmp_path / "out/bunny-2.md").read_text()
+    assert sha256(path.read_bytes()).hexdigest() in text and "/home/someone" not in text
+    assert "- segments: body, head, ear_left, ear_right, tail" in text
+    assert "- longest side of the visible part in training: 0.12 to 0.254 m" in text
+    assert "6530 steps of 40 examples, 261,200 examples seen" in text and "nearest preset `base`" in text
+    assert "128 synthetic views, test seed 1000000, noise 0.1 units" in text
+    assert "| IoU | mIoU | body | head | ear_left | ear_right | tail |" in text
+    assert "| 0.923 | 0.798 | 0.930 | 0.878 | 0.685 | 0.719 | - |" in text
+    assert "2 real scans (bun000, chin)" in text and "Not tested on a real sensor" not in text
+    assert "Weakest segment on synthetic views: ear_left, IoU 0.685" in text
+
+
+def test_a_card_without_tests_says_so() -> None:
+    text = card("rope", load_model("rope"), [], b"")
+    assert "Not measured yet" in text and "Not tested on a real sensor" in text and "0.0 MB" in text
+
+
+def test_what_cannot_be_released_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = evaluation(tmp_path / "other", per_segment={"base": 1.0})
+    for arguments, said in (
+        (["--name", "My Bunny"], "the name is 'My Bunny'; weights are named by"),
+        (["--name", "b", "--tests", str(other)], "is a test of base, but the weights know body, head"),
+        (["--name", "b", "--tests", str(tmp_path)], "has no metrics.json; --tests takes folders that mereo evaluate"),
+    ):
+        assert command_line.main(["release", "bunny", "--output", str(tmp_path / "out"), *arguments]) != 0
+        assert said in " ".join(capsys.readouterr().err.split())
+        assert not (tmp_path / "out").exists()
