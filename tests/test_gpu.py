@@ -122,6 +122,9 @@ def test_what_cannot_be_fixed_is_refused() -> None:
     camera = frame.depth.camera
     with pytest.raises(ValueError, match="640 x 480 pixels; at most 16384 .*crop it around the object"):
         StaticFrames(model, replace(camera, width=640, height=480))
+    for sizes in ((), (0, 64)):
+        with pytest.raises(ValueError, match="at least one number of queries must be prepared"):
+            StaticFrames(model, camera, sizes)
     frames = StaticFrames(model, camera, sizes=(64,))
     with pytest.raises(ValueError, match="call see first"):
         frames.ask(np.zeros((1, 3)))

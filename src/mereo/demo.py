@@ -12,15 +12,16 @@ from rich.table import Table
 from mereo.assets import AssetUnavailable
 from mereo.camera import PointCloud
 from mereo.evaluation import grid_confusion, predict_grid
-from mereo.frames import TruthGrid, load_frame, shipped_frames, truth_grid
+from mereo.frames import TruthGrid, load_frame, truth_grid
 from mereo.input_config import Frame
 from mereo.metrics import Scores, intersection_over_union
 from mereo.model import Model
 from mereo.reconstruction import Reconstruction, reconstruct, segment_names, write_reconstruction
 from mereo.scans import bunny_scan, scan_in_camera
-from mereo.weights import load_model, shipped_names
+from mereo.weights import load_model
 
 REAL_SCAN = "bun000"
+FRAMES = ("liver", "rope")
 RESOLUTION = 100
 
 OWN_OBJECT = """[bold]On your own data[/bold]
@@ -74,12 +75,10 @@ def main(output: str | Path = Path("out/demo")) -> None:
 
 
 def _inputs() -> Iterator[Callable[[], Case]]:
-    """The real scan first; frames and weights that are not shipped are no inputs."""
-    if "bunny" in shipped_names():
-        yield _scan_case
-    for name in shipped_frames():
-        if name in shipped_names():
-            yield partial(_frame_case, name)
+    """The real scan first, then frames of other objects."""
+    yield _scan_case
+    for name in FRAMES:
+        yield partial(_frame_case, name)
 
 
 def _scan_case() -> Case:

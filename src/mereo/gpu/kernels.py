@@ -25,6 +25,9 @@ MOST_COMPARED = 2048
 QUERIES = 16
 """Of one program."""
 
+DISTANCES_PER_WARP = 2048
+"""64 in each thread, which has room for twice as many numbers."""
+
 
 @triton.jit
 def _order(points, valid, order, n, count, BLOCK: tl.constexpr):
@@ -99,6 +102,15 @@ def nearest(queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], cou
     programs = (triton.cdiv(asked, QUERIES), batch)
     block = triton.next_power_of_2(n)
     _nearest[programs](
-        queries.contiguous(), points.contiguous(), found, asked, n, D=axes, K=count, QUERIES=QUERIES, BLOCK=block
+        queries.contiguous(),
+        points.contiguous(),
+        found,
+        asked,
+        n,
+        D=axes,
+        K=count,
+        QUERIES=QUERIES,
+        BLOCK=block,
+        num_warps=max(4, QUERIES * block // DISTANCES_PER_WARP),
     )
     return found

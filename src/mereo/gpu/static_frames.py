@@ -69,6 +69,10 @@ class StaticFrames:
                 f"the image has {camera.width} x {camera.height} pixels; at most {MOST_PIXELS} fit into one program: "
                 "crop it around the object, or use Model.encode"
             )
+        if not sizes or min(sizes) < 1:
+            raise ValueError(
+                f"the sizes are {sizes}; at least one number of queries must be prepared: give for example 4096"
+            )
         if model.network.config.encoder == "autodecoder":
             raise ValueError("an autodecoder searches for its code, which has no fixed shape: use Model.encode")
         if model.device.type == "cuda" and gpu_kernels() is None:
