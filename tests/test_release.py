@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
 from mereo import __main__ as command_line
 from mereo.release import card, release
-from mereo.weights import load_model, save_model
+from mereo.weights import find_weights, load_model, save_model, shipped_names
 
 TEST = {
     "seed": 1_000_000,
@@ -57,6 +59,19 @@ def test_the_file_answers_as_the_weights_and_the_card_knows_it(tmp_path: Path) -
 def test_a_card_without_tests_says_so() -> None:
     text = card("rope", load_model("rope"), [], b"")
     assert "Not measured yet" in text and "Not tested on a real sensor" in text and "0.0 MB" in text
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_shipped_weights_have_a_true_card(name: str) -> None:
+    path = find_weights(name)
+    text = path.with_suffix(".md").read_text()
+    assert path.stat().st_size < 8 * 2**20
+    assert sha256(path.read_bytes()).hexdigest() in text
+    model = load_model(name)
+    assert f"- segments: {', '.join(model.names)}\n" in text
+    assert "synthetic views, test seed 1000000" in text
+    assert '"/' not in json.dumps(model.provenance), "no folders of the machine that trained"
+    assert {tensor.dtype for tensor in load_file(path).values() if tensor.is_floating_point()} == {torch.float16}
 
 
 def test_what_cannot_be_released_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

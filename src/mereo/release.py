@@ -15,6 +15,7 @@ import torch
 
 from mereo.config import PRESETS
 from mereo.model import Model
+from mereo.network import config_from_dict
 from mereo.output import new_directory
 from mereo.weights import load_model, save_model
 
@@ -102,9 +103,11 @@ def _training(provenance: dict[str, object]) -> str:
 def _nearest_preset(recipe: dict[str, Any]) -> str:
     """The preset whose network it is, else of which most settings are."""
 
+    network = config_from_dict(recipe["network"])  # what older recipes do not state is at its default
+
     def agreement(preset: str) -> tuple[bool, int]:
         known = json.loads(json.dumps(asdict(PRESETS[preset])))
-        return known["network"] == recipe.get("network"), sum(known[key] == recipe.get(key) for key in known)
+        return PRESETS[preset].network == network, sum(known[key] == recipe.get(key) for key in known)
 
     return max(PRESETS, key=agreement)
 
