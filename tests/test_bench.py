@@ -36,6 +36,8 @@ def test_the_rivals_points_are_the_farthest() -> None:
     order = farthest_point_order(points, 80)
     found = farthest_points(torch.from_numpy(points[order]), 40)
     assert torch.equal(found, torch.arange(40))
+    repeated = torch.from_numpy(points[order][:30]).repeat(3, 1)
+    assert torch.equal(farthest_points(repeated, 70), torch.arange(70))
 
 
 def test_different_labels_are_an_error() -> None:

@@ -51,11 +51,12 @@ class Rival:
 
 
 def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, " m"]:
-    """Greedy farthest-point sampling from the first point on, one point after the other."""
+    """Greedy farthest-point sampling from the first point on, one point after the other; repeated points last."""
     distance = torch.full((len(points),), torch.inf, device=points.device)
     chosen = [torch.zeros((), dtype=torch.long, device=points.device)]
     while len(chosen) < count:
         distance = torch.minimum(distance, (points - points[chosen[-1]]).square().sum(dim=-1))
+        distance[chosen[-1]] = -1.0  # where points are repeated, each is still taken once
         chosen.append(distance.argmax())
     return torch.stack(chosen)
 
