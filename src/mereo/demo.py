@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -62,14 +62,13 @@ class Case:
 def main(output: str | Path = Path("out/demo")) -> None:
     """Reconstruct every input that can be had, print tables, and write a folder each below ``output``."""
     console, started = Console(), time.perf_counter()
-    model = cache(load_model)
     for make in _inputs():
         try:
             case = make()
         except AssetUnavailable as error:
             console.print(f"The real scan {REAL_SCAN} is left out: {error}\n", highlight=False, soft_wrap=True)
             continue
-        _show(case, model(case.weights), Path(output) / case.name, console)
+        _show(case, load_model(case.weights), Path(output) / case.name, console)
     console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
     console.print(OWN_OBJECT, highlight=False, soft_wrap=True)
 

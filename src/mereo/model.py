@@ -110,9 +110,14 @@ class Model:
         return next(self.network.parameters()).device
 
     @property
-    def working_precision(self) -> str:
+    def working_dtype(self) -> torch.dtype:
         """Of the products on this machine: float32 or bfloat16."""
-        return str(pick_precision(self.precision, self.device) or torch.float32).removeprefix("torch.")
+        return pick_precision(self.precision, self.device) or torch.float32
+
+    @property
+    def working_precision(self) -> str:
+        """The name of ``working_dtype``."""
+        return str(self.working_dtype).removeprefix("torch.")
 
     def encode(self, cloud: PointCloud | Float[np.ndarray, "n 3"]) -> EncodedCloud:
         """Points in a camera frame (z forward), any unit, any density. Raises ``ValueError`` on unusable clouds."""
@@ -222,14 +227,18 @@ class Model:
         return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
 
 
+def check_enough(count: int, said: str) -> None:
+    """Raise ``ValueError``, beginning with ``said``, where the encoder needs more points than ``count``."""
+    if count < MIN_POINTS:
+        raise ValueError(
+            f"{said}; the encoder needs at least {MIN_POINTS}: move closer, or check the mask and the depth range"
+        )
+
+
 def checked_points(cloud: PointCloud) -> Float[np.ndarray, "n 3"]:
     """The cloud's points as float64, or one sentence on why they cannot be used."""
     points = np.asarray(cloud.points, dtype=np.float64)
-    if len(points) < MIN_POINTS:
-        raise ValueError(
-            f"the cloud has {len(points)} points; the encoder needs at least {MIN_POINTS}: "
-            "move closer, or check the mask and the depth range"
-        )
+    check_enough(len(points), f"the cloud has {len(points)} points")
     if (points[:, 2] <= 0).any():
         raise ValueError(
             f"{int((points[:, 2] <= 0).sum())} of {len(points)} points have z <= 0, behind the camera; the cloud must "

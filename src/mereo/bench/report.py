@@ -14,7 +14,7 @@ from mereo.bench.floor import Machine, measure_machine
 from mereo.bench.stages import Bench, Stage, random_points
 from mereo.config import Precision
 from mereo.frames import Frame, load_frame, shipped_frames
-from mereo.hardware import has_amx, pick_precision
+from mereo.hardware import has_amx
 from mereo.model import Model
 from mereo.output import write_json
 from mereo.weights import load_model
@@ -50,11 +50,10 @@ def benchmark(
     model, frame = _subject(weights, preset)
     model.network.to(device)
     fast = replace(model, precision=precision)
-    dtype = pick_precision(precision, device) or torch.float32
-    machine = measure_machine(device, dtype)
+    machine = measure_machine(device, fast.working_dtype)
     stages = Bench(fast, frame, machine, repeats, rival).run()
-    facts = _facts(weights or f"preset {preset}, fitted to one frame", device, dtype, machine)
-    cost = _cost(model, fast, frame) if dtype is not torch.float32 else None
+    facts = _facts(weights or f"preset {preset}, fitted to one frame", fast, machine)
+    cost = _cost(model, fast, frame) if fast.working_dtype is not torch.float32 else None
     print(table(stages, facts, cost))
     if output is not None:
         rows = [{**asdict(stage), "ratio": stage.ratio} for stage in stages]
@@ -77,7 +76,8 @@ def _subject(weights: str | None, preset: str) -> tuple[Model, Frame]:
     return model, load_frame(scene)
 
 
-def _facts(subject: str, device: torch.device, dtype: torch.dtype, machine: Machine) -> dict[str, Any]:
+def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:
+    device = model.device
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
     return {
         "model": subject,
@@ -85,7 +85,7 @@ def _facts(subject: str, device: torch.device, dtype: torch.dtype, machine: Mach
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "amx": has_amx(),
-        "precision": str(dtype).removeprefix("torch."),
+        "precision": model.working_precision,
         "gigaflops": machine.operations / 1e9,
         "gigabytes_per_second": machine.bandwidth / 1e9,
     }

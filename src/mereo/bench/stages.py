@@ -90,7 +90,7 @@ class Bench:
     def whole_frame(self) -> Stage:
         """Depth image to labels of 10,000 and then 40,000 points, as in the authors' follow-up.
 
-        On CUDA by graphs of fixed shapes, where the model has any.
+        On CUDA by graphs of fixed shapes, which an autodecoder does not have.
         """
         coarse, fine = random_points(self.frame, 10_000), random_points(self.frame, 40_000)
 
@@ -138,6 +138,12 @@ class Bench:
         rival = (lambda: dense(self._rival().logits, box)) if self.rival else None
         return self._stage("surfaces of all segments, 128", self._grid_work(ours()), ours, rival, once=True)
 
+    # --- parts ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _code(self) -> EncodedCloud:
+        return self.model.encode(self.frame.depth.to_points())
+
     def _by_graphs(
         self, coarse: Float[np.ndarray, "n 3"], fine: Float[np.ndarray, "m 3"]
     ) -> Callable[[], UInt8[np.ndarray, " m"]]:
@@ -150,12 +156,6 @@ class Bench:
 
         answer()  # records the graphs
         return answer
-
-    # --- parts ---------------------------------------------------------------------------------------------------
-
-    @cached_property
-    def _code(self) -> EncodedCloud:
-        return self.model.encode(self.frame.depth.to_points())
 
     def _warm_up(self) -> None:
         self.model.logits(self._code, random_points(self.frame, 8192))

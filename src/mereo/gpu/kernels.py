@@ -16,8 +16,7 @@ import triton.language as tl
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-MOST_ORDERED = 16384
-"""Points of one cloud that a program can keep: 16 in each of 1024 threads."""
+from mereo.gpu import MOST_ORDERED
 
 MOST_COMPARED = 2048
 """Points that a query may be compared with."""

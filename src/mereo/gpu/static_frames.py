@@ -17,17 +17,14 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from torch import Tensor
 
 from mereo.camera import Camera
-from mereo.config import MIN_POINTS
 from mereo.decoder import Code
-from mereo.model import Model
+from mereo.gpu import MOST_ORDERED
+from mereo.model import Model, check_enough
 from mereo.neighbors import gpu_kernels
 from mereo.ordering import farthest_point_order
 
 SIZES = (4096, 10_000, 40_000)
 """Queries at once; what is asked is padded to the next of them."""
-
-MOST_PIXELS = 16384
-"""Of an image: one program of the GPU orders its points. 128 x 128 are four times what the network looks at."""
 
 WARM_UPS = 3
 """Runs before recording, as PyTorch asks for: libraries set themselves up in the first ones."""
@@ -56,7 +53,7 @@ class StaticFrames:
 
     Args:
         model: any but an autodecoder, whose search needs gradients.
-        camera: of all images, at most ``MOST_PIXELS`` pixels: crop a larger one around the object.
+        camera: of all images, at most ``MOST_ORDERED`` pixels: crop a larger one around the object.
         sizes: numbers of queries that are prepared.
 
     Raises ``ValueError`` for other models and cameras, ``ImportError`` on CUDA without Triton.
@@ -64,9 +61,9 @@ class StaticFrames:
 
     def __init__(self, model: Model, camera: Camera, sizes: tuple[int, ...] = SIZES) -> None:
         pixels = camera.width * camera.height
-        if pixels > MOST_PIXELS:
+        if pixels > MOST_ORDERED:
             raise ValueError(
-                f"the image has {camera.width} x {camera.height} pixels; at most {MOST_PIXELS} fit into one program: "
+                f"the image has {camera.width} x {camera.height} pixels; at most {MOST_ORDERED} fit into one program: "
                 "crop it around the object, or use Model.encode"
             )
         if not sizes or min(sizes) < 1:
@@ -110,11 +107,7 @@ class StaticFrames:
             labels.append(found[0])
             distances.append(found[1])
         count = int(self._seen.count)
-        if count < MIN_POINTS:
-            raise ValueError(
-                f"the object has {count} pixels; the encoder needs at least {MIN_POINTS}: "
-                "move closer, or check the mask and the depth range"
-            )
+        check_enough(count, f"the object has {count} pixels")
         return np.concatenate(labels), np.concatenate(distances)
 
     # --- steps ---------------------------------------------------------------------------------------------------
@@ -125,7 +118,7 @@ class StaticFrames:
         if size not in self._steps:
             self._steps[size] = self._prepared(lambda: self._query(buffer.on_device))
         labels, distances = self._steps[size]()
-        return labels[: len(points)].cpu().numpy().copy(), distances[: len(points)].cpu().numpy().copy()
+        return labels[: len(points)].cpu().numpy(), distances[: len(points)].cpu().numpy()
 
     def _observe(self, depth: Float[Tensor, " n"]) -> Seen:
         """What ``Model.encode`` does, without its loops and checks on the host."""
