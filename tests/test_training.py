@@ -142,18 +142,34 @@ def test_bfloat16_trains(dataset: Path, tmp_path: Path) -> None:
 
 
 def test_training_starts_from_given_weights(dataset: Path, tmp_path: Path) -> None:
-    """Without any step, the network is that of the weights; other networks and segments are refused."""
+    """Without any step, the network is that of the weights; other networks are refused."""
     first = training.train(dataset, tmp_path / "first", replace(SMALL, epochs=0.2))
     data, config = training.Dataset.load(dataset), replace(SMALL, init=str(first))
     network = start_network(config, data)
     assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
     with pytest.raises(ValueError, match="another network setting width"):
         start_network(replace(config, network=replace(config.network, width=32)), data)
-    with pytest.raises(ValueError, match="know the segments base, segment_1"):
-        start_network(replace(config, init="rope"), data)
     with pytest.raises(FileNotFoundError, match="no weights 'lost'"):
         training.train(dataset, tmp_path / "second", replace(config, init="lost"))
     assert not (tmp_path / "second").exists()
+
+
+def test_training_starts_from_another_objects_weights(dataset: Path, tmp_path: Path) -> None:
+    """All that is not about segments is taken; segments and template are new."""
+    first = training.train(dataset, tmp_path / "first", replace(SMALL, epochs=0.2))
+    data = training.Dataset.load(dataset)
+    manifest = data.manifest | {"segments": [{"name": "whole", "color": [1, 2, 3]}]}
+    data = replace(data, manifest=manifest, template=torch.rand(1, 64, 64, 64))
+    given = load_file(first)
+    random, started = (start_network(replace(SMALL, init=init), data).state_dict() for init in ("", str(first)))
+    taken = {name for name in started if not torch.equal(started[name], random[name])}
+    untouched = {name for name in given if "decoder.lookup" in name}
+    assert all(torch.equal(started[name], random[name]) for name in untouched)
+    head = started["decoder.head.weight"]
+    assert torch.equal(head[[0, 2, 3, 4, 5]], given["decoder.head.weight"][[0, 3, 4, 5, 6]])
+    assert torch.equal(head[1], random["decoder.head.weight"][1])
+    same = taken - {"decoder.head.weight", "decoder.head.bias"}
+    assert len(same) > 40 and all(torch.equal(started[name], given[name]) for name in same)
 
 
 def test_a_lookup_may_be_added_to_given_weights(dataset: Path, tmp_path: Path) -> None:

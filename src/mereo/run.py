@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+from torch import Tensor
 
-from mereo.config import TEMPLATE, AugmentConfig, TrainConfig
+from mereo.config import TEMPLATE, AugmentConfig, NetworkConfig, TrainConfig
 from mereo.dataset import Dataset
 from mereo.encoders.autodecoder import Autodecoder
 from mereo.network import Network
@@ -57,21 +58,20 @@ def _check_autodecoder(config: TrainConfig) -> None:
 def start_network(config: TrainConfig, data: Dataset) -> Network:
     """A network to train: random from the seed, or with the weights that ``config.init`` names.
 
-    An autodecoder gets a random code for each example that is not held out. Raises ``ValueError`` when the weights are
-    of another architecture or know other segments.
+    Weights that know other segments give all that is not about segments (docs/design/0002-learning.md). An
+    autodecoder gets a random code for each example that is not held out. Raises ``ValueError`` when the weights are of
+    another architecture.
     """
     names = tuple(segment["name"] for segment in data.manifest["segments"])
     torch.manual_seed(config.seed)
     network = Network(config.network, len(names))
     if config.init:
         start = load_model(config.init)
+        _check_architecture(start.network.config, config)
+        given = start.network.state_dict()
         if start.names != names:
-            raise ValueError(
-                f"the weights {config.init} know the segments {', '.join(start.names)}, the dataset has "
-                f"{', '.join(names)}; both must be the same in the same order: "
-                "start from other weights, or without --init"
-            )
-        _copy_weights(start.network, network, config.init)
+            given = _without_segments(given, network)
+        network.load_state_dict(network.state_dict() | given)
     if isinstance(network.encoder, Autodecoder):
         network.encoder.add_codes(len(data) - config.holdout)
     lookup = network.decoder.lookup
@@ -85,16 +85,27 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
     return network
 
 
-def _copy_weights(start: Network, network: Network, name: str) -> None:
-    """Weights of the same architecture; only the template lookup, which begins as nothing, may be new."""
-    known = replace(start.config, rest_template=start.config.rest_template or network.config.rest_template)
-    odd = [f.name for f in fields(known) if getattr(known, f.name) != getattr(network.config, f.name)]
+def _check_architecture(start: NetworkConfig, config: TrainConfig) -> None:
+    """Only the template lookup, which begins as nothing, may be new."""
+    known = replace(start, rest_template=start.rest_template or config.network.rest_template)
+    odd = [f.name for f in fields(known) if getattr(known, f.name) != getattr(config.network, f.name)]
     if odd:
         raise ValueError(
-            f"the weights {name} have another network setting {odd[0]}; continuing needs the same "
+            f"the weights {config.init} have another network setting {odd[0]}; continuing needs the same "
             "network: use the preset and settings they were trained with, or train without --init"
         )
-    network.load_state_dict(network.state_dict() | start.state_dict())
+
+
+def _without_segments(given: dict[str, Tensor], network: Network) -> dict[str, Tensor]:
+    """What weights of one object can tell a ``network`` of another: all but its segments and its template.
+
+    Of the last layer, the rows of empty space, distance and direction mean the same everywhere; the others stay as
+    they are in ``network``.
+    """
+    kept = {name: value for name, value in given.items() if not name.startswith(("decoder.lookup.", "decoder.head."))}
+    for name, value in network.decoder.head.state_dict(prefix="decoder.head.").items():
+        kept[name] = torch.cat([given[name][:1], value[1:-4], given[name][-4:]])
+    return kept
 
 
 def join_processes() -> Process:
