@@ -1,12 +1,10 @@
 """The command line as a user meets it: help at once, one line for every error, the exit codes of a good citizen."""
 
-import inspect
 import os
 import signal
 import subprocess
 import sys
 import time
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import get_args
@@ -265,48 +263,3 @@ def test_doctor_exits_with_0() -> None:
     assert result.returncode == 0
     assert result.stderr == ""
     assert "torch" in result.stdout
-
-
-# --- what each command calls ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "module", "function", "expected"),
-    [
-        (
-            "generate rope --examples 7 --seed 3 --output out --workers 2 --shard 1/4 --resume",
-            "mereo.generation",
-            "generate",
-            {"examples": 7, "seed": 3, "output": Path("out"), "workers": 2, "shard": (1, 4), "resume": True},
-        ),
-        (
-            "train data --output run --preset tiny",
-            "mereo.training",
-            "train",
-            {"dataset_dir": Path("data"), "run_dir": Path("run"), "config": PRESETS["tiny"]},
-        ),
-        (
-            "evaluate bunny --output out --examples 4 --seed 1000001",
-            "mereo.evaluation",
-            "evaluate_weights",
-            {"weights": "bunny", "output": Path("out"), "examples": 4, "seed": 1_000_001, "scene": None},
-        ),
-        (
-            "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force",
-            "mereo.reconstruction",
-            "reconstruct_file",
-            {"reading": InputConfig(Path("k.json"), 5000.0, Path("m.png")), "force": True},
-        ),
-        ("demo --output out", "mereo.demo", "main", {"output": Path("out")}),
-    ],
-)
-def test_command_calls_the_library_with_its_options(
-    text: str, module: str, function: str, expected: dict[str, object], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    library = import_module(module)
-    signature = inspect.signature(getattr(library, function))
-    calls: list[dict[str, object]] = []
-    monkeypatch.setattr(library, function, lambda *a, **k: calls.append(signature.bind(*a, **k).arguments))
-    assert command_line.main(text.split()) == 0
-    (call,) = calls
-    assert {name: call[name] for name in expected} == expected

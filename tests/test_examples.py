@@ -14,6 +14,7 @@ EXPECTED = {
     "query_points.py": "to the nearest surface",
     "reconstruct_cloud.py": "report.html",
     "sensors.py": "wrote",
+    "shipped_weights.py": "wrote objects.png",
     "simulate_liver.py": "3 states of 98 nodes",
 }
 ASSETS = {
@@ -21,6 +22,9 @@ ASSETS = {
     "simulate_liver.py": ("liver/lapgym_liver_volumetric.vtk",),
 }
 """Downloads that they need."""
+
+OPTIONS = {"shipped_weights.py": ("--weights", "rope", "--cells", "24")}
+"""What keeps an example short."""
 
 EXTRAS = {"simulate_liver.py": "mujoco"}
 """Modules that come with an extra of the package."""
@@ -37,7 +41,7 @@ def test_example_runs(name: str, tmp_path: Path, require_asset: Callable[[str], 
     if name in EXTRAS:
         pytest.importorskip(EXTRAS[name], reason=f"{name} needs {EXTRAS[name]}")
     done = subprocess.run(
-        [sys.executable, str(EXAMPLES / name)],
+        [sys.executable, str(EXAMPLES / name), *OPTIONS.get(name, ())],
         cwd=tmp_path,
         env={**os.environ, "PYTHONWARNINGS": "error"},
         capture_output=True,

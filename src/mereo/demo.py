@@ -33,7 +33,7 @@ OWN_OBJECT = """[bold]On your own data[/bold]
   mereo scene check NAME.yaml
   mereo scene preview NAME.yaml --output states.png
   mereo generate NAME.yaml --examples 12000 --seed 1 --sampler nested-sort-sample --uniform-fraction 0.5 --output data
-  mereo train data --output run --preset base
+  mereo train data --output run --preset base --init bunny
   mereo evaluate run/weights.safetensors --scene NAME.yaml --output test
   mereo reconstruct frame.ply --weights run/weights.safetensors --output result"""
 

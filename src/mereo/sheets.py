@@ -121,8 +121,9 @@ def legend(names: Sequence[str], colors: Sequence[Color], width: int) -> Picture
 
 
 def name_plate(name: str, width: int, height: int) -> Picture:
-    """A caption as a picture of its own."""
+    """A caption as a picture of its own; it may have several lines."""
+    longest = max(name.splitlines(), key=len, default="")
     plate = Image.new("RGB", (width, height), "white")
     pen = ImageDraw.Draw(plate)
-    pen.text((width // 2, height // 2), name, fill=INK, font=fit_font(18, name, width - 4), anchor="mm")
+    pen.text((width // 2, height // 2), name, fill=INK, font=fit_font(18, longest, width - 4), anchor="mm")
     return np.asarray(plate)

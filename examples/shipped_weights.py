@@ -1,0 +1,44 @@
+"""Every object with shipped weights in one picture: a test view, its reconstruction, what is wrong in it, the truth.
+
+    python examples/shipped_weights.py --output objects.png
+
+The view is the first of the test seed 1,000,000, the same for everyone; none of it was ever trained on.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from mereo.assets import AssetUnavailable
+from mereo.config import TEST_SEED_START
+from mereo.error_pictures import ErrorCase, error_picture
+from mereo.evaluation import evaluate
+from mereo.weights import load_model, shipped_names
+
+
+def first_view(name: str, cells: int) -> ErrorCase:
+    """The first test view with its labels, true and predicted; the row says how good this one is."""
+    evaluation = evaluate(load_model(name), examples=1, cells=cells, seed=TEST_SEED_START)
+    scores = evaluation.scores
+    return replace(evaluation.cases[0], name=f"{name}\nIoU {scores.iou:.2f}\nmIoU {scores.miou:.2f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Draw one test view of every object with shipped weights.")
+    parser.add_argument("--output", type=Path, default=Path("objects.png"), help="the PNG to write")
+    parser.add_argument("--weights", nargs="*", default=shipped_names(), help="names of shipped weights; default all")
+    parser.add_argument("--cells", type=int, default=100, help="grid cells along each axis")
+    options = parser.parse_args()
+
+    cases: list[ErrorCase] = []
+    for name in options.weights:
+        try:
+            cases.append(first_view(name, options.cells))
+        except AssetUnavailable as error:
+            print(f"{name} is left out: {error}")
+    error_picture(options.output, cases)
+    print(f"wrote {options.output}")
+
+
+if __name__ == "__main__":
+    main()
