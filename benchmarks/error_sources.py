@@ -1,0 +1,105 @@
+"""Where the errors lie: at the side that the camera sees or at the hidden one, and how far rest coordinates are off.
+
+    python benchmarks/error_sources.py [WEIGHTS ...] [--views N] [--cells C] [--dataset DIR]
+
+For each weight set, over the same test views: wrongly occupied or empty cells per cell of the object's surface layer,
+near the observed points (within 1.2 cells) and elsewhere. With the dataset that one weight set was trained on, also
+the mean error of rest coordinates inside the object, in half-lengths, over its last 64 examples: after the best rigid
+motion (the truth's own), after the network's alignment, and of the template's lookup.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from mereo.alignment import Alignment, fit_rigid
+from mereo.config import TEST_SEED_START, AugmentConfig, GenerateConfig
+from mereo.dataset import Batch, Dataset
+from mereo.evaluation import predict_grid, trained_scene
+from mereo.frames import TruthGrid, truth_grid
+from mereo.model import Model
+from mereo.scene import load_scene
+from mereo.synthesis import example_rng, sample_view
+from mereo.weights import load_model, shipped_names
+
+NEAR_CELLS = 1.2
+HELD_OUT = 64
+
+
+def near_and_elsewhere(cells: Bool[np.ndarray, "x y z"], truth: TruthGrid, seen: cKDTree) -> tuple[int, int]:
+    """How many of the cells are near an observed point, and how many are not."""
+    centers = truth.grid.origin + np.argwhere(cells) * truth.grid.spacing
+    near = int((seen.query(centers)[0] < NEAR_CELLS * truth.grid.spacing.max()).sum()) if len(centers) else 0
+    return near, len(centers) - near
+
+
+def by_side(weights: str, views: int, cells: int) -> str:
+    """A row of the first table."""
+    model = load_model(weights)
+    scene = load_scene(trained_scene(model)).for_seed(TEST_SEED_START)
+    wrong, shell = np.zeros(2), np.zeros(2)
+    for index in range(views):
+        view = sample_view(scene, GenerateConfig(), example_rng(TEST_SEED_START, index))
+        cloud, truth = view.depth.to_points(), truth_grid(view.mesh, cells)
+        occupied, seen = truth.grid.labels > 0, cKDTree(cloud.points)
+        found = predict_grid(model, cloud, truth) > 0
+        wrong += near_and_elsewhere((found != occupied) & truth.kept, truth, seen)
+        shell += near_and_elsewhere(occupied & ~binary_erosion(occupied), truth, seen)
+    seen_rate, hidden_rate = wrong / shell
+    return f"| {weights} | {seen_rate:.2f} | {hidden_rate:.2f} | {wrong[1] / wrong.sum():.2f} |"
+
+
+def mean_error(rest: Float[Tensor, "b q 3"], batch: Batch) -> list[float]:
+    """Of each example, over the queries inside the object."""
+    return (rest - batch.rest).norm(dim=-1).nanmean(dim=1).tolist()
+
+
+def best_rigid(batch: Batch) -> Alignment:
+    """The motion that fits the true rest coordinates best."""
+    known = [~rest.isnan().any(dim=-1) for rest in batch.rest]
+    fits = [
+        fit_rigid(points[inside][None], rest[inside][None])
+        for points, rest, inside in zip(batch.positions, batch.rest, known, strict=True)
+    ]
+    return Alignment(torch.cat([fit.rotation for fit in fits]), torch.cat([fit.shift for fit in fits]))
+
+
+@torch.no_grad()
+def rest_errors(model: Model, dataset: Path) -> dict[str, list[float]]:
+    """Errors of each held-out example by what made the rest coordinates."""
+    network, data = model.network.eval(), Dataset.load(dataset)
+    errors: dict[str, list[float]] = {"best rigid motion": [], "alignment": [], "template": []}
+    for index in torch.arange(len(data) - HELD_OUT, len(data)).split(8):
+        batch = data.batch(index, network.config.points, 0, AugmentConfig(), torch.Generator())
+        code = network.encode(batch.cloud, batch.viewpoint)
+        prediction = network.query(code, batch.positions)
+        assert code.alignment is not None and prediction.rest is not None, "needs weights with alignment and template"
+        errors["best rigid motion"] += mean_error(best_rigid(batch).apply(batch.positions), batch)
+        errors["alignment"] += mean_error(code.alignment.apply(batch.positions), batch)
+        errors["template"] += mean_error(prediction.rest, batch)
+    return errors
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("weights", nargs="*", default=shipped_names())
+    parser.add_argument("--views", type=int, default=6)
+    parser.add_argument("--cells", type=int, default=60)
+    parser.add_argument("--dataset", type=Path, help="of the first weights")
+    options = parser.parse_args()
+    print("| weights | wrong per surface cell, seen | hidden | share of errors hidden |\n|---|---|---|---|")
+    for name in options.weights:
+        print(by_side(name, options.views, options.cells), flush=True)
+    if options.dataset:
+        for name, values in rest_errors(load_model(options.weights[0]), options.dataset).items():
+            print(f"{options.weights[0]}, {name}: mean {np.mean(values):.3f}, median {np.median(values):.3f}")
+
+
+if __name__ == "__main__":
+    main()
