@@ -5,8 +5,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float, Int8
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor
 
 from mereo.encoders.autodecoder import CODES
 from mereo.hardware import find_device
@@ -15,12 +17,20 @@ from mereo.model import Model
 from mereo.network import Network, config_from_dict
 from mereo.output import atomic_file
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""Version 2 may hold the template in bytes; the rest is as in version 1, which is read too."""
+
+PACKED = "decoder.lookup.distance"
+"""The template's signed distances: with ten segments more than half of a float16 file."""
+
+FINE = 0.1
+"""Packed distances are finest within this of a surface: steps of 0.0008 at it, a fiftieth of the grid's, 0.1 at 1."""
+
 SHIPPED = Path(__file__).parent / "weights"
 
 
 def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> None:
-    """Write weights and header atomically; ``float16`` halves the file and is read back as float32.
+    """Write weights and header atomically; ``float16`` halves the file and packs the template. All is read as float32.
 
     An autodecoder's codes of training examples are left out: using a network needs their mean only.
     """
@@ -40,8 +50,21 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
         for name, value in model.network.state_dict().items()
         if name != CODES
     }
+    if dtype == torch.float16 and PACKED in tensors:
+        tensors[PACKED] = _pack(model.network.state_dict()[PACKED])
     with atomic_file(path) as partial:
         partial.write_bytes(save(tensors, metadata={"mereo": json.dumps(header)}))
+
+
+def _pack(distance: Float[Tensor, "*s"]) -> Int8[Tensor, "*s"]:
+    """One byte each: ``d / (|d| + FINE)`` in 254 steps, so that what is near is kept finely."""
+    return (127.0 * distance / (distance.abs() + FINE)).round().to(torch.int8)
+
+
+def _unpack(packed: Int8[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+    """Inverse of ``_pack`` up to rounding; no distance of the template is so large that it would be infinite."""
+    share = packed.float() / 127.0
+    return FINE * share / (1.0 - share.abs())
 
 
 def shipped_names() -> tuple[str, ...]:
@@ -82,11 +105,13 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
     if "mereo" not in metadata:
         raise ValueError(f"{path} holds tensors but no mereo header; give the weights.safetensors of a mereo run")
     header = json.loads(metadata["mereo"])
-    if header.get("version") != FORMAT_VERSION:
+    if header.get("version") not in (1, FORMAT_VERSION):
         raise ValueError(
-            f"{path} has weights format {header.get('version')}; this mereo reads format {FORMAT_VERSION}: "
+            f"{path} has weights format {header.get('version')}; this mereo reads formats up to {FORMAT_VERSION}: "
             "train again, or install the matching version"
         )
+    if PACKED in tensors and tensors[PACKED].dtype == torch.int8:
+        tensors[PACKED] = _unpack(tensors[PACKED])
     network = Network(config_from_dict(header["network"]), len(header["names"]))
     try:
         network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
