@@ -34,7 +34,7 @@ HELD_OUT = 64
 
 def near_and_elsewhere(cells: Bool[np.ndarray, "x y z"], truth: TruthGrid, seen: cKDTree) -> tuple[int, int]:
     """How many of the cells are near an observed point, and how many are not."""
-    centers = truth.grid.origin + np.argwhere(cells) * truth.grid.spacing
+    centers = truth.grid.positions(np.argwhere(cells))
     near = int((seen.query(centers)[0] < NEAR_CELLS * truth.grid.spacing.max()).sum()) if len(centers) else 0
     return near, len(centers) - near
 
@@ -73,7 +73,7 @@ def best_rigid(batch: Batch) -> Alignment:
 @torch.no_grad()
 def rest_errors(model: Model, dataset: Path) -> dict[str, list[float]]:
     """Errors of each held-out example by what made the rest coordinates."""
-    network, data = model.network.eval(), Dataset.load(dataset)
+    network, data = model.network, Dataset.load(dataset)
     errors: dict[str, list[float]] = {"best rigid motion": [], "alignment": [], "template": []}
     for index in torch.arange(len(data) - HELD_OUT, len(data)).split(8):
         batch = data.batch(index, network.config.points, 0, AugmentConfig(), torch.Generator())

@@ -46,14 +46,26 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
         "provenance": model.provenance,
     }
     tensors = {
-        name: (value.to(dtype) if value.is_floating_point() else value).contiguous()
+        name: _stored(name, value, dtype).contiguous()
         for name, value in model.network.state_dict().items()
         if name != CODES
     }
-    if dtype == torch.float16 and PACKED in tensors:
-        tensors[PACKED] = _pack(model.network.state_dict()[PACKED])
     with atomic_file(path) as partial:
         partial.write_bytes(save(tensors, metadata={"mereo": json.dumps(header)}))
+
+
+def _stored(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
+    """A tensor of the network as the file has it."""
+    if name == PACKED and dtype == torch.float16:
+        return _pack(value)
+    return value.to(dtype) if value.is_floating_point() else value
+
+
+def _restored(name: str, value: Tensor) -> Tensor:
+    """A tensor of the file as the network has it."""
+    if name == PACKED and value.dtype == torch.int8:
+        return _unpack(value)
+    return value.float() if value.is_floating_point() else value
 
 
 def _pack(distance: Float[Tensor, "*s"]) -> Int8[Tensor, "*s"]:
@@ -110,11 +122,9 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
             f"{path} has weights format {header.get('version')}; this mereo reads formats up to {FORMAT_VERSION}: "
             "train again, or install the matching version"
         )
-    if PACKED in tensors and tensors[PACKED].dtype == torch.int8:
-        tensors[PACKED] = _unpack(tensors[PACKED])
     network = Network(config_from_dict(header["network"]), len(header["names"]))
     try:
-        network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
+        network.load_state_dict({name: _restored(name, value) for name, value in tensors.items()})
     except RuntimeError as error:
         raise ValueError(f"{path} does not fit its own header ({str(error).splitlines()[0]}); train again") from None
     return Model(
