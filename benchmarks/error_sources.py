@@ -3,26 +3,33 @@
     python benchmarks/error_sources.py [WEIGHTS ...] [--views N] [--cells C] [--dataset DIR]
 
 For each weight set, over the same test views: wrongly occupied or empty cells per cell of the object's surface layer,
-near the observed points (within 1.2 cells) and elsewhere. With the dataset that one weight set was trained on, also
-the mean error of rest coordinates inside the object, in half-lengths, over its last 64 examples: after the best rigid
-motion (the truth's own), after the network's alignment, and of the template's lookup.
+near the observed points (within 1.2 cells) and elsewhere. With the dataset that the first weight set was trained on,
+over its last 64 examples, also
+
+- the mean error of rest coordinates inside the object, in half-lengths: after the best rigid motion (the truth's own),
+  after the network's alignment, and of the template's lookup;
+- IoU and mIoU on the queries: of the first 64 examples, which were trained on, of the last, of the last with the best
+  rigid motion instead of the network's, and of the last with the mean answer to eight clouds that lack points.
 """
 
 import argparse
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mereo.alignment import Alignment, fit_rigid
 from mereo.config import TEST_SEED_START, AugmentConfig, GenerateConfig
-from mereo.dataset import Batch, Dataset
+from mereo.dataset import Batch, Dataset, choose_points
 from mereo.evaluation import predict_grid, trained_scene
 from mereo.frames import TruthGrid, truth_grid
+from mereo.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.model import Model
 from mereo.scene import load_scene
 from mereo.synthesis import example_rng, sample_view
@@ -30,6 +37,8 @@ from mereo.weights import load_model, shipped_names
 
 NEAR_CELLS = 1.2
 HELD_OUT = 64
+CLOUDS = 8
+FEWER = AugmentConfig(keep_points=(0.6, 0.9))
 
 
 def near_and_elsewhere(cells: Bool[np.ndarray, "x y z"], truth: TruthGrid, seen: cKDTree) -> tuple[int, int]:
@@ -86,6 +95,45 @@ def rest_errors(model: Model, dataset: Path) -> dict[str, list[float]]:
     return errors
 
 
+@torch.no_grad()
+def query_scores(model: Model, dataset: Path) -> dict[str, Scores]:
+    """Scores on stored queries by which examples they are of and what the network is told."""
+    network, data = model.network, Dataset.load(dataset)
+    classes = len(model.names) + 1
+    last = torch.arange(len(data) - HELD_OUT, len(data))
+
+    def answer(batch: Batch, alignment: Alignment | None = None) -> Float[Tensor, "b q c"]:
+        code = network.encode(batch.cloud, batch.viewpoint)
+        if alignment is not None:
+            encoding = network.encoder(alignment.apply(batch.cloud))
+            code = network.decoder.prepare(encoding, batch.cloud, batch.viewpoint, alignment)
+        return network.query(code, batch.positions).logits.softmax(dim=-1)
+
+    def averaged(index: Int[Tensor, " b"], batch: Batch) -> Float[Tensor, "b q c"]:
+        rng = torch.Generator().manual_seed(0)
+        clouds = [
+            choose_points(data.cloud[index], data.count[index], network.config.points, FEWER, rng)
+            for _ in range(CLOUDS)
+        ]
+        return torch.stack([answer(replace(batch, cloud=cloud)) for cloud in clouds]).mean(dim=0)
+
+    ways: dict[str, tuple[Tensor, Callable[[Tensor, Batch], Tensor]]] = {
+        "trained on": (torch.arange(HELD_OUT), lambda _, batch: answer(batch)),
+        "held out": (last, lambda _, batch: answer(batch)),
+        "held out, best rigid motion": (last, lambda _, batch: answer(batch, best_rigid(batch))),
+        f"held out, mean of {CLOUDS} clouds": (last, averaged),
+    }
+    found = {}
+    for name, (examples, way) in ways.items():
+        total = np.zeros((classes, classes), dtype=np.int64)
+        for index in examples.split(8):
+            batch = data.batch(index, network.config.points, 0, AugmentConfig(), torch.Generator())
+            guess = way(index, batch).argmax(dim=-1)
+            total += confusion_matrix(batch.labels.numpy(), guess.numpy(), classes)
+        found[name] = intersection_over_union(total)
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("weights", nargs="*", default=shipped_names())
@@ -99,6 +147,8 @@ def main() -> None:
     if options.dataset:
         for name, values in rest_errors(load_model(options.weights[0]), options.dataset).items():
             print(f"{options.weights[0]}, {name}: mean {np.mean(values):.3f}, median {np.median(values):.3f}")
+        for name, scores in query_scores(load_model(options.weights[0]), options.dataset).items():
+            print(f"{options.weights[0]}, queries {name}: IoU {scores.iou:.3f}, mIoU {scores.miou:.3f}")
 
 
 if __name__ == "__main__":
