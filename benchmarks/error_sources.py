@@ -80,9 +80,9 @@ def best_rigid(batch: Batch) -> Alignment:
 
 
 @torch.no_grad()
-def rest_errors(model: Model, dataset: Path) -> dict[str, list[float]]:
+def rest_errors(model: Model, data: Dataset) -> dict[str, list[float]]:
     """Errors of each held-out example by what made the rest coordinates."""
-    network, data = model.network, Dataset.load(dataset)
+    network = model.network
     errors: dict[str, list[float]] = {"best rigid motion": [], "alignment": [], "template": []}
     for index in torch.arange(len(data) - HELD_OUT, len(data)).split(8):
         batch = data.batch(index, network.config.points, 0, AugmentConfig(), torch.Generator())
@@ -96,10 +96,9 @@ def rest_errors(model: Model, dataset: Path) -> dict[str, list[float]]:
 
 
 @torch.no_grad()
-def query_scores(model: Model, dataset: Path) -> dict[str, Scores]:
+def query_scores(model: Model, data: Dataset) -> dict[str, Scores]:
     """Scores on stored queries by which examples they are of and what the network is told."""
-    network, data = model.network, Dataset.load(dataset)
-    classes = len(model.names) + 1
+    network, classes = model.network, len(model.names) + 1
     last = torch.arange(len(data) - HELD_OUT, len(data))
 
     def answer(batch: Batch, alignment: Alignment | None = None) -> Float[Tensor, "b q c"]:
@@ -145,9 +144,10 @@ def main() -> None:
     for name in options.weights:
         print(by_side(name, options.views, options.cells), flush=True)
     if options.dataset:
-        for name, values in rest_errors(load_model(options.weights[0]), options.dataset).items():
+        model, data = load_model(options.weights[0]), Dataset.load(options.dataset)
+        for name, values in rest_errors(model, data).items():
             print(f"{options.weights[0]}, {name}: mean {np.mean(values):.3f}, median {np.median(values):.3f}")
-        for name, scores in query_scores(load_model(options.weights[0]), options.dataset).items():
+        for name, scores in query_scores(model, data).items():
             print(f"{options.weights[0]}, queries {name}: IoU {scores.iou:.3f}, mIoU {scores.miou:.3f}")
 
 
