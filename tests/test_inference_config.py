@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mereo import __main__ as command_line
-from mereo.hardware import find_device, has_amx
+from mereo.hardware import BFLOAT16_PAYS, bfloat16_gain, find_device
 from mereo.inference_config import EXACT, InferenceConfig
 from mereo.reconstruction import reconstruct_file
 from mereo.weights import load_for
@@ -28,7 +28,7 @@ def test_where_and_how_exactly_is_what_was_asked_for() -> None:
     assert (fast.device.type, fast.working_precision) == ("cpu", "bfloat16")
     assert exact.working_precision == "float32"
     on_cpu = load_for("bunny", InferenceConfig(device="cpu"))
-    assert on_cpu.working_precision == ("bfloat16" if has_amx() else "float32")
+    assert on_cpu.working_precision == ("bfloat16" if bfloat16_gain() >= BFLOAT16_PAYS else "float32")
 
 
 def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None:

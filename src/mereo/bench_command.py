@@ -15,7 +15,7 @@ class BenchCommand:
         weights: a shipped name or a file; without it the preset's network is fitted to one shipped frame first.
         preset: the architecture to fit.
         device: where the network runs; preprocessing is always on the CPU.
-        precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs with AMX, else float32.
+        precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
         output: a JSON file for the figures.

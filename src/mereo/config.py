@@ -180,7 +180,7 @@ class TrainConfig:
         augment: changes to the observed clouds.
         offset_examples: training examples from which the finished network's class offsets are chosen; 0 is off.
         holdout: examples at the end of the dataset kept for the validation curve.
-        precision: auto takes bfloat16 on CUDA and on CPUs with AMX, else float32.
+        precision: auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         compile: torch.compile of the network; auto means where it pays: on CUDA, and for long runs on a CPU.
         seed: initialization, shuffling and augmentation.
     """

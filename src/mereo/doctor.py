@@ -10,6 +10,8 @@ from collections.abc import Iterator
 
 import torch
 
+from mereo.hardware import BFLOAT16_PAYS, bfloat16_gain
+
 PURPOSES: dict[str, str] = {
     "view": "the pages of `mereo view`",
     "track": "training curves in TensorBoard",
@@ -93,7 +95,14 @@ def _device() -> Iterator[str]:
     features = cpu_features()
     for name, present in features.items():
         yield _row(name, {True: "yes", False: "no", None: "unknown"}[present])
-    yield _row("bfloat16", "pays here" if features["amx"] or torch.cuda.is_available() else "does not pay here")
+    yield _row("bfloat16", _bfloat16())
+
+
+def _bfloat16() -> str:
+    if torch.cuda.is_available():
+        return "pays here"
+    gain = bfloat16_gain()
+    return f"{'pays' if gain >= BFLOAT16_PAYS else 'does not pay'} here: {gain:.1f} times float32"
 
 
 def cpu_features() -> dict[str, bool | None]:

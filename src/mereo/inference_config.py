@@ -14,8 +14,8 @@ class InferenceConfig:
 
     Attributes:
         device: where the network runs; auto takes a CUDA device where there is one.
-        precision: of its products: float32 is exact; auto takes bfloat16 on CUDA and on CPUs with AMX, where it is
-            several times faster and changes about one label in a thousand (`mereo bench` measures it).
+        precision: of its products: float32 is exact; auto takes bfloat16 on CUDA and on CPUs that are much faster in
+            it, where it changes about one label in a thousand (`mereo bench` measures it).
     """
 
     device: Device = "auto"

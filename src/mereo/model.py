@@ -82,8 +82,8 @@ class Model:
         domain: normalized box outside which everything is answered as empty: nothing was ever there in training, and
             a network may say anything where it was never corrected. None means no limit.
         nested: pairs of names (inner, outer), see ``SegmentedMesh``.
-        precision: of the products; float32 is exact, bfloat16 faster on GPUs and CPUs with AMX (`mereo bench` says what
-            it costs), auto takes bfloat16 there.
+        precision: of the products; float32 is exact, bfloat16 faster on GPUs and some CPUs (`mereo bench` says what it
+            costs), auto takes bfloat16 there.
     """
 
     network: Network
