@@ -56,6 +56,23 @@ def test_paper_preset_has_the_papers_sizes() -> None:
     assert not network.decoder.local and config.sight_neighbors == 0 and network.aligner is None
 
 
+def test_what_all_clouds_have_in_common_is_not_rounded_to_bfloat16() -> None:
+    """Normalization takes a channel's mean away, however large: in bfloat16 it would first erase what differs."""
+    torch.manual_seed(0)
+    network = Network(replace(TINY, align_points=0, rest_template=False), 3).train()
+    encoder, decoder = network.encoder, network.decoder
+    readers = (encoder.level2.mlp.layers[0], encoder.pool.layers[0], decoder.latent1)
+    for shared, reader in zip((encoder.level1.mlp, encoder.level2.mlp, encoder.pool), readers, strict=True):
+        *_, norm, _ = shared.layers
+        with torch.no_grad():  # the first channel is 4 everywhere, and whoever reads it adds 400
+            norm.weight[0], norm.bias[0], reader.weight[:, 0] = 0.0, 4.0, 100.0
+    inputs = cloud_of(network.config, batch=8), viewpoint_of(8), torch.randn(8, 40, 3)
+    exact = network(*inputs)[0]
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = network(*inputs)[0]
+    assert (rounded - exact).std() < 0.1 * exact.std()
+
+
 def test_encoder_ignores_the_order_within_its_last_half() -> None:
     """Centres are the first half (a farthest-point sample); the rest is a set, whatever its order."""
     config = replace(TINY, neighbors=TINY.points)

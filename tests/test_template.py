@@ -83,7 +83,8 @@ def test_a_new_lookup_changes_no_answer() -> None:
     cloud, viewpoint, queries = random_rest(2, TINY.points), torch.tensor([[0.0, 0.0, -8.0]] * 2), random_rest(2, 9)
     with torch.inference_mode():
         before, after = plain(cloud, viewpoint, queries), added(cloud, viewpoint, queries)
-    assert all(torch.equal(a, b) for a, b in zip(before[:3], after[:3], strict=True))
+    for answer, same in zip(after[:3], before[:3], strict=True):
+        torch.testing.assert_close(answer, same)  # products of other widths may be added in another order
     assert before[3] is None and after[3].shape == queries.shape
 
 

@@ -3,13 +3,13 @@
 Notation: b clouds, n points, q queries.
 """
 
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mereo.hardware import exact
 from mereo.svd import svd3
 
 
@@ -32,13 +32,6 @@ class Alignment:
         """Directions from the aligned frame to the camera's."""
         with exact(directions):
             return directions @ self.rotation
-
-
-def exact(tensor: Tensor) -> AbstractContextManager[object]:
-    """Switches autocast off: in bfloat16 a coordinate near 1 would be off by up to 0.004, more than sensor noise."""
-    device = tensor.device.type
-    # where it is off already nothing is done, because an exported graph would keep the switch, which ONNX does not know
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 @torch.no_grad()

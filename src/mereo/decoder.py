@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from mereo.alignment import Alignment
 from mereo.config import NetworkConfig
 from mereo.encoders.encoding import Encoding, Level
+from mereo.hardware import exact
 from mereo.neighbors import gather, nearest
 from mereo.template import RestLookup
 
@@ -162,7 +163,9 @@ class ConditionedMLP(nn.Module):
             Level(level.centers, attention.project(level.features))  # type: ignore[operator]
             for level, attention in zip(encoding.levels, self.local, strict=False)
         )
-        return Code(self.latent1(encoding.latent), self.latent2(encoding.latent), levels, cloud, viewpoint, alignment)
+        with exact(cloud):  # pooled features have much in common, and the rest is what counts
+            latent = encoding.latent.float()
+            return Code(self.latent1(latent), self.latent2(latent), levels, cloud, viewpoint, alignment)
 
     def features(
         self, code: Code, queries: Float[Tensor, "b q 3"]

@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import sys
 import time
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 
 import torch
@@ -62,6 +63,17 @@ def pick_precision(precision: Precision, device: torch.device) -> torch.dtype | 
     if precision == "bfloat16" or device.type == "cuda" or bfloat16_gain() >= BFLOAT16_PAYS:
         return torch.bfloat16
     return None
+
+
+def exact(tensor: Tensor) -> AbstractContextManager[object]:
+    """Switches autocast off where bfloat16, with its eight bits, is too coarse.
+
+    A coordinate near 1 would be off by up to 0.004, more than sensor noise; and what all rows have in common, which
+    batch normalization takes away again, may be hundreds of times their spread, which rounding would then erase.
+    """
+    device = tensor.device.type
+    # where it is off already nothing is done, because an exported graph would keep the switch, which ONNX does not know
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 def compiling_pays(device: torch.device, steps: int) -> bool:

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mereo.alignment import exact
+from mereo.hardware import exact
 from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 
 SCALES = (1.0, 8.0, 32.0)

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mereo.hardware import exact
+
 
 @dataclass(frozen=True, eq=False)
 class Level:
@@ -45,5 +47,9 @@ class SharedMLP(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, rows: Float[Tensor, "*r i"]) -> Float[Tensor, "*r o"]:
-        flat = self.layers(rows.reshape(-1, rows.shape[-1]))
-        return flat.reshape(*rows.shape[:-1], -1)
+        first, *rest = self.layers
+        with exact(rows):  # coordinates, and pooled features, which have much in common
+            hidden = first(rows.reshape(-1, rows.shape[-1]).float())
+        for layer in rest:
+            hidden = layer(hidden)
+        return hidden.reshape(*rows.shape[:-1], -1)
