@@ -61,11 +61,13 @@ def test_what_all_clouds_have_in_common_is_not_rounded_to_bfloat16() -> None:
     torch.manual_seed(0)
     network = Network(replace(TINY, align_points=0, rest_template=False), 3).train()
     encoder, decoder = network.encoder, network.decoder
-    readers = (encoder.level2.mlp.layers[0], encoder.pool.layers[0], decoder.latent1)
-    for shared, reader in zip((encoder.level1.mlp, encoder.level2.mlp, encoder.pool), readers, strict=True):
-        *_, norm, _ = shared.layers
-        with torch.no_grad():  # the first channel is 4 everywhere, and whoever reads it adds 400
-            norm.weight[0], norm.bias[0], reader.weight[:, 0] = 0.0, 4.0, 100.0
+    with torch.no_grad():  # the first pooled channel is 4 everywhere, and whoever reads it adds 400
+        for shared in (encoder.level1.mlp, encoder.level2.mlp, encoder.pool):
+            *_, norm, _ = shared.layers
+            norm.weight[0], norm.bias[0] = 0.0, 4.0
+        attentions = [attention.project for attention in decoder.local]
+        for reader in (encoder.level2.mlp.layers[0], encoder.pool.layers[0], decoder.latent1, *attentions):
+            reader.weight[:, 0] = 100.0
     inputs = cloud_of(network.config, batch=8), viewpoint_of(8), torch.randn(8, 40, 3)
     exact = network(*inputs)[0]
     with torch.autocast("cpu", torch.bfloat16):

@@ -159,11 +159,11 @@ class ConditionedMLP(nn.Module):
         alignment: Alignment | None = None,
     ) -> Code:
         """The part of the work that does not depend on the queries."""
-        levels = tuple(
-            Level(level.centers, attention.project(level.features))  # type: ignore[operator]
-            for level, attention in zip(encoding.levels, self.local, strict=False)
-        )
         with exact(cloud):  # pooled features have much in common, and the rest is what counts
+            levels = tuple(
+                Level(level.centers, attention.project(level.features.float()))  # type: ignore[operator]
+                for level, attention in zip(encoding.levels, self.local, strict=False)
+            )
             latent = encoding.latent.float()
             return Code(self.latent1(latent), self.latent2(latent), levels, cloud, viewpoint, alignment)
 
@@ -173,12 +173,13 @@ class ConditionedMLP(nn.Module):
         """The last layer's outputs, and the rest coordinates of the lookup on the way, if there is one."""
         placed = queries if code.alignment is None else code.alignment.apply(queries)
         encoded = self.encode(placed) if self.config.encode_positions else placed
-        rows = [encoded]
-        if self.config.local_neighbors:
-            rows += [layer(level, placed) for layer, level in zip(self.local, code.levels, strict=True)]
-        if self.config.sight_neighbors:
-            rows.append(line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors))
-        hidden = self._activate(0, joint_linear(self.summands(0)[1:], rows, code.latent1))
+        with exact(queries):  # up to the first normalization
+            rows = [encoded]
+            if self.config.local_neighbors:
+                rows += [layer(level, placed) for layer, level in zip(self.local, code.levels, strict=True)]
+            if self.config.sight_neighbors:
+                rows.append(line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors))
+            hidden = self._activate(0, joint_linear(self.summands(0)[1:], rows, code.latent1))
         rest = None
         for number in range(1, len(self.norms)):
             rows, latent = [hidden], None
