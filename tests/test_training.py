@@ -147,6 +147,12 @@ def test_training_starts_from_given_weights(dataset: Path, tmp_path: Path) -> No
     data, config = training.Dataset.load(dataset), replace(SMALL, init=str(first))
     network = start_network(config, data)
     assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
+    other_counts = replace(config.network, points=48, neighbors=6)  # the same weights fit
+    network = start_network(replace(config, network=other_counts), data)
+    assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
+    assert network.config == other_counts
+    with pytest.raises(ValueError, match="another network setting sight_neighbors"):
+        start_network(replace(config, network=replace(config.network, sight_neighbors=0)), data)
     with pytest.raises(ValueError, match="another network setting width"):
         start_network(replace(config, network=replace(config.network, width=32)), data)
     with pytest.raises(FileNotFoundError, match="no weights 'lost'"):

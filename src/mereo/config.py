@@ -163,8 +163,8 @@ class TrainConfig:
 
     Attributes:
         network: the architecture.
-        init: weights to start from, of the same architecture: a shipped name or a file; empty is random. Those of
-            another object give all but its segments and template.
+        init: weights to start from, of the same architecture (the numbers of points and neighbours may differ): a
+            shipped name or a file; empty is random. Those of another object give all but its segments and template.
         loss: which terms: cross-entropy, L1 on the distance, cosine on the direction.
         l1_weight: the paper's lambda.
         batch: examples per step, over all processes together.

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import torch
 
-from mereo.hardware import BFLOAT16_PAYS, bfloat16_gain
+from mereo.hardware import bfloat16_gain, pick_device, pick_precision
 
 PURPOSES: dict[str, str] = {
     "view": "the pages of `mereo view`",
@@ -99,10 +99,9 @@ def _device() -> Iterator[str]:
 
 
 def _bfloat16() -> str:
-    if torch.cuda.is_available():
-        return "pays here"
-    gain = bfloat16_gain()
-    return f"{'pays' if gain >= BFLOAT16_PAYS else 'does not pay'} here: {gain:.1f} times float32"
+    device = pick_device()
+    verdict = "does not pay here" if pick_precision("auto", device) is None else "pays here"
+    return verdict if device.type == "cuda" else f"{verdict}: {bfloat16_gain():.1f} times float32"
 
 
 def cpu_features() -> dict[str, bool | None]:

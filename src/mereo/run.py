@@ -85,10 +85,16 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
     return network
 
 
+COUNTS = ("points", "neighbors", "ratio1", "ratio2", "local_neighbors", "sight_neighbors", "align_points")
+"""Network settings that say how many points are looked at: weights trained with one number run with another."""
+
+
 def _check_architecture(start: NetworkConfig, config: TrainConfig) -> None:
-    """Only the template lookup, which begins as nothing, may be new."""
-    known = replace(start, rest_template=start.rest_template or config.network.rest_template)
-    odd = [f.name for f in fields(known) if getattr(known, f.name) != getattr(config.network, f.name)]
+    """Only the template lookup, which begins as nothing, may be new, and counts differ that both have."""
+    ours = config.network
+    counts = {name: getattr(ours, name) for name in COUNTS if getattr(start, name) and getattr(ours, name)}
+    known = replace(start, rest_template=start.rest_template or ours.rest_template, **counts)
+    odd = [f.name for f in fields(known) if getattr(known, f.name) != getattr(ours, f.name)]
     if odd:
         raise ValueError(
             f"the weights {config.init} have another network setting {odd[0]}; continuing needs the same "

@@ -13,8 +13,8 @@ from mereo.bench.fitting import fitted_model
 from mereo.bench.floor import Machine, measure_machine
 from mereo.bench.stages import Bench, Stage, random_points
 from mereo.config import Precision
+from mereo.doctor import cpu_features
 from mereo.frames import Frame, load_frame, shipped_frames
-from mereo.hardware import has_amx
 from mereo.model import Model
 from mereo.output import write_json
 from mereo.weights import load_model
@@ -84,7 +84,7 @@ def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:
         "device": f"{device.type}, {name}",
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
-        "amx": has_amx(),
+        "amx": bool(cpu_features()["amx"]),
         "precision": model.working_precision,
         "gigaflops": machine.operations / 1e9,
         "gigabytes_per_second": machine.bandwidth / 1e9,
