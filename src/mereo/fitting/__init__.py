@@ -1,0 +1,1 @@
+"""Registration of an object's own deformation model to one frame of a depth camera."""

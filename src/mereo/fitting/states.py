@@ -1,0 +1,62 @@
+"""Random states of a scene as material points: what its statistical model is built from."""
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from mereo.fitting.interpolation import spread
+from mereo.fitting.statistical_model import StatisticalModel, build_model, material_points
+from mereo.mesh import SegmentedMesh
+from mereo.scene import Scene, State
+from mereo.solid import Solids
+from mereo.synthesis import example_rng
+
+STATES = 1500
+STATES_SEED = 500_000
+"""A training seed: no test view shares its states."""
+
+NODES = 600
+"""Interior material points of all segments together."""
+
+CANDIDATES = 40_000
+
+
+def interior_nodes(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "j 3"], UInt8[np.ndarray, " j"]]:
+    """Points inside the segments, evenly spread, as many for each segment, and their labels."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(*rest.bounds, size=(CANDIDATES, 3))
+    labels = Solids(rest).label(points)
+    each = NODES // len(rest.segments)
+    rows = []
+    for label in range(1, len(rest.segments) + 1):
+        inside = np.flatnonzero(labels == label)
+        if len(inside):
+            rows.append(inside[spread(points[inside], each)])
+    chosen = np.concatenate(rows)
+    return points[chosen], labels[chosen]
+
+
+def state_points(
+    state: State, nodes: Float[np.ndarray, "j 3"], labels: UInt8[np.ndarray, " j"]
+) -> Float[np.ndarray, "m 3"]:
+    """Where a state has moved all material points, in the scene's frame."""
+    moved = np.empty_like(nodes)
+    for label in np.unique(labels):
+        rows = labels == label
+        moved[rows] = state.deformations[label - 1](nodes[rows])
+    return material_points(state.mesh, moved)
+
+
+def sample_states(
+    scene: Scene, nodes: Float[np.ndarray, "j 3"], labels: UInt8[np.ndarray, " j"], count: int, seed: int
+) -> Float32[np.ndarray, "n m 3"]:
+    """Material points of random states; state i comes from (seed, i)."""
+    return np.stack(
+        [state_points(scene.sample_state(example_rng(seed, i)), nodes, labels).astype(np.float32) for i in range(count)]
+    )
+
+
+def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED) -> StatisticalModel:
+    """The statistical model of a scene."""
+    scene = scene.for_seed(seed)
+    nodes, labels = interior_nodes(scene.rest)
+    return build_model(scene.rest, nodes, labels, sample_states(scene, nodes, labels, count, seed))

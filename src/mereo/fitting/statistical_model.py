@@ -1,0 +1,214 @@
+"""The object's own deformation model: the mean of its states and their principal components (Cootes et al., CVIU 1995).
+
+States are brought rigidly onto their mean (Procrustes), so that what is left is deformation; the principal components
+of the material points, surface vertices and interior nodes alike, are its modes. A coefficient of 1 is one standard
+deviation, so the prior of the coefficients ``z`` is N(0, 1) each. Lengths are scene units.
+
+Notation: m material points (first the vertices of ``rest.merged()``, then the nodes), k modes, n states.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from mereo.fitting.interpolation import ANCHORS, Anchors, PointWeights, spread
+from mereo.fitting.rigid_alignment import align_all, fit_rigid
+from mereo.mesh import SegmentedMesh
+
+PROCRUSTES_ROUNDS = 100
+PROCRUSTES_POINTS = 600
+"""Material points whose alignment decides that of all."""
+
+GRAM_POINTS = 2000
+"""Material points whose inner products make the modes' directions among the states."""
+
+HELD_OUT = 0.05
+"""Share of the states that the modes do not see: their distance from the model is its residue."""
+
+LEAST_MOTION = 2e-4
+"""Of half the rest box's longest side: modes whose root mean square motion is smaller are left out."""
+
+MOST_MODES = 160
+PROJECTIONS = 5
+"""Rounds of alignment and least squares that express a state in modes."""
+
+
+@dataclass(frozen=True, eq=False)
+class StatisticalModel:
+    """Linear model of an object's states.
+
+    Attributes:
+        rest: the segments at rest.
+        nodes, node_labels: further material points, inside the segments at rest; label i + 1 is segment i.
+        mean: of the aligned states, turned as ``rest`` is.
+        modes: motion of each material point for one standard deviation, largest first.
+        library: coefficients of the states that the model was built from.
+        residue: root mean square distance of held-out states from the model.
+    """
+
+    rest: SegmentedMesh
+    nodes: Float[np.ndarray, "j 3"]
+    node_labels: UInt8[np.ndarray, " j"]
+    mean: Float[np.ndarray, "m 3"]
+    modes: Float32[np.ndarray, "m 3 k"]
+    library: Float32[np.ndarray, "n k"]
+    residue: float
+
+    @property
+    def count(self) -> int:
+        """How many modes there are."""
+        return self.modes.shape[2]
+
+    @cached_property
+    def faces(self) -> Int[np.ndarray, "f 3"]:
+        """Of all segments, as indices of material points."""
+        return self.rest.merged()[1].astype(np.int64)
+
+    @cached_property
+    def vertex_counts(self) -> tuple[int, ...]:
+        """Vertices of each segment."""
+        return tuple(len(segment.vertices) for segment in self.rest.segments)
+
+    @cached_property
+    def labels(self) -> UInt8[np.ndarray, " m"]:
+        """Of each material point."""
+        owner = np.repeat(np.arange(len(self.vertex_counts)), self.vertex_counts)
+        return np.concatenate([owner + 1, self.node_labels]).astype(np.uint8)
+
+    @cached_property
+    def rest_points(self) -> Float[np.ndarray, "m 3"]:
+        """All material points at rest."""
+        return material_points(self.rest, self.nodes)
+
+    @cached_property
+    def half(self) -> float:
+        """Half of the rest box's longest side."""
+        return float(np.ptp(self.rest.bounds, axis=0).max() / 2)
+
+    @cached_property
+    def rest_center(self) -> Float[np.ndarray, "3"]:
+        """Middle of the rest box."""
+        return self.rest.bounds.mean(axis=0)
+
+    @cached_property
+    def anchors(self) -> tuple[Int[np.ndarray, " a"], ...]:
+        """For each segment the material points that others of it follow."""
+        result = []
+        for index, first in enumerate(np.cumsum([0, *self.vertex_counts[:-1]])):
+            vertices = first + spread(self.rest.segments[index].vertices, ANCHORS)
+            nodes = sum(self.vertex_counts) + np.flatnonzero(self.node_labels == index + 1)
+            result.append(np.concatenate([vertices, nodes]))
+        return tuple(result)
+
+    @cached_property
+    def rest_anchors(self) -> tuple[Anchors, ...]:
+        """The same at rest."""
+        return tuple(Anchors(index, self.rest_points[index]) for index in self.anchors)
+
+    def material(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "m 3"]:
+        """Positions of all material points, unposed."""
+        return self.mean + self.modes @ z.astype(np.float32)
+
+    def mesh(self, material: Float[np.ndarray, "m 3"]) -> SegmentedMesh:
+        """The segments, with the rest mesh's faces, at these positions."""
+        ends = np.cumsum(self.vertex_counts)
+        return self.rest.with_vertices(np.split(material[: ends[-1]].astype(np.float64), ends[:-1]))
+
+    def weights(self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]) -> PointWeights:
+        """How points at rest, each of the segment that its label (1 or more) says, follow the material points."""
+        return following(self.rest_anchors, points, labels)
+
+    def project(self, material: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, " k"]]:
+        """Pose and coefficients of a state: ``T_state_model`` and z of (nearly) least squared distance."""
+        flat = self.modes.reshape(-1, self.count).astype(np.float64)
+        normal = flat.T @ flat + 1e-9 * np.trace(flat.T @ flat) * np.eye(self.count)
+        z = np.zeros(self.count)
+        for _ in range(PROJECTIONS):
+            T = fit_rigid(self.mean + (flat @ z).reshape(-1, 3), material)
+            unposed = (material - T[:3, 3]) @ T[:3, :3]
+            z = np.linalg.solve(normal, flat.T @ (unposed - self.mean).ravel())
+        return fit_rigid(self.mean + (flat @ z).reshape(-1, 3), material), z
+
+
+def material_points(mesh: SegmentedMesh, nodes: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "m 3"]:
+    """Vertices of all segments, then the nodes."""
+    return np.concatenate([*(segment.vertices for segment in mesh.segments), nodes])
+
+
+def following(
+    anchors: tuple[Anchors, ...], points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]
+) -> PointWeights:
+    """Weights of points by the anchors of their own segments."""
+    width = max((min(len(a.index), 32) for a in anchors), default=1)
+    index = np.zeros((len(points), width), dtype=np.int64)
+    weight = np.zeros((len(points), width))
+    for label in np.unique(labels):
+        rows = np.flatnonzero(labels == label)
+        found = anchors[label - 1].weights(points[rows])
+        index[rows, : found.index.shape[1]], weight[rows, : found.index.shape[1]] = found.index, found.weight
+    return PointWeights(index, weight)
+
+
+def build_model(
+    rest: SegmentedMesh,
+    nodes: Float[np.ndarray, "j 3"],
+    node_labels: UInt8[np.ndarray, " j"],
+    states: Float32[np.ndarray, "n m 3"],
+    most: int = MOST_MODES,
+) -> StatisticalModel:
+    """The statistical model of random or recorded states.
+
+    Args:
+        rest: the segments at rest.
+        nodes, node_labels: material points inside; may be none.
+        states: positions of all material points in each state, in any pose.
+        most: modes at most.
+
+    Raises ``ValueError`` for fewer than two states.
+    """
+    if len(states) < 2:
+        raise ValueError(f"a statistical model is asked of {len(states)} states; it needs 2 or more: record more states")
+    held_out = max(1, round(HELD_OUT * len(states)))
+    mean, aligned = _aligned(material_points(rest, nodes), states)
+    seen, unseen = aligned[:-held_out], aligned[-held_out:]
+    half = float(np.ptp(rest.bounds, axis=0).max() / 2)
+    library, modes = _principal(seen, most, LEAST_MOTION * half)
+    left = unseen - (unseen @ np.linalg.pinv(modes)) @ modes if len(modes) else unseen
+    residue = float(np.sqrt((left.astype(np.float64) ** 2).sum() / (left.size / 3)))
+    layout = np.ascontiguousarray(modes.reshape(len(modes), -1, 3).transpose(1, 2, 0))
+    return StatisticalModel(rest, nodes, node_labels, mean, layout, library, residue)
+
+
+def _aligned(
+    rest: Float[np.ndarray, "m 3"], states: Float32[np.ndarray, "n m 3"]
+) -> tuple[Float[np.ndarray, "m 3"], Float32[np.ndarray, "n c"]]:
+    """The mean, turned as the rest pose, and the aligned states' differences from it."""
+    few = spread(rest, PROCRUSTES_POINTS)
+    rotation, center, mean = align_all(states[:, few], PROCRUSTES_ROUNDS, 1e-5 * float(np.ptp(rest, axis=0).max()))
+    T = fit_rigid(mean.astype(np.float64), rest[few])
+    rotation = (T[:3, :3] @ rotation).astype(np.float32)
+    aligned = np.matmul(states - center[:, None], rotation.transpose(0, 2, 1)) + T[:3, 3].astype(np.float32)
+    middle = aligned.mean(axis=0)
+    return middle.astype(np.float64), (aligned - middle).reshape(len(states), -1)
+
+
+def _principal(
+    differences: Float32[np.ndarray, "n c"], most: int, least: float
+) -> tuple[Float32[np.ndarray, "n k"], Float32[np.ndarray, "k c"]]:
+    """Coefficients of the states, of unit variance, and the modes, largest first."""
+    count, columns = differences.shape
+    few = spread_columns(columns, GRAM_POINTS)
+    part = differences[:, few]
+    values, vectors = np.linalg.eigh((part @ part.T).astype(np.float64) / len(few) * 3)
+    order = np.argsort(values)[::-1][:most]
+    order = order[np.sqrt(np.maximum(values[order], 0.0) / count) > least]
+    library = (vectors[:, order] * np.sqrt(count)).astype(np.float32)
+    return library, library.T @ differences / np.float32(count)
+
+
+def spread_columns(columns: int, points: int) -> Int[np.ndarray, " c"]:
+    """Columns of about ``points`` evenly chosen material points."""
+    step = max(1, columns // 3 // points)
+    return (np.arange(0, columns // 3, step)[:, None] * 3 + np.arange(3)).ravel()
