@@ -162,14 +162,22 @@ class Model:
 
     def rest(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"] | None:
         """Where each point was at rest, in rest coordinates (see ``rest_pose``); None from a model without template."""
+        found = self.correspond(code, points)
+        return None if found is None else found[1]
+
+    def correspond(
+        self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n c"], Float[np.ndarray, "n 3"]] | None:
+        """Class probabilities and rest coordinates of each point in one pass; None from a model without template."""
         if self.network.decoder.lookup is None:
             return None
 
-        def rest(prediction: Prediction, _: Tensor) -> tuple[Tensor]:
+        def found(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor]:
             assert prediction.rest is not None
-            return (prediction.rest,)
+            return self.class_logits(prediction, queries).softmax(dim=-1), prediction.rest
 
-        return self._chunked(code, points, rest)[0].astype(np.float64)
+        probability, rest = self._chunked(code, points, found)
+        return probability, rest.astype(np.float64)
 
     def respond(
         self, prediction: Prediction, queries: Float[Tensor, "b q 3"]

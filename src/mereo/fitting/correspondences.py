@@ -1,0 +1,87 @@
+"""Correspondences between what a camera sees and the rest pose, as a trained network states them.
+
+Every point of the object lies on a line of sight through an observed point, at it or behind it. So the network is asked
+at the observed points and along the lines of sight behind them: where it finds a segment, it says where that place was
+at rest. It is right on what is seen and vague on what is hidden.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from mereo.fitting.interpolation import spread
+from mereo.model import EncodedCloud, Model
+
+SIGHT_LINES = 256
+"""Lines of sight along which the hidden inside is asked for."""
+
+DEPTHS = np.concatenate([np.arange(0.04, 0.6, 0.08), np.arange(0.6, 2.4, 0.15)])
+"""How far behind the observed point, in half longest sides of the visible part."""
+
+OBSERVED = 400
+"""Observed points that are asked for."""
+
+EACH = 125
+"""Correspondences kept of the observed points, and of the inside."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Places of the object in the camera frame and at rest.
+
+    Attributes:
+        points: in the camera frame, input unit.
+        rest: at rest, in scene units.
+        labels: of their segments, 1 or more.
+        confidence: probability of that segment, for observed points among the segments alone.
+        observed: whether the point is an observed one; otherwise it lies inside the object.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    rest: Float[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+    confidence: Float[np.ndarray, " n"]
+    observed: Bool[np.ndarray, " n"]
+
+    def rows(self, chosen: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Correspondences":
+        """Some of them."""
+        parts = (self.points, self.rest, self.labels, self.confidence, self.observed)
+        return Correspondences(*(part[chosen] for part in parts))
+
+    def evenly(self, each: int = EACH) -> "Correspondences":
+        """At most ``each`` observed and as many inside, evenly spread in space."""
+        chosen = []
+        for rows in (np.flatnonzero(self.observed), np.flatnonzero(~self.observed)):
+            if len(rows):
+                chosen.append(rows[spread(self.points[rows], each)])
+        return self.rows(np.concatenate(chosen))
+
+
+def find_correspondences(
+    model: Model, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
+) -> Correspondences | None:
+    """All that the network says about observed points and the lines of sight behind them.
+
+    Args:
+        model: the trained network.
+        code: of the observed cloud.
+        center, half: of the rest frame (``rest_pose.rest_frame``), scene units.
+
+    Returns None from a network without rest coordinates.
+    """
+    seen = code.cloud[:OBSERVED]
+    lines = seen[:SIGHT_LINES]
+    behind = DEPTHS / code.normalizer.scale / np.linalg.norm(lines, axis=1)[:, None]
+    inner = (lines[:, None] * (1.0 + behind[..., None])).reshape(-1, 3)
+    found = model.correspond(code, np.concatenate([seen, inner]))
+    if found is None:
+        return None
+    probability, rest = found
+    probability[: len(seen), 0] = 0.0  # an observed point is on the object, whatever the network thinks
+    probability[: len(seen)] /= np.maximum(probability[: len(seen)].sum(axis=1, keepdims=True), 1e-12)
+    labels = probability.argmax(axis=1).astype(np.uint8)
+    observed = np.arange(len(labels)) < len(seen)
+    confidence = probability.max(axis=1).astype(np.float64)
+    everything = Correspondences(np.concatenate([seen, inner]), rest * half + center, labels, confidence, observed)
+    return everything.rows(labels > 0)

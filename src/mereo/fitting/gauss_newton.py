@@ -1,0 +1,111 @@
+"""Least squares over a pose and the coefficients of a linear model, with analytic Jacobians.
+
+A material point is at ``y = e^s R q + t`` with ``q = mean + modes z``. A step turns about the camera's origin by a small
+rotation vector, shifts, scales and changes z:
+
+    dy = w x (y - t) + dt + (y - t) ds + e^s R modes dz
+
+Notation: n points, r residuals, p = 7 + k parameters in the order w, dt, ds, dz.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+POSE = 7
+"""Parameters before the coefficients."""
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """Pose and coefficients: a state of the model in the camera frame.
+
+    Attributes:
+        rotation, translation, log_scale: of the similarity into the camera frame.
+        z: coefficients of the modes.
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+    z: Float[np.ndarray, " k"]
+    log_scale: float = 0.0
+
+    def place(self, unposed: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points of the model's frame in the camera frame."""
+        return np.exp(self.log_scale) * (unposed @ self.rotation.T) + self.translation
+
+    def unplace(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Inverse of ``place``."""
+        return np.exp(-self.log_scale) * ((points - self.translation) @ self.rotation)
+
+    def moved(self, step: Float[np.ndarray, " p"]) -> "Posed":
+        """After one step of the parameters."""
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        return Posed(
+            turn @ self.rotation, self.translation + step[3:6], self.z + step[POSE:], self.log_scale + float(step[6])
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Sum of weighted squared residuals near a state: ``matrix step = -gradient`` is its least."""
+
+    matrix: Float[np.ndarray, "p p"]
+    gradient: Float[np.ndarray, " p"]
+
+    @classmethod
+    def prior(
+        cls, z: Float[np.ndarray, " k"], center: Float[np.ndarray, " k"], precision: Float[np.ndarray, "k k"],
+        log_scale: float, scale_std: float,
+    ) -> "NormalEquations":
+        """Of ``(z - center)^T precision (z - center)`` and of a scale that is known up to ``scale_std``."""
+        count = POSE + len(z)
+        matrix, gradient = np.zeros((count, count)), np.zeros(count)
+        matrix[POSE:, POSE:], gradient[POSE:] = precision, precision @ (z - center)
+        matrix[6, 6], gradient[6] = 1.0 / scale_std**2, log_scale / scale_std**2
+        return cls(matrix, gradient)
+
+    def add(
+        self, jacobian: Float[np.ndarray, "r p"], residual: Float[np.ndarray, " r"], weight: Float[np.ndarray, " r"]
+    ) -> "NormalEquations":
+        """With further residuals."""
+        weighted = jacobian * weight[:, None].astype(jacobian.dtype)
+        matrix = (weighted.T @ jacobian).astype(np.float64)
+        return NormalEquations(self.matrix + matrix, self.gradient + weighted.T.astype(np.float64) @ residual)
+
+    def step(self, damping: float) -> Float[np.ndarray, " p"]:
+        """Levenberg and Marquardt's step."""
+        damped = self.matrix + np.diag(damping * np.diag(self.matrix) + 1e-9)
+        solved: np.ndarray = cho_solve(cho_factor(damped), -self.gradient)
+        return solved
+
+
+def along(
+    posed: Posed, points: Float[np.ndarray, "n 3"], modes: Float[np.ndarray, "n 3 k"], direction: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n p"]:
+    """Derivatives of ``direction . y`` at posed ``points`` whose modes are given."""
+    arm = points - posed.translation
+    local = (np.exp(posed.log_scale) * (direction @ posed.rotation)).astype(modes.dtype)
+    result = np.empty((len(points), POSE + modes.shape[2]), dtype=modes.dtype)
+    result[:, :3] = np.cross(arm, direction)
+    result[:, 3:6] = direction
+    result[:, 6] = np.einsum("ni,ni->n", arm, direction)
+    result[:, POSE:] = np.matmul(local[:, None], modes)[:, 0]
+    return result
+
+
+def in_space(
+    posed: Posed, points: Float[np.ndarray, "n 3"], modes: Float[np.ndarray, "n 3 k"]
+) -> Float[np.ndarray, "m p"]:
+    """Derivatives of y at posed points, three rows for each: all x first, then y, then z."""
+    axes = np.eye(3)
+    return np.concatenate([along(posed, points, modes, np.broadcast_to(axis, points.shape)) for axis in axes])
+
+
+def geman_mcclure(residual: Float[np.ndarray, " r"], scale: float) -> Float[np.ndarray, " r"]:
+    """Weights of iteratively reweighted least squares for ``r^2 / (1 + r^2 / scale^2)``."""
+    weight: np.ndarray = 1.0 / (1.0 + (residual / scale) ** 2) ** 2
+    return weight

@@ -1,0 +1,137 @@
+"""Terms of the fit: what the network said, the observed points, and what the frame rules out.
+
+Every term gives normal equations near a state; lengths in scene units, camera frame. Notation: n correspondences, p
+partners, k modes.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import igl
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from mereo.fitting.correspondences import Correspondences
+from mereo.fitting.evidence import Evidence
+from mereo.fitting.gauss_newton import NormalEquations, Posed, along, geman_mcclure, in_space
+from mereo.fitting.interpolation import spread
+from mereo.fitting.statistical_model import StatisticalModel
+from mereo.mesh import barycentric
+
+ROBUST = 2.5
+"""Residuals beyond this many sigma count for little."""
+
+WITNESSES = 1500
+"""Vertices, evenly spread, that may not be where the frame rules them out."""
+
+MOST_VIOLATIONS = 400
+WITNESS_WEIGHT = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A posed model, and its faces turned towards the camera.
+
+    Attributes:
+        material: posed positions of all material points.
+        facing: indices of the faces that are seen from their outside.
+        normals: unit normals of these.
+    """
+
+    model: StatisticalModel
+    material: Float[np.ndarray, "m 3"]
+    facing: Int[np.ndarray, " g"]
+    normals: Float[np.ndarray, "g 3"]
+
+    @classmethod
+    def of(cls, model: StatisticalModel, posed: Posed) -> "Surface":
+        """Of a state."""
+        material = posed.place(model.material(posed.z))
+        a, b, c = (material[model.faces[:, i]] for i in range(3))
+        normal = np.cross(b - a, c - a)
+        facing = np.flatnonzero(np.einsum("fi,fi->f", normal, a) < 0)
+        normal = normal[facing]
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        return cls(model, material, facing, normal)
+
+    @cached_property
+    def _tree(self) -> tuple[igl.AABB, Float[np.ndarray, "m 3"], Int[np.ndarray, "g 3"]]:
+        vertices, faces = np.ascontiguousarray(self.material), np.ascontiguousarray(self.model.faces[self.facing])
+        tree = igl.AABB()
+        tree.init(vertices, faces)
+        return tree, vertices, faces
+
+    def nearest(
+        self, points: Float[np.ndarray, "p 3"]
+    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """Distance, face among the facing ones, and place of the nearest point of the facing surface."""
+        tree, vertices, faces = self._tree
+        squared, face, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
+        return np.sqrt(squared), face.astype(np.int64), place
+
+    def cloud_term(
+        self, posed: Posed, points: Float[np.ndarray, "p 3"], sigma: float, worth: float
+    ) -> tuple[Float[np.ndarray, "p q"], Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+        """Jacobian, residual and weight of each point's distance to the plane of its nearest facing face."""
+        _, face, place = self.nearest(points)
+        corners = self.model.faces[self.facing[face]]
+        weight = barycentric(self.material[corners], place).astype(np.float32)
+        modes = np.matmul(weight[:, None], self.model.modes[corners].reshape(len(points), 3, -1))
+        normal = self.normals[face]
+        residual = np.einsum("pi,pi->p", normal, place - points)
+        jacobian = along(posed, place, modes.reshape(len(points), 3, -1), normal)
+        return jacobian, residual, geman_mcclure(residual, ROBUST * sigma) * (worth / len(points) / sigma**2)
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkTerm:
+    """Correspondences, with the modes at their rest positions.
+
+    Attributes:
+        target: positions in the camera frame.
+        mean, modes: of the same points in the model.
+        confidence: weight of each.
+    """
+
+    target: Float[np.ndarray, "n 3"]
+    mean: Float[np.ndarray, "n 3"]
+    modes: Float32[np.ndarray, "n 3 k"]
+    confidence: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, model: StatisticalModel, found: Correspondences) -> "NetworkTerm":
+        weights = model.weights(found.rest, found.labels)
+        return cls(found.points, weights(model.mean), weights(model.modes), found.confidence)
+
+    def place(self, posed: Posed) -> Float[np.ndarray, "n 3"]:
+        """Where the state has the points."""
+        return posed.place(self.mean + self.modes @ posed.z.astype(np.float32))
+
+    def add_to(self, normal: NormalEquations, posed: Posed, sigma: float, worth: float, robust: bool) -> NormalEquations:
+        """With the squared distances, together worth as many independent points as ``worth``."""
+        points = self.place(posed)
+        offset = points - self.target
+        weight = self.confidence / self.confidence.sum() * (worth / sigma**2)
+        if robust:
+            weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
+        return normal.add(in_space(posed, points, self.modes), offset.T.ravel(), np.tile(weight, 3))
+
+
+def witness_vertices(model: StatisticalModel) -> Int[np.ndarray, " w"]:
+    """Material points on the surface that are compared with what the frame rules out."""
+    return spread(model.rest_points[: sum(model.vertex_counts)], WITNESSES)
+
+
+def add_witnesses(
+    normal: NormalEquations, surface: Surface, posed: Posed, evidence: Evidence, chosen: Int[np.ndarray, " w"],
+    sigma: float,
+) -> NormalEquations:
+    """With the chosen vertices that are outside the silhouette or in free space."""
+    direction, amount = evidence.violations(surface.material[chosen], ROBUST * sigma)
+    rows = np.flatnonzero(amount > 0)
+    if len(rows) == 0:
+        return normal
+    rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
+    jacobian = along(posed, surface.material[chosen[rows]], surface.model.modes[chosen[rows]], direction[rows])
+    weight = WITNESS_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
+    return normal.add(jacobian, -amount[rows], weight)
