@@ -12,12 +12,12 @@ from functools import partial
 
 import numpy as np
 
-from mereo.config import TEST_SEED_START, GenerateConfig
-from mereo.evaluation import trained_scene
-from mereo.extraction import Extraction, extract, extract_dense
-from mereo.scene import load_scene
-from mereo.synthesis import example_rng, sample_view
-from mereo.weights import load_model
+from mereo.evaluation.scoring import trained_scene
+from mereo.models.weights import load_model
+from mereo.reconstruction.isosurfaces import Extraction, extract, extract_dense
+from mereo.scenes.scene import load_scene
+from mereo.synthesis.examples import example_rng, sample_view
+from mereo.training.config import TEST_SEED_START, GenerateConfig
 
 
 def main(weights: str = "rope", resolution: int = 64, views: int = 2) -> None:

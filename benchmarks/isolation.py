@@ -11,15 +11,15 @@ import time
 
 import numpy as np
 
-from mereo.config import SENSORS, TEST_SEED_START, GenerateConfig
-from mereo.evaluation import grid_confusion, predict_grid, trained_scene
-from mereo.frames import truth_grid
-from mereo.input_config import IsolationConfig
-from mereo.isolation import isolate
-from mereo.metrics import intersection_over_union
-from mereo.scene import load_scene
-from mereo.synthesis import example_rng, sample_view
-from mereo.weights import load_model, shipped_names
+from mereo.evaluation.metrics import intersection_over_union
+from mereo.evaluation.sample_views import truth_grid
+from mereo.evaluation.scoring import grid_confusion, predict_grid, trained_scene
+from mereo.models.weights import load_model, shipped_names
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.isolation import isolate
+from mereo.scenes.scene import load_scene
+from mereo.synthesis.examples import example_rng, sample_view
+from mereo.training.config import SENSORS, TEST_SEED_START, GenerateConfig
 
 WAYS = {
     "as it comes": IsolationConfig(),

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mereo.camera import DepthImage
-from mereo.config import SENSORS, GenerateConfig, SensorConfig
-from mereo.scene import load_scene
-from mereo.sensor import Observation, observe
-from mereo.sheets import Picture, contact_sheet, depth_to_rgb, enlarge, save_png
-from mereo.solid import Solids
-from mereo.surroundings import OBJECT, OCCLUDER
-from mereo.synthesis import example_rng, sample_view
+from mereo.geometry.camera import DepthImage
+from mereo.geometry.solids import Solids
+from mereo.scenes.scene import load_scene
+from mereo.synthesis.clutter import OBJECT, OCCLUDER
+from mereo.synthesis.depth_sensor import Observation, observe
+from mereo.synthesis.examples import example_rng, sample_view
+from mereo.training.config import SENSORS, GenerateConfig, SensorConfig
+from mereo.visualization.contact_sheets import Picture, contact_sheet, depth_to_rgb, enlarge, save_png
 
 STRAY, LEFT_OUT = (214, 39, 40), (176, 180, 188)
 OFF = SensorConfig()

@@ -9,11 +9,11 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from mereo.assets import AssetUnavailable
-from mereo.config import TEST_SEED_START
-from mereo.error_pictures import ErrorCase, error_picture
-from mereo.evaluation import evaluate
-from mereo.weights import load_model, shipped_names
+from mereo.evaluation.scoring import evaluate
+from mereo.models.weights import load_model, shipped_names
+from mereo.scenes.assets import AssetUnavailable
+from mereo.training.config import TEST_SEED_START
+from mereo.visualization.error_maps import ErrorCase, error_picture
 
 
 def first_view(name: str, cells: int) -> ErrorCase:

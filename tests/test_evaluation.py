@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from analytic import AnalyticModel, untrained
 
-from mereo import demo
-from mereo.assets import AssetUnavailable
-from mereo.camera import PointCloud
-from mereo.config import GenerateConfig
-from mereo.evaluation import (
+from mereo.cli import demo
+from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
+from mereo.evaluation.sample_views import DEPTH_STEP, TruthGrid, load_frame, make_frame, save_frame, truth_grid
+from mereo.evaluation.scoring import (
     Evaluation,
     TestCase,
     evaluate,
@@ -23,13 +22,14 @@ from mereo.evaluation import (
     score_cases,
     trained_scene,
 )
-from mereo.frames import DEPTH_STEP, TruthGrid, load_frame, make_frame, save_frame, truth_grid
-from mereo.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.metrics import confusion_matrix, intersection_over_union
-from mereo.scene import load_scene
-from mereo.solid import Solids
-from mereo.synthesis import example_rng, sample_view
-from mereo.weights import save_model
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.models.weights import save_model
+from mereo.scenes.assets import AssetUnavailable
+from mereo.scenes.scene import load_scene
+from mereo.synthesis.examples import example_rng, sample_view
+from mereo.training.config import GenerateConfig
 
 NAMES = ("left", "right")
 

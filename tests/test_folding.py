@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import nn
 
-from mereo.config import PRESETS, NetworkConfig
-from mereo.folding import fold_batch_norm
-from mereo.network import Network
+from mereo.models.batch_norm_fusion import fold_batch_norm
+from mereo.models.network import Network
+from mereo.training.config import PRESETS, NetworkConfig
 
 SMALL = replace(PRESETS["tiny"].network, points=64)
 

@@ -7,10 +7,10 @@ import pytest
 from scipy.stats import kstest
 from toy_scene import rest_mesh, toy_scene
 
-from mereo.deformation import Deformation, Rigid
-from mereo.draws import Recorder
-from mereo.freedoms import Freedom, Played, Refused, freedoms, play, random_state, set_value, turned
-from mereo.scene import Scene, load_scene
+from mereo.deformation.maps import Deformation, Rigid
+from mereo.scenes.draw_recorder import Recorder
+from mereo.scenes.parameters import Freedom, Played, Refused, freedoms, play, random_state, set_value, turned
+from mereo.scenes.scene import Scene, load_scene
 
 STILL = np.zeros(3)
 

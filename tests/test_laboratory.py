@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from toy_scene import toy_scene
 
-from mereo.evaluation import grid_scores
-from mereo.frame import transform_points
-from mereo.freedoms import freedoms, random_state, set_value
-from mereo.laboratory import CameraPlace, Laboratory
-from mereo.scene import Workspace, load_scene
-from mereo.weights import load_model
+from mereo.evaluation.scoring import grid_scores
+from mereo.geometry.transforms import transform_points
+from mereo.models.weights import load_model
+from mereo.scenes.parameters import freedoms, random_state, set_value
+from mereo.scenes.scene import Workspace, load_scene
+from mereo.visualization.viewer.laboratory import CameraPlace, Laboratory
 
 
 def test_the_camera_stands_where_its_place_says_and_sees_the_state() -> None:

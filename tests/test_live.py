@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mereo.camera import Camera, DepthImage
-from mereo.frame import inverse_rigid
-from mereo.freedoms import freedoms, random_state, set_value
-from mereo.input_config import InputConfig, IsolationConfig
-from mereo.live import stream_reconstructions
-from mereo.mesh import SegmentedMesh
-from mereo.output import write_camera
-from mereo.rendering import add_depth_noise, render_depth
-from mereo.scene import load_scene
-from mereo.stream_sources import frames_of
+from mereo.cli.stream import stream_reconstructions
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.transforms import inverse_rigid
+from mereo.io.atomic_files import write_camera
+from mereo.reconstruction.config import InputConfig, IsolationConfig
+from mereo.reconstruction.stream_sources import frames_of
+from mereo.scenes.parameters import freedoms, random_state, set_value
+from mereo.scenes.scene import load_scene
+from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
 
 FRAMES, BAD, RATE_HZ = 30, 12, 30.0
 UNIT_M = 0.005

@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 
 from mereo import __main__ as command_line
-from mereo import commands
-from mereo.camera import Camera
-from mereo.files import read_point_cloud
-from mereo.input_config import InputConfig, IsolationConfig
-from mereo.observation import read_observation, size_warning
-from mereo.output import write_camera
-from mereo.weights import load_model
+from mereo.cli import commands
+from mereo.geometry.camera import Camera
+from mereo.io.atomic_files import write_camera
+from mereo.io.readers import read_point_cloud
+from mereo.models.weights import load_model
+from mereo.reconstruction.config import InputConfig, IsolationConfig
+from mereo.reconstruction.observation import read_observation, size_warning
 
 CAMERA = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
 

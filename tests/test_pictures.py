@@ -7,11 +7,12 @@ import pytest
 import trimesh
 from PIL import Image
 
-from mereo.camera import Camera, DepthImage, PointCloud
-from mereo.error_pictures import OVER, UNDER, WRONG, error_grids, voxel_triangles
-from mereo.frame import rigid
-from mereo.mesh import PALETTE, Color, Segment, SegmentedMesh
-from mereo.pictures import (
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.geometry.transforms import rigid
+from mereo.synthesis.examples import View
+from mereo.visualization.error_maps import OVER, UNDER, WRONG, error_grids, voxel_triangles
+from mereo.visualization.previews import (
     ErrorCase,
     contact_sheet,
     depth_to_rgb,
@@ -19,8 +20,7 @@ from mereo.pictures import (
     render_cloud_and_segments,
     scene_preview,
 )
-from mereo.shading import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
-from mereo.synthesis import View
+from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
 
 FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 

@@ -14,11 +14,13 @@ import trimesh
 from analytic import AnalyticModel, ball, logits_of, union, untrained
 
 import mereo
-from mereo.camera import PointCloud
-from mereo.frame import inverse_rigid, transform_points
-from mereo.input_config import IsolationConfig
-from mereo.observation import SizeWarning
-from mereo.reconstruction import (
+from mereo.evaluation.scans import scanner_to_camera
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.models.weights import save_model
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import SizeWarning
+from mereo.reconstruction.pipeline import (
     Frame,
     Reconstruction,
     reconstruct,
@@ -26,8 +28,6 @@ from mereo.reconstruction import (
     summarize,
     write_reconstruction,
 )
-from mereo.scans import scanner_to_camera
-from mereo.weights import save_model
 
 NAMES = ("big", "small", "absent")
 BIG, SMALL = ((0.02, -0.03, 0.6), 0.06), ((0.02, 0.0605, 0.6), 0.03)
@@ -157,7 +157,7 @@ def test_from_file_to_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cloud, model = scene("camera")
-    monkeypatch.setattr("mereo.reconstruction.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.reconstruction.pipeline.load_for", lambda *_: model)
     np.save(tmp_path / "cloud.npy", cloud)
     result = reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "out", resolution=16)
     assert summarize(result)["segments"][0]["name"] == "big"
@@ -173,7 +173,9 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     """Strays beside the object are pointed out, and left out when asked; the summary says so."""
     cloud, model = scene("camera")
     np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
-    monkeypatch.setattr("mereo.reconstruction.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
+    monkeypatch.setattr(
+        "mereo.reconstruction.pipeline.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]})
+    )
     read = partial(reconstruct_file, tmp_path / "cloud.npy", "any", resolution=16)
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
         read(output=tmp_path / "crowded")

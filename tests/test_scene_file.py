@@ -10,12 +10,12 @@ import trimesh
 from scene_files import HEAD, write_bar, write_mesh
 from shapes import ball, box
 
-from mereo.deformation import jacobian_determinant
-from mereo.mesh import PALETTE
-from mereo.random_motion import RandomMotion
-from mereo.scene import SCENES, load_scene
-from mereo.scene_schema import Deformation, SceneFile
-from mereo.warps import FreeFormLattice
+from mereo.deformation.maps import jacobian_determinant
+from mereo.deformation.samplers import RandomMotion
+from mereo.deformation.warps import FreeFormLattice
+from mereo.geometry.mesh import PALETTE
+from mereo.scenes.files.schema import Deformation, SceneFile
+from mereo.scenes.scene import SCENES, load_scene
 
 EVERYTHING = """
 deformations:

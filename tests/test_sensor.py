@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from shapes import ball, box, one
 
-from mereo.camera import Camera
-from mereo.config import SENSORS, SensorConfig
-from mereo.mesh import SegmentedMesh
-from mereo.rendering import add_depth_noise, render_depth
-from mereo.sensor import (
+from mereo.geometry.camera import Camera
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.synthesis.config import SENSOR_TERMS, SensorModel
+from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
+from mereo.synthesis.depth_sensor import (
     Observation,
     axial_std_m,
     check_sensor,
@@ -23,8 +24,7 @@ from mereo.sensor import (
     sample_mask,
     smooth_field,
 )
-from mereo.sensor_config import SENSOR_TERMS, SensorModel
-from mereo.solid import Solids
+from mereo.training.config import SENSORS, SensorConfig
 
 CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
 RAYS = CAMERA.directions()

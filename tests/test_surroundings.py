@@ -8,14 +8,14 @@ import trimesh
 from shapes import ball, box, one, segment
 from toy_scene import toy_scene
 
-from mereo.camera import Camera
-from mereo.config import MIN_POINTS, SENSORS, GenerateConfig, SamplingConfig, SensorConfig
-from mereo.mesh import Segment, SegmentedMesh
-from mereo.rays import first_hits
-from mereo.sensor import Observation, observe
-from mereo.solid import Solids
-from mereo.surroundings import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
-from mereo.synthesis import example_rng, sample_view, synthesize
+from mereo.geometry.camera import Camera
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.raycasting import first_hits
+from mereo.geometry.solids import Solids
+from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
+from mereo.synthesis.depth_sensor import Observation, observe
+from mereo.synthesis.examples import example_rng, sample_view, synthesize
+from mereo.training.config import MIN_POINTS, SENSORS, GenerateConfig, SamplingConfig, SensorConfig
 
 CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
 RAYS = CAMERA.directions().reshape(-1, 3)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from mereo.config import TEST_SEED_START, GenerateConfig
-from mereo.scene import load_scene
-from mereo.synthesis import example_rng, sample_view
+from mereo.scenes.scene import load_scene
+from mereo.synthesis.examples import example_rng, sample_view
+from mereo.training.config import TEST_SEED_START, GenerateConfig
 
 
 def mereo(*arguments: object) -> str:

@@ -12,14 +12,14 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo import commands, scene_commands
-from mereo.align_command import Align
-from mereo.bench_command import BenchCommand
-from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
-from mereo.experiment_command import Experiment
-from mereo.release_command import Release
-from mereo.stream_command import StreamCommand
-from mereo.view_command import View
+from mereo.cli import commands, scene_commands
+from mereo.cli.align_command import Align
+from mereo.cli.bench_command import BenchCommand
+from mereo.cli.experiment_command import Experiment
+from mereo.cli.release_command import Release
+from mereo.cli.stream_command import StreamCommand
+from mereo.cli.view_command import View
+from mereo.training.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
 
 Choice = TypeVar("Choice")
 
@@ -30,7 +30,7 @@ USER_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 
 @runtime_checkable
 class Command(Protocol):
-    """What the arguments are read into: one of the classes of ``mereo.commands``."""
+    """What the arguments are read into: one of the classes of ``mereo.cli.commands``."""
 
     def run(self) -> None: ...
 

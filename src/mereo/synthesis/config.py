@@ -1,0 +1,89 @@
+"""Settings of simulated depth cameras; a part of ``mereo.training.config``, which is where to import them from."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+SensorModel = Literal["structured-light", "time-of-flight"]
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """Errors of real depth cameras, on top of the paper's noise; each is off at 0 (docs/design/0006-sensors.md).
+
+    A strength of 1 is as published. The formulas are in metres, scenes in their own units.
+
+    Attributes:
+        metres_per_unit: size of a scene unit; 0.005 makes objects 10 cm thick, seen from 0.5 to 1 m, where depth
+            cameras of arm's reach work.
+        model: whose formulas the axial and lateral noise follow.
+        axial: strength of the noise along the ray, which grows with distance and slant.
+        lateral: strength of the noise across the ray: where a pixel looks.
+        quantization: strength of the depth steps of structured light, which grow with the distance squared.
+        flying: probability that a pixel at a depth edge lies between both sides; the object's outline is such an edge
+            where there is a background.
+        dropout: probability that a pixel on a surface seen edge-on is missing; below 60 degrees of slant none is.
+        holes: mean number of missing blobs on the object (mirroring or absorbing spots).
+        hole_radius_m: their mean radius in metres.
+        tool: probability of a thin tool in front of the object.
+        hand: probability of a hand with its forearm in front of the object.
+        background: probability of a plane behind the object, which a wrong mask lets in.
+        mask_offset_px: how far the mask's edge is off, outward or inward, standard deviation in pixels of the image.
+        mask_shift_px: how far the whole mask is off, standard deviation along each axis in pixels of the image.
+    """
+
+    metres_per_unit: float = 0.005
+    model: SensorModel = "structured-light"
+    axial: float = 0.0
+    lateral: float = 0.0
+    quantization: float = 0.0
+    flying: float = 0.0
+    dropout: float = 0.0
+    holes: float = 0.0
+    hole_radius_m: float = 0.01
+    tool: float = 0.0
+    hand: float = 0.0
+    background: float = 0.0
+    mask_offset_px: float = 0.0
+    mask_shift_px: float = 0.0
+
+    @property
+    def on(self) -> bool:
+        """Whether anything differs from the paper's sensor."""
+        return any(getattr(self, name) != 0 for name in SENSOR_TERMS)
+
+
+SENSOR_TERMS = (
+    *("axial", "lateral", "quantization", "flying", "dropout", "holes", "tool", "hand", "background"),
+    *("mask_offset_px", "mask_shift_px"),
+)
+"""What a sensor is off without; each term draws from a random stream of its own."""
+
+Sensor = Literal["paper", "structured-light", "time-of-flight"]
+
+SENSORS: dict[Sensor, SensorConfig] = {
+    # Gaussian noise alone, GenerateConfig.noise_std
+    "paper": SensorConfig(),
+    # the first Kinect and its kin, with a segmentation that is about half a pixel off
+    "structured-light": SensorConfig(
+        axial=1.0,
+        lateral=1.0,
+        quantization=1.0,
+        dropout=0.8,
+        holes=1.0,
+        background=1.0,
+        mask_offset_px=0.5,
+        mask_shift_px=0.3,
+    ),
+    # the second Kinect and its kin: no depth steps, but flying pixels
+    "time-of-flight": SensorConfig(
+        model="time-of-flight",
+        axial=1.0,
+        lateral=1.0,
+        flying=0.5,
+        dropout=0.5,
+        holes=0.5,
+        background=1.0,
+        mask_offset_px=0.5,
+        mask_shift_px=0.3,
+    ),
+}
