@@ -18,9 +18,11 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.scenes.builtin._liver_parts import MM
 from mereo.scenes.recorded_states import States, SurfaceFrames, load_states
-from mereo.scenes.scene import Scene, load_scene
-from mereo.synthesis.examples import example_rng, synthesize
-from mereo.training.config import GenerateConfig
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import synthesize
 
 STATES = Path(__file__).parents[1] / "src/mereo/states/liver.npz"
 POINTS = 1500

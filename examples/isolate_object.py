@@ -19,8 +19,9 @@ from jaxtyping import Float
 from mereo.evaluation.scans import scan_in_camera
 from mereo.evaluation.scoring import grid_scores
 from mereo.geometry.camera import PointCloud
+from mereo.io.config import InputConfig
 from mereo.models.weights import load_model
-from mereo.reconstruction.config import InputConfig, IsolationConfig
+from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import isolate
 from mereo.reconstruction.observation import read_observation
 from mereo.visualization.contact_sheets import cloud_picture, contact_sheet, save_png

@@ -24,46 +24,7 @@ from architecture import (
 
 TOP = Path(__file__).parents[1]
 
-EXCEPTIONS: frozenset[str] = frozenset(
-    {
-        "evaluation/sample_views -> training/config",
-        "evaluation/scoring -> training/config",
-        "evaluation/scoring -> visualization/error_maps",
-        "evaluation/scoring -> visualization/evaluation_report",
-        "experiments/speed/report -> cli/doctor",
-        "io/writers/formats -> reconstruction/isosurfaces",
-        "io/writers/formats -> reconstruction/segment_statistics",
-        "io/writers/glb -> reconstruction/config",
-        "io/writers/medical -> reconstruction/isosurfaces",
-        "io/writers/ply -> reconstruction/segment_statistics",
-        "io/writers/points -> reconstruction/segment_statistics",
-        "io/writers/volumes -> reconstruction/isosurfaces",
-        "io/yaml_document -> scenes/files/schema",
-        "models/alignment_network -> training/config",
-        "models/config -> training/config",
-        "models/decoder -> training/config",
-        "models/device -> training/config",
-        "models/encoders/__init__ -> training/config",
-        "models/encoders/autodecoder -> training/config",
-        "models/encoders/point_transformer -> training/config",
-        "models/encoders/pointnet2 -> training/config",
-        "models/export/onnx_export -> training/config",
-        "models/model -> training/config",
-        "models/network -> training/config",
-        "reconstruction/isolation -> training/config",
-        "reconstruction/pipeline -> evaluation/scans",
-        "reconstruction/pipeline -> visualization/previews",
-        "reconstruction/pipeline -> visualization/reconstruction_report",
-        "scenes/files/check -> synthesis/examples",
-        "scenes/parameters -> visualization/viewer/parameter_names",
-        "scenes/scene -> training/config",
-        "synthesis/clutter -> training/config",
-        "synthesis/depth_sensor -> training/config",
-        "synthesis/examples -> training/config",
-        "synthesis/query_sampling -> training/config",
-        "synthesis/shards -> training/config",
-    }
-)
+EXCEPTIONS: frozenset[str] = frozenset()
 """Imports from a later room that are still there; one that has gone must leave this list."""
 
 

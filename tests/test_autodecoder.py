@@ -12,10 +12,11 @@ from shapes import ball
 from toy_data import write_toy_dataset
 from training_runs import assert_resumes_exactly, train_in_two_processes
 
-from mereo.evaluation.sample_views import truth_grid
+from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.scoring import TestCase, score_cases
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.models.config import NetworkConfig
 from mereo.models.decoder import Code
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.encoders.encoding import Encoding
@@ -24,7 +25,7 @@ from mereo.models.network import Network
 from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import reconstruct
 from mereo.training import trainer, validation
-from mereo.training.config import PRESETS, AugmentConfig, NetworkConfig, TrainConfig
+from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
 from mereo.training.dataset import Dataset
 from mereo.training.run_directory import start_network
 

@@ -7,7 +7,7 @@ import pytest
 from shapes import ball
 
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 from mereo.geometry.solids import Solids
 from mereo.models.model import Answer
 from mereo.visualization.vertex_colors import (
@@ -17,7 +17,6 @@ from mereo.visualization.vertex_colors import (
     error_scale,
     observed_distance,
     surface_error,
-    vertex_normals,
 )
 from mereo.visualization.viewer.laboratory import FAR, NEAR, NOTHING, depth_picture
 from mereo.visualization.viewer.probe import first_hit

@@ -13,9 +13,10 @@ import pytest
 
 import mereo.__main__ as command_line
 from mereo.cli import commands
-from mereo.reconstruction.config import InputConfig
-from mereo.scenes.scene import SCENES
-from mereo.training.config import PRESETS, GenerateConfig, PresetName, SamplingConfig
+from mereo.io.config import InputConfig
+from mereo.scenes.registry import SCENES
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.training.config import PRESETS, PresetName
 
 WITHOUT_NETWORK = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
 

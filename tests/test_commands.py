@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import mereo.__main__ as command_line
-from mereo.reconstruction.config import InputConfig
+from mereo.io.config import InputConfig
 from mereo.training.config import PRESETS
 
 
@@ -28,13 +28,13 @@ from mereo.training.config import PRESETS
         ),
         (
             "evaluate bunny --output out --examples 4 --seed 1000001",
-            "mereo.evaluation.scoring",
+            "mereo.visualization.result_files",
             "evaluate_weights",
             {"weights": "bunny", "output": Path("out"), "examples": 4, "seed": 1_000_001, "scene": None},
         ),
         (
             "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force",
-            "mereo.reconstruction.pipeline",
+            "mereo.cli.reconstruct",
             "reconstruct_file",
             {"reading": InputConfig(Path("k.json"), 5000.0, Path("m.png")), "force": True},
         ),

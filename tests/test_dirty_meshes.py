@@ -11,9 +11,10 @@ from shapes import ball, box
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import _DIRECTIONS, Solids, label_grid
 from mereo.scenes.files.build import MeshWarning
-from mereo.scenes.scene import load_scene
-from mereo.synthesis.examples import example_rng, synthesize
-from mereo.training.config import GenerateConfig, SamplingConfig
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import synthesize
 
 WHOLE = ball((0, 0, 0), 2.0, level=3)
 

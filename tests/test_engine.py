@@ -7,7 +7,7 @@ from solid_pairs import gap, overlapping_pairs
 from mereo.deformation.maps import Deformation, jacobian_determinant
 from mereo.scenes.builtin import _engine_parts as parts
 from mereo.scenes.builtin import engine
-from mereo.scenes.scene import load_scene
+from mereo.scenes.registry import load_scene
 
 ANGLES_RAD = np.linspace(0.0, engine.CYCLE_RAD, 19)[:-1] + 0.11
 NAMES = engine.rest_mesh().names

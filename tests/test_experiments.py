@@ -10,7 +10,7 @@ from mereo.experiments.paper.registry import EXPERIMENTS, run_experiment
 from mereo.experiments.paper.result import Claim, Result, Row, better, markdown, published, write_result
 from mereo.experiments.paper.scales import SCALES
 from mereo.experiments.paper.store import Score, Store, content_key, read_score
-from mereo.training.config import GenerateConfig
+from mereo.synthesis.config import GenerateConfig
 
 NAN = float("nan")
 

@@ -10,8 +10,9 @@ from mereo.models.weights import load_model, shipped_names
 from mereo.reconstruction.coarse_to_fine import Field, sample_coarse_to_fine, sample_dense
 from mereo.reconstruction.isosurfaces import Extraction, _grid, extract, extract_dense, extract_whole, locate
 from mereo.scenes.assets import AssetUnavailable
-from mereo.scenes.scene import load_scene
-from mereo.synthesis.examples import GenerateConfig, example_rng, sample_view
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.examples import GenerateConfig, sample_view
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 

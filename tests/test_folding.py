@@ -7,8 +7,9 @@ import torch
 from torch import nn
 
 from mereo.models.batch_norm_fusion import fold_batch_norm
+from mereo.models.config import NetworkConfig
 from mereo.models.network import Network
-from mereo.training.config import PRESETS, NetworkConfig
+from mereo.training.config import PRESETS
 
 SMALL = replace(PRESETS["tiny"].network, points=64)
 

@@ -16,11 +16,13 @@ import pytest
 from safetensors.numpy import load_file
 from toy_scene import toy_scene
 
-from mereo.scenes.scene import Scene, load_scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis import progress, shards
-from mereo.synthesis.examples import Example, example_rng, synthesize
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.shards import example_bytes, generate
-from mereo.training.config import TEST_SEED_START, GenerateConfig, SamplingConfig
 from mereo.training.dataset import Dataset
 
 SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))

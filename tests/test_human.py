@@ -12,7 +12,7 @@ from mereo.scenes.builtin import human
 from mereo.scenes.builtin._human_joints import JOINTS, NAMES, rotations, turn_limits
 from mereo.scenes.builtin._human_parts import rest_mesh
 from mereo.scenes.builtin._human_skin import PosedBody
-from mereo.scenes.scene import load_scene
+from mereo.scenes.registry import load_scene
 
 
 @pytest.fixture(autouse=True)

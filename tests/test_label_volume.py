@@ -10,7 +10,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids
 from mereo.io.label_volumes import is_volume, read_label_volume, segment_surfaces
-from mereo.scenes.scene import load_scene
+from mereo.scenes.registry import load_scene
 
 nibabel = pytest.importorskip("nibabel")
 nrrd = pytest.importorskip("nrrd")

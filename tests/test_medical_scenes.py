@@ -13,7 +13,7 @@ from mereo.geometry.mesh_repair import close_holes, largest_piece
 from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids
 from mereo.scenes.builtin import _liver_parts, skull, tumor
-from mereo.scenes.scene import load_scene
+from mereo.scenes.registry import load_scene
 
 Require = Callable[[str], Path]
 

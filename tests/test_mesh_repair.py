@@ -14,7 +14,7 @@ from mereo.geometry.mesh_check import examine, likely_unit
 from mereo.geometry.mesh_repair import repaired, without_overlaps
 from mereo.geometry.overlap import check_overlap, overlaps
 from mereo.scenes.files.check import check_scene
-from mereo.scenes.scene import load_scene
+from mereo.scenes.registry import load_scene
 
 
 def joined(*parts: Segment) -> Segment:

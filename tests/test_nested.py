@@ -18,7 +18,9 @@ from mereo.geometry.transforms import rigid, transform_points
 from mereo.reconstruction.isosurfaces import extract, extract_dense
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
 from mereo.scenes.scene import Scene
-from mereo.synthesis.examples import example_rng, sample_view, synthesize
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import sample_view, synthesize
 from mereo.synthesis.label_rules import owner_labels
 from mereo.synthesis.query_sampling import (
     label_uniform,
@@ -28,7 +30,6 @@ from mereo.synthesis.query_sampling import (
     volume_uniform,
 )
 from mereo.synthesis.shards import make_manifest
-from mereo.training.config import GenerateConfig, SamplingConfig
 from mereo.visualization.renderer import Viewpoint, shade
 
 CORE, ORGAN = ((2.0, 0.0, 0.0), 2.6), ((0.0, 0.0, 0.0), 5.0)

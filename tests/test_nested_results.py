@@ -22,9 +22,10 @@ from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids
 from mereo.io.writers.glb import OUTER_OPACITY
 from mereo.models.weights import load_model, save_model
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct, write_reconstruction
+from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.training.trainer import train
 from mereo.visualization.previews import render_cloud_and_segments
+from mereo.visualization.result_files import write_reconstruction
 
 NESTED = (("core", "organ"),)
 CENTER, RADIUS = (0.0, 0.0, 5.0), 1.0

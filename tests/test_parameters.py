@@ -9,8 +9,9 @@ from toy_scene import rest_mesh, toy_scene
 
 from mereo.deformation.maps import Deformation, Rigid
 from mereo.scenes.draw_recorder import Recorder
-from mereo.scenes.parameters import Freedom, Played, Refused, freedoms, play, random_state, set_value, turned
-from mereo.scenes.scene import Scene, load_scene
+from mereo.scenes.parameters import Parameter, Played, Refused, parameters, play, random_state, set_value, turned
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
 
 STILL = np.zeros(3)
 
@@ -24,8 +25,8 @@ def shifted(*values: float) -> tuple[Deformation, ...]:
     return (Rigid(STILL, np.array([*values, 0.0, 0.0, 0.0][:3]), STILL),) * 4
 
 
-def named(played: Played, name: str) -> Freedom:
-    return next(freedom for freedom in freedoms(played) if freedom.name == name)
+def named(played: Played, name: str) -> Parameter:
+    return next(parameter for parameter in parameters(played) if parameter.name == name)
 
 
 def shift_of(played: Played) -> np.ndarray:
@@ -81,10 +82,10 @@ def test_draws_that_a_choice_brings_come_and_go_and_come_back_the_same() -> None
 
     scene = scene_of(sample)
     played = random_state(scene, 0)
-    switch = freedoms(played)[0]
+    switch = parameters(played)[0]
     low = set_value(scene, played, switch, 0.2)
-    high = set_value(scene, low, freedoms(low)[0], 0.8)
-    back = set_value(scene, high, freedoms(high)[0], 0.3)
+    high = set_value(scene, low, parameters(low)[0], 0.8)
+    back = set_value(scene, high, parameters(high)[0], 0.3)
     assert low.keys != high.keys
     assert shift_of(low)[0] < 1 < 2 < shift_of(high)[0]
     np.testing.assert_array_equal(shift_of(back), shift_of(low))
@@ -106,7 +107,7 @@ def test_attempts_that_the_scene_threw_away_have_no_sliders() -> None:
         recorder, _ = play(scene, seed, {}, None)
         attempts.append(len(recorder.calls))
         played = random_state(scene, seed)
-        assert len(freedoms(played)) == 3
+        assert len(parameters(played)) == 3
         # what is kept leads to the same state at once
         again, deformations = play(scene, seed, {c.key: c.shares for c in played.calls}, None)
         assert len(again.calls) == 3
@@ -151,32 +152,32 @@ def test_many_numbers_move_together_and_stay_as_random_as_they_were() -> None:
 def test_an_array_of_many_numbers_has_one_slider() -> None:
     scene = scene_of(lambda rng: shifted(float(rng.normal(size=(4, 3)).sum())))
     played = random_state(scene, 0)
-    (whole,) = freedoms(played)
+    (whole,) = parameters(played)
     assert (whole.index, whole.low, whole.high, whole.value) == (None, 0.0, 1.0, 0.0)
     moved = set_value(scene, played, whole, 0.2)
     assert shift_of(moved)[0] != shift_of(played)[0]
-    home = set_value(scene, moved, freedoms(moved)[0], 1.0)
+    home = set_value(scene, moved, parameters(moved)[0], 1.0)
     np.testing.assert_allclose(shift_of(home), shift_of(played), atol=1e-6)
 
 
 def test_the_toy_scene_has_a_slider_for_every_number_it_draws() -> None:
     scene = toy_scene()
     played = random_state(scene, 0)
-    found = freedoms(played)
+    found = parameters(played)
     assert [(f.low, f.high) for f in found] == [(-1.0, 1.0)] * 3 + [(0.5, 3.0)]
     assert found[-1].name == "lift"
-    for freedom in found:
-        moved = set_value(scene, played, freedom, freedom.high)
+    for parameter in found:
+        moved = set_value(scene, played, parameter, parameter.high)
         points = scene.rest.segments[3].vertices
         assert np.abs(moved.deformations[3](points) - played.deformations[3](points)).max() > 0.01
 
 
 def test_built_in_scenes_name_their_sliders() -> None:
-    robot = [(f.group, f.name, f.low, f.high) for f in freedoms(random_state(load_scene("robot"), 0))]
+    robot = [(f.group, f.name, f.low, f.high) for f in parameters(random_state(load_scene("robot"), 0))]
     assert [name for _, name, _, _ in robot] == [*(f"angles {k}" for k in range(1, 7)), "opening"]
     assert robot[0][2:] == (-170.0, 170.0)
-    (cycle,) = freedoms(random_state(load_scene("engine"), 0))
+    (cycle,) = parameters(random_state(load_scene("engine"), 0))
     assert (cycle.name, cycle.unit) == ("cycle", "°")
     assert (cycle.low, cycle.high) == pytest.approx((0.0, 720.0))
-    rope = freedoms(random_state(load_scene("rope"), 3))
+    rope = parameters(random_state(load_scene("rope"), 3))
     assert {"coil start", "coil rate", "coil pitch"} <= {f.name for f in rope}

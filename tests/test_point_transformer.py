@@ -13,17 +13,18 @@ from torch import Tensor
 from toy_data import NAMES, write_toy_dataset
 from training_runs import assert_resumes_exactly
 
-from mereo.evaluation.sample_views import truth_grid
+from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.scoring import TestCase, score_cases
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.models.config import NetworkConfig
 from mereo.models.encoders.point_transformer import PointTransformer, TransitionDown, VectorAttention
 from mereo.models.network import Network
 from mereo.models.ops.neighbors import distinct_distances, nearest
 from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import reconstruct
 from mereo.training import trainer
-from mereo.training.config import PRESETS, AugmentConfig, NetworkConfig
+from mereo.training.config import PRESETS, AugmentConfig
 
 TINY = NetworkConfig(
     encoder="point-transformer",

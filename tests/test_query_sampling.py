@@ -10,6 +10,7 @@ from mereo.experiments.paper.sampling_figure import Polygons2D, read_outlines
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.synthesis import query_sampling
+from mereo.synthesis.config import SamplingConfig
 from mereo.synthesis.label_rules import Shape, owner_labels
 from mereo.synthesis.query_sampling import (
     Samples,
@@ -21,7 +22,6 @@ from mereo.synthesis.query_sampling import (
     sort_sample,
     volume_uniform,
 )
-from mereo.training.config import SamplingConfig
 
 
 def square(low: float, high: float, shift: float = 0.0) -> np.ndarray:

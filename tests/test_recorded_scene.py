@@ -8,8 +8,8 @@ from scene_files import write_bar
 
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.files.check import check_scene
-from mereo.scenes.scene import load_scene
-from mereo.training.config import TEST_SEED_START
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START
 
 FRAMES = 10
 

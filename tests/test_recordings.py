@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.io.config import InputConfig
 from mereo.io.intrinsics import CameraWarning
 from mereo.io.readers import read_intrinsics
 from mereo.io.ros_recordings import recorded_frame, recorded_frames
-from mereo.reconstruction.config import InputConfig
 from mereo.reconstruction.observation import read_observation
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")

@@ -17,8 +17,9 @@ from mereo.geometry.mesh import PALETTE
 from mereo.io.config import FilesConfig
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct, write_reconstruction
+from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.reconstruction.segment_statistics import segment_points
+from mereo.visualization.result_files import write_reconstruction
 
 NAMES = ("big", "small")
 BIG, SMALL = ((0.1, 0.2, 0.5), 0.06), ((0.1, 0.2905, 0.5), 0.03)

@@ -10,7 +10,8 @@ from mereo.deformation.maps import jacobian
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.scenes.builtin import _robot_parts as parts
 from mereo.scenes.builtin import robot
-from mereo.scenes.scene import State, load_scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import State
 
 LINKS = ("base", "column", "upper_arm", "elbow", "forearm", "wrist", "hand")
 

@@ -10,7 +10,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids
 from mereo.scenes.builtin import rope
-from mereo.scenes.scene import load_scene
+from mereo.scenes.registry import load_scene
 
 STATES = 100
 

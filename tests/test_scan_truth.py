@@ -24,7 +24,9 @@ from mereo.geometry.solids import Solids
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.models.weights import load_model
 from mereo.scenes import assets
-from mereo.scenes.scene import Scene, load_scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.visualization.result_files import evaluate_on_scans
 
 pytest.importorskip("small_gicp", reason="the extra align is not installed")
 
@@ -69,7 +71,7 @@ def oracle(folder: Path, shift_mm: float) -> Scores:
     truth = read_truth(folder / "truth").truth
     solids, shift = Solids(truth), np.array([shift_mm, 0.0, 0.0])
     model = AnalyticModel.of(lambda points: 5.0 * np.eye(3)[solids.label(points - shift)], truth.names)
-    evaluation = evaluate_scans(model, folder / f"test{shift_mm}", truths=[folder / "truth"], cells=20)
+    evaluation = evaluate_on_scans(model, folder / f"test{shift_mm}", truths=[folder / "truth"], cells=20)
     assert list(evaluation.examples) == ["truth"]
     written = json.loads((folder / f"test{shift_mm}/metrics.json").read_text())
     assert written["iou"] == evaluation.scores.iou and written["scans"] == ["truth"]

@@ -10,8 +10,8 @@ from shapes import ball
 from test_scene_file import CODE
 
 from mereo.evaluation.scoring import trained_scene
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
-from mereo.training.config import GenerateConfig, SamplingConfig
 
 SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 

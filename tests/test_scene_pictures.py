@@ -9,7 +9,8 @@ from PIL import Image
 from toy_scene import toy_scene
 
 from mereo.cli.scene_commands import ScenePreview
-from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.registry import SCENES
+from mereo.scenes.scene import Scene
 from mereo.visualization import scene_previews
 from mereo.visualization.scene_previews import SIZE, preview_all, scene_row
 

@@ -11,13 +11,15 @@ from solid_pairs import crowded
 
 from mereo.deformation.maps import invert, jacobian_determinant
 from mereo.geometry.camera import Camera
+from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids, label_grid
-from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.scenes.scene import SCENES, Scene, State, Workspace, load_scene, look_at
+from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
+from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.scene import Scene, State, Workspace
+from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_rendering import render_depth
-from mereo.training.config import MIN_POINTS, GenerateConfig
 
 STATES, MANY_STATES, CAMERAS = 12, 200, 50
 

@@ -10,10 +10,10 @@ from shapes import ball, box, one
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.synthesis.config import SENSOR_TERMS, SensorModel
+from mereo.synthesis.config import SENSOR_TERMS, SENSORS, SensorConfig, SensorModel
 from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
 from mereo.synthesis.depth_sensor import (
-    Observation,
+    SimulatedView,
     axial_std_m,
     check_sensor,
     dropout_probability,
@@ -24,7 +24,6 @@ from mereo.synthesis.depth_sensor import (
     sample_mask,
     smooth_field,
 )
-from mereo.training.config import SENSORS, SensorConfig
 
 CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
 RAYS = CAMERA.directions()
@@ -47,7 +46,7 @@ def slant(tilt_deg: float) -> np.ndarray:
     return np.arccos(np.abs(RAYS @ normal) / np.linalg.norm(RAYS, axis=-1))
 
 
-def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object) -> Observation:
+def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object) -> SimulatedView:
     return observe(solids, CAMERA, noise_std, replace(OFF, **terms), np.random.default_rng(seed))  # type: ignore[arg-type]
 
 

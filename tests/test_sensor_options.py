@@ -12,11 +12,10 @@ from toy_scene import toy_scene
 import mereo.__main__ as command_line
 from mereo.cli import commands
 from mereo.evaluation import scoring
-from mereo.evaluation.scoring import evaluate_weights
-from mereo.synthesis.config import SENSOR_TERMS
+from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
 from mereo.synthesis.depth_sensor import check_sensor
 from mereo.synthesis.shards import generate
-from mereo.training.config import SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
+from mereo.visualization.result_files import evaluate_weights
 
 SMALL = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
 BASICS = "generate rope --examples 7 --output out"

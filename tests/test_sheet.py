@@ -7,7 +7,7 @@ from solid_pairs import crowded
 from mereo.deformation.maps import Deformation, jacobian
 from mereo.scenes.builtin import sheet
 from mereo.scenes.builtin._sheet_parts import THICKNESS, middle_points
-from mereo.scenes.scene import load_scene
+from mereo.scenes.registry import load_scene
 
 
 def underside_share(deformation: Deformation) -> float:

@@ -17,9 +17,10 @@ from mereo.evaluation.scoring import evaluate
 from mereo.io.simulation_states import TetrahedralRecord, read_states
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis import shards
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
-from mereo.training.config import TEST_SEED_START, GenerateConfig, SamplingConfig
 
 SHIPPED = Path(__file__).parents[1] / "src/mereo/states/liver.npz"
 

@@ -12,9 +12,11 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.network import Network
 from mereo.models.template_lookup import RestLookup
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
-from mereo.synthesis.examples import example_rng, synthesize
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import synthesize
 from mereo.synthesis.shards import generate
-from mereo.training.config import PRESETS, GenerateConfig, SamplingConfig
+from mereo.training.config import PRESETS
 from mereo.training.dataset import Dataset
 
 TINY = PRESETS["tiny"].network

@@ -17,12 +17,12 @@ from PIL import Image
 from toy_scene import rest_mesh, toy_scene
 
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.labels import LabelGrid
 from mereo.models.model import Answer, Model
 from mereo.models.network import Network
-from mereo.reconstruction.isosurfaces import LabelGrid
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.training.config import PRESETS
-from mereo.visualization.viewer import html, stage
+from mereo.visualization.viewer import display, html
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
@@ -55,7 +55,7 @@ def toy_inspection() -> Told:
 
 @pytest.fixture
 def server() -> Iterator[object]:
-    started = stage.start_server(0, "mereo")
+    started = display.start_server(0, "mereo")
     yield started
     started.stop()
 
@@ -111,7 +111,7 @@ def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object)
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as answer:
         assert answer.status == 200
     with pytest.raises(OSError, match=f"port {port} is taken or not allowed; choose another one with --port"):
-        stage.start_server(port, "mereo")
+        display.start_server(port, "mereo")
 
 
 @needs_viser

@@ -12,7 +12,7 @@ import numpy as np
 from safetensors.numpy import save_file
 
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
-from mereo.training.config import TEMPLATE
+from mereo.synthesis.config import TEMPLATE
 
 NAMES = ("left", "right")
 SHARD = 32

@@ -3,9 +3,8 @@
 import numpy as np
 import trimesh
 
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.reconstruction.isosurfaces import LabelGrid
-from mereo.reconstruction.segment_statistics import SegmentedCloud
 
 NAMES = ("zebra head", "lost", "Öhrchen")
 COLORS = ((86, 180, 233), (9, 9, 9), (3, 7, 255))

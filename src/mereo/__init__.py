@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from mereo.models.model import Model as Model
     from mereo.models.weights import load_model as load_model
     from mereo.reconstruction.pipeline import reconstruct as reconstruct
-    from mereo.reconstruction.pipeline import write_reconstruction as write_reconstruction
-    from mereo.scenes.scene import load_scene as load_scene
+    from mereo.scenes.registry import load_scene as load_scene
     from mereo.synthesis.examples import synthesize as synthesize
+    from mereo.visualization.result_files import write_reconstruction as write_reconstruction
 
 _HOME = {
     "Camera": "geometry.camera",
@@ -32,13 +32,13 @@ _HOME = {
     "SegmentedMesh": "geometry.mesh",
     "evaluate": "evaluation.scoring",
     "load_model": "models.weights",
-    "load_scene": "scenes.scene",
+    "load_scene": "scenes.registry",
     "read_camera": "io.readers",
     "read_depth_image": "io.readers",
     "read_point_cloud": "io.readers",
     "reconstruct": "reconstruction.pipeline",
     "synthesize": "synthesis.examples",
-    "write_reconstruction": "reconstruction.pipeline",
+    "write_reconstruction": "visualization.result_files",
 }
 """The module of each public name."""
 

@@ -18,8 +18,9 @@ from mereo.cli.bench_command import BenchCommand
 from mereo.cli.experiment_command import Experiment
 from mereo.cli.release_command import Release
 from mereo.cli.stream_command import StreamCommand
-from mereo.cli.view_command import View
-from mereo.training.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
+from mereo.cli.view_command import ViewCommand
+from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
+from mereo.training.config import PRESETS, TrainConfig
 
 Choice = TypeVar("Choice")
 
@@ -118,7 +119,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
         | Annotated[Align, subcommand("align")]
-        | Annotated[View, subcommand("view")]
+        | Annotated[ViewCommand, subcommand("view")]
         | Annotated[StreamCommand, subcommand("stream")]
         | Annotated[commands.Export, subcommand("export")]
         | Annotated[Experiment, subcommand("experiment")]

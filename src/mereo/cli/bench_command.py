@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mereo.training.config import Precision, PresetName
+from mereo.models.config import Precision
+from mereo.training.config import PresetName
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mereo.io.config import FilesConfig
+from mereo.io.config import FilesConfig, InputConfig
 from mereo.models.config import EXACT, InferenceConfig
-from mereo.reconstruction.config import InputConfig, IsolationConfig
-from mereo.training.config import GenerateConfig, PresetName, Sensor, SensorConfig, TrainConfig
+from mereo.reconstruction.config import IsolationConfig
+from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
+from mereo.training.config import PresetName, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -168,19 +169,15 @@ class Evaluate:
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
 
     def run(self) -> None:
-        from mereo.evaluation.scoring import evaluate_weights, markdown_table
+        from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
 
         settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)
         if self.scans is not None:
-            from mereo.evaluation.scan_scoring import evaluate_scans
             from mereo.models.weights import load_for
 
             if settings != GenerateConfig():
                 raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
-
-            print(
-                markdown_table(evaluate_scans(load_for(self.weights, self.inference), self.output, truths=self.scans))
-            )
+            evaluate_on_scans(load_for(self.weights, self.inference), self.output, truths=self.scans)
             return
         evaluate_weights(
             self.weights,
@@ -221,7 +218,7 @@ class Reconstruct:
     force: bool = False
 
     def run(self) -> None:
-        from mereo.reconstruction.pipeline import reconstruct_file
+        from mereo.cli.reconstruct import reconstruct_file
 
         reconstruct_file(
             self.input,

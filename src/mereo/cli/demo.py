@@ -9,16 +9,18 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.sample_views import TruthGrid, load_frame, truth_grid
+from mereo.evaluation.sample_views import load_frame
 from mereo.evaluation.scans import bunny_scan, scan_in_camera
 from mereo.evaluation.scoring import grid_confusion, predict_grid
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo.reconstruction.config import Frame
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct, segment_names, write_reconstruction
+from mereo.reconstruction.pipeline import Reconstruction, reconstruct, segment_names
 from mereo.scenes.assets import AssetUnavailable
+from mereo.visualization.result_files import write_reconstruction
 
 REAL_SCAN = "bun000"
 FRAMES = ("liver", "rope")
@@ -54,7 +56,7 @@ class Case:
     title: str
     weights: str
     cloud: PointCloud
-    frame: Frame
+    frame: CloudAxes
     camera_cloud: PointCloud
     truth: TruthGrid
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import torch
 
-from mereo.models.device import bfloat16_gain, pick_device, pick_precision
+from mereo.models.device import bfloat16_gain, cpu_features, pick_device, pick_precision
 
 PURPOSES: dict[str, str] = {
     "view": "the pages of `mereo view`",
@@ -102,26 +102,6 @@ def _bfloat16() -> str:
     device = pick_device()
     verdict = "does not pay here" if pick_precision("auto", device) is None else "pays here"
     return verdict if device.type == "cuda" else f"{verdict}: {bfloat16_gain():.1f} times float32"
-
-
-def cpu_features() -> dict[str, bool | None]:
-    """Instruction sets that decide the speed; None where this torch cannot tell."""
-    probes = {
-        "avx2": "_is_avx2_supported",
-        "avx512": "_is_avx512_supported",
-        "avx512_bf16": "_is_avx512_bf16_supported",
-        "amx": "_is_amx_tile_supported",
-    }
-    return {name: _ask_torch(function) for name, function in probes.items()}
-
-
-def _ask_torch(function: str) -> bool | None:
-    """The probes are private functions of torch: they come and go, and must never stop the report."""
-    probe = getattr(torch.cpu, function, None)
-    try:
-        return None if probe is None else bool(probe())
-    except (RuntimeError, AttributeError):
-        return None
 
 
 def _extras() -> Iterator[str]:

@@ -12,7 +12,7 @@ class SceneList:
     """Name the built-in scenes."""
 
     def run(self) -> None:
-        from mereo.scenes.scene import SCENES
+        from mereo.scenes.registry import SCENES
 
         for name in SCENES:
             print(name)
@@ -77,7 +77,7 @@ class ScenePreview:
     seed: int = 0
 
     def run(self) -> None:
-        from mereo.scenes.scene import load_scene
+        from mereo.scenes.registry import load_scene
         from mereo.visualization.previews import preview_scene
         from mereo.visualization.scene_previews import preview_all
 
@@ -108,7 +108,7 @@ class SceneExport:
 
         from mereo.io.writers.glb import write_segments_glb
         from mereo.io.writers.ply import write_segments_ply
-        from mereo.scenes.scene import load_scene
+        from mereo.scenes.registry import load_scene
 
         suffix = self.output.suffix.lower()
         if suffix not in (".ply", ".glb"):

@@ -8,10 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mereo.io.config import InputConfig
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
-from mereo.reconstruction.config import InputConfig, IsolationConfig
+from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.reconstruction.stream import Counter, Outcome, Summary, stream
 from mereo.reconstruction.stream_sources import STANDARD_INPUT, frames_of

@@ -6,8 +6,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig
-from mereo.reconstruction.config import InputConfig, IsolationConfig
+from mereo.reconstruction.config import IsolationConfig
 
 
 @dataclass(frozen=True)

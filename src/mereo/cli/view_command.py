@@ -6,12 +6,13 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig
-from mereo.reconstruction.config import InputConfig, IsolationConfig
+from mereo.reconstruction.config import IsolationConfig
 
 
 @dataclass(frozen=True)
-class View:
+class ViewCommand:
     """Look at a frame and its reconstruction in a browser, or move a scene by hand (--scene): needs the extra `view`.
 
     Attributes:

@@ -8,56 +8,25 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
-from jaxtyping import Bool
 
+from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.solids import label_grid
+from mereo.geometry.labels import LabelGrid
 from mereo.io.atomic_files import atomic_file
-from mereo.reconstruction.isosurfaces import LabelGrid
-from mereo.scenes.scene import load_scene
-from mereo.synthesis.examples import example_rng, sample_view
-from mereo.training.config import TEST_SEED_START, GenerateConfig
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
 
 SHIPPED = Path(__file__).parents[1] / "frames"
 
-BOX_MARGIN = 0.25
-"""The paper's boxes are enlarged by 50 %: by a quarter of their size on each side."""
 
 DEPTH_STEP = 0.005
 """Depth is stored as whole multiples of this many scene units, a twentieth of the sensor's noise."""
 
 
 @dataclass(frozen=True, eq=False)
-class TruthGrid:
-    """The right answer for an evaluation (paper, appendix B).
-
-    Attributes:
-        grid: true labels at the centres of the cells into which the joint box of all segments is divided.
-        kept: which of them count: those in the enlarged box of at least one segment.
-    """
-
-    grid: LabelGrid
-    kept: Bool[np.ndarray, "x y z"]
-
-
-def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:
-    """Divide the joint box of all segments into ``cells`` ** 3 cells and label their centres."""
-    low, high = mesh.bounds
-    spacing = (high - low) / cells
-    origin = low + spacing / 2
-    x, y, z = (origin[axis] + np.arange(cells) * spacing[axis] for axis in range(3))
-    kept = np.zeros((cells, cells, cells), dtype=bool)
-    for segment in mesh.segments:
-        first, last = segment.bounds
-        margin = BOX_MARGIN * (last - first)
-        inside = [(c >= a) & (c <= b) for c, a, b in zip((x, y, z), first - margin, last + margin, strict=True)]
-        kept[np.ix_(*inside)] = True
-    return TruthGrid(LabelGrid(label_grid(mesh, x, y, z), origin, spacing, mesh.names), kept)
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
+class SampleView:
     """One view with its truth.
 
     Attributes:
@@ -72,7 +41,7 @@ class Frame:
     truth: TruthGrid
 
 
-def make_frame(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> Frame:
+def make_frame(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> SampleView:
     """Example 0 of a test seed, its depth rounded as ``save_frame`` stores it."""
     view = sample_view(load_scene(scene).for_seed(seed), GenerateConfig(), example_rng(seed, 0))
     rounded = np.rint(view.depth.depth / DEPTH_STEP)
@@ -81,10 +50,10 @@ def make_frame(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> Fra
             f"scene {scene!r} is {view.depth.depth.max():.4g} units away; a frame stores up to {65535 * DEPTH_STEP:g}: "
             "move its camera workspace closer"
         )
-    return Frame(scene, seed, DepthImage(rounded * DEPTH_STEP, view.depth.camera), truth_grid(view.mesh, cells))
+    return SampleView(scene, seed, DepthImage(rounded * DEPTH_STEP, view.depth.camera), truth_grid(view.mesh, cells))
 
 
-def save_frame(path: str | Path, frame: Frame) -> None:
+def save_frame(path: str | Path, frame: SampleView) -> None:
     """Write a compressed .npz (about 50 kB): 16-bit depth, intrinsics, true labels."""
     camera, grid = frame.depth.camera, frame.truth.grid
     with atomic_file(path) as partial:
@@ -110,7 +79,7 @@ def shipped_frames() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.npz")))
 
 
-def load_frame(name: str | Path) -> Frame:
+def load_frame(name: str | Path) -> SampleView:
     """A shipped frame by name, or a file. Raises ``FileNotFoundError`` or ``ValueError``."""
     shipped = SHIPPED / f"{name}.npz"
     path = shipped if shipped.is_file() else Path(name)
@@ -125,10 +94,10 @@ def load_frame(name: str | Path) -> Frame:
         raise ValueError(f"{path} is not a frame of mereo ({error}); write it with `save_frame`") from None
 
 
-def _frame(stored: dict[str, np.ndarray]) -> Frame:
+def _frame(stored: dict[str, np.ndarray]) -> SampleView:
     height, width = stored["depth"].shape
     camera = Camera(width, height, *(float(value) for value in stored["intrinsics"]))
     names = tuple(str(name) for name in stored["names"])
     grid = LabelGrid(stored["labels"], stored["origin"], stored["spacing"], names)
     depth = DepthImage(stored["depth"] * float(stored["depth_step"]), camera)
-    return Frame(str(stored["scene"]), int(stored["seed"]), depth, TruthGrid(grid, stored["kept"]))
+    return SampleView(str(stored["scene"]), int(stored["seed"]), depth, TruthGrid(grid, stored["kept"]))

@@ -3,22 +3,18 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.registration.truth_file import read_truth
-from mereo.evaluation.sample_views import truth_grid
 from mereo.evaluation.scans import SCANS, PosedScan, bunny_posed
-from mereo.evaluation.scoring import CELLS, Evaluation, TestCase, check_names, score_cases, write_evaluation
-from mereo.io.atomic_files import new_directory
+from mereo.evaluation.scoring import CELLS, Evaluation, TestCase, check_names, score_cases
 from mereo.models.model import Model
 
 
-def evaluate_scans(
-    model: Model, output: str | Path | None = None, *, truths: Sequence[str | Path] = (), cells: int = CELLS
-) -> Evaluation:
-    """Scores on real scans; writes what ``evaluate_weights`` does when ``output`` is given.
+def evaluate_scans(model: Model, *, truths: Sequence[str | Path] = (), cells: int = CELLS) -> Evaluation:
+    """Scores on real scans.
 
     Args:
         model: the trained model.
-        output: folder to create.
         truths: truth files, or their folders, of ``mereo align``; none means the four scans of the bunny.
         cells: of the grid along each axis.
 
@@ -33,12 +29,7 @@ def evaluate_scans(
         )
     for scan in scans:
         check_names(model, scan.truth.names)
-    evaluation = score_cases(model, lambda index: _case(scans[index], cells), len(scans), progress=False)
-    if output is not None:
-        with new_directory(output) as directory:
-            facts = {"scans": names, "truths": [str(path) for path in truths], "trained": model.provenance}
-            write_evaluation(directory, evaluation, facts)
-    return evaluation
+    return score_cases(model, lambda index: _case(scans[index], cells), len(scans), progress=False)
 
 
 def _case(scan: PosedScan, cells: int) -> TestCase:

@@ -1,53 +1,60 @@
-"""Range scans: from a scanner's frame to a camera's, and the four real scans of the Stanford bunny with their truth.
+"""Range scans: the four real ones of the Stanford bunny with their truth.
 
 Scanner frame: x right, y up, z toward the scanner, the origin somewhere near the object. The scans' poses are known, so
 the rest-pose segments of the scene "bunny", brought into a scan's frame, are its exact answer.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
 
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import Normalizer, rigid, transform_points
+from mereo.geometry.scanner_axes import into_camera
+from mereo.geometry.transforms import transform_points
 from mereo.io.readers import read_point_cloud
-from mereo.reconstruction.config import Frame
 from mereo.scenes import assets
 
-SCANS = tuple(assets.BUNNY_SCAN_POSES)
+
+def _pose(*rows: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
+    pose = np.array([*rows, (0.0, 0.0, 0.0, 1.0)])
+    pose.setflags(write=False)
+    return pose
+
+
+BUNNY_SCAN_POSES: Mapping[str, Float[np.ndarray, "4 4"]] = MappingProxyType(
+    {
+        "bun000": _pose((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
+        "bun090": _pose(
+            (-0.003101617, 0.000374929, 0.99999512, 2.2076e-05),
+            (-0.001326438, 0.999999048, -0.000379044, -3.3461e-05),
+            (-0.99999431, -0.001327608, -0.003101117, -7.2088e-05),
+        ),
+        "bun270": _pose(
+            (0.000263461, -0.00406004, -0.999991723, 0.000130273),
+            (0.005368373, 0.999977354, -0.004058567, 1.5862e-05),
+            (0.999985555, -0.005367259, 0.000285251, 0.000406764),
+        ),
+        "chin": _pose(
+            (0.909091601, -0.175642136, -0.37775958, 0.00435102),
+            (-0.200252705, 0.610904628, -0.765959783, 0.0882863),
+            (0.365309888, 0.771974984, 0.520195453, -0.108853),
+        ),
+    }
+)
+"""``T_model_scan`` of each scan: scanner coordinates (metres, y up, z toward the scanner) to those of ``bunny.off``.
+
+The file published with the scans stores conjugated quaternions; these matrices have been corrected, and the scans lie
+within 0.1 mm (median) of the mesh. Rotations are given to nine decimals, so orthonormal to about 1e-6.
+"""
+
+
+SCANS = tuple(BUNNY_SCAN_POSES)
 """Names of the bunny's scans."""
-
-SCANNER_TO_CAMERA = np.diag([1.0, -1.0, -1.0])
-"""Half a turn about x; its own inverse."""
-
-VIEW_DISTANCE = 8.5
-"""Assumed distance of a scanner, in half longest sides of the visible part: within the range of the training views.
-
-Anything from 7 to 16 gives the bunny's scans the same IoU to 0.002."""
-
-
-def scanner_to_camera(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-    """``T_camera_scanner`` that turns a scan into a camera frame and puts it on the optical axis.
-
-    The network looks along lines of sight from the camera, but a scan does not say where the scanner stood; it is
-    assumed ``VIEW_DISTANCE`` away, in front of the middle of the cloud. Raises ``ValueError`` for a cloud without
-    extent.
-    """
-    normalizer = Normalizer.fit(points)
-    target = np.array([0.0, 0.0, VIEW_DISTANCE / normalizer.scale])
-    return rigid(SCANNER_TO_CAMERA, target - SCANNER_TO_CAMERA @ normalizer.center)
-
-
-def into_camera(points: Float[np.ndarray, "n 3"], frame: Frame) -> Float[np.ndarray, "4 4"]:
-    """``T_camera_input`` of a cloud in either frame; see ``scanner_to_camera``."""
-    return scanner_to_camera(points) if frame == "scanner" else np.eye(4)
-
-
-def camera_axes(frame: Frame) -> Float[np.ndarray, "4 4"]:
-    """Turns a frame's axes into a camera's, about its own origin: for looking, where the distance does not matter."""
-    return rigid(SCANNER_TO_CAMERA if frame == "scanner" else np.eye(3), np.zeros(3))
 
 
 def bunny_scan(name: str) -> tuple[PointCloud, Float[np.ndarray, "4 4"]]:
@@ -57,7 +64,7 @@ def bunny_scan(name: str) -> tuple[PointCloud, Float[np.ndarray, "4 4"]]:
     """
     if name not in SCANS:
         raise ValueError(f"there is no scan {name!r}; it must be one of {', '.join(SCANS)}: check the spelling")
-    return read_point_cloud(assets.get(f"bunny/{name}.ply")), assets.BUNNY_SCAN_POSES[name]
+    return read_point_cloud(assets.get(f"bunny/{name}.ply")), BUNNY_SCAN_POSES[name]
 
 
 def bunny_truth(name: str) -> SegmentedMesh:
@@ -72,7 +79,7 @@ def bunny_truth(name: str) -> SegmentedMesh:
     T_model_scene[:3, :3] /= scale
     T_model_scene[:3, 3] = center
     # the published rotations are orthonormal to 1e-6 only, so a general inverse
-    return rest_mesh().transformed(np.linalg.inv(assets.BUNNY_SCAN_POSES[name]) @ T_model_scene)
+    return rest_mesh().transformed(np.linalg.inv(BUNNY_SCAN_POSES[name]) @ T_model_scene)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +96,7 @@ class PosedScan:
     name: str
     cloud: PointCloud
     truth: SegmentedMesh
-    frame: Frame
+    frame: CloudAxes
 
     def in_camera(self) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
         """Cloud and truth in a camera frame, and ``T_camera_scan``."""

@@ -6,37 +6,34 @@ IoU and mIoU come from it, and the mean over single examples is reported beside 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from rich.console import Console
 from rich.progress import track
 
+from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
-from mereo.evaluation.sample_views import TruthGrid, truth_grid
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
-from mereo.io.atomic_files import new_directory, write_json
-from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
-from mereo.models.weights import load_for
 from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 from mereo.reconstruction.pipeline import segment_names
-from mereo.scenes.scene import SCENES, Scene, load_scene
-from mereo.synthesis.examples import example_rng, sample_view
-from mereo.training.config import TEST_SEED_START, GenerateConfig
-from mereo.visualization.error_maps import ErrorCase, error_picture
-from mereo.visualization.evaluation_report import write_evaluation_report
-
-CELLS = 100
-"""The paper's grid along each axis."""
+from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
 
 PICTURES = 4
 """The first few examples are drawn with their errors."""
+
+
+CELLS = 100
+"""The paper's grid along each axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +45,27 @@ class TestCase:
     name: str
     cloud: PointCloud
     truth: TruthGrid
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedView:
+    """One row of the paper's figure of reconstructions.
+
+    Attributes:
+        name: the label at the left.
+        cloud: the input.
+        reference, predicted: labels on the same grid; 0 is empty space.
+        origin, spacing: voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the cloud's frame.
+        colors: of the segments; label k has ``colors[k - 1]``.
+    """
+
+    name: str
+    cloud: PointCloud
+    reference: UInt8[np.ndarray, "x y z"]
+    predicted: UInt8[np.ndarray, "x y z"]
+    origin: Float[np.ndarray, "3"]
+    spacing: Float[np.ndarray, "3"]
+    colors: Sequence[Color]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +83,7 @@ class Evaluation:
     names: tuple[str, ...]
     confusion: Int[np.ndarray, "c c"]
     examples: dict[str, Scores]
-    cases: tuple[ErrorCase, ...] = field(default=())
+    cases: tuple[EvaluatedView, ...] = field(default=())
     segmented: bool = True
 
     @property
@@ -176,7 +194,7 @@ def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progr
     names, colors = segment_names(model)
     total = np.zeros((len(names) + 1,) * 2, dtype=np.int64)
     examples: dict[str, Scores] = {}
-    pictures: list[ErrorCase] = []
+    pictures: list[EvaluatedView] = []
     for one, predicted in _predictions(model, case, count, progress):
         confusion = grid_confusion(one.truth, predicted, len(names))
         total += confusion
@@ -184,14 +202,6 @@ def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progr
         if len(pictures) < PICTURES:
             pictures.append(_picture_case(one, predicted, colors))
     return Evaluation(names, total, examples, tuple(pictures), model.segmented)
-
-
-def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> ErrorCase:
-    """Only points that count are shown."""
-    grid = one.truth.grid
-    reference = np.minimum(grid.labels, np.uint8(len(colors)))
-    shown = np.where(one.truth.kept, predicted, np.uint8(0))
-    return ErrorCase(one.name, one.cloud, reference, shown, grid.origin, grid.spacing, colors)
 
 
 def _predictions(
@@ -203,47 +213,6 @@ def _predictions(
 
 
 # --- results ---------------------------------------------------------------------------------------------------------
-
-
-def evaluate_weights(
-    weights: str | Path,
-    output: str | Path,
-    *,
-    examples: int = 128,
-    seed: int = TEST_SEED_START,
-    scene: str | None = None,
-    cells: int = CELLS,
-    settings: GenerateConfig | None = None,
-    inference: InferenceConfig = EXACT,
-) -> Evaluation:
-    """``mereo evaluate``: write metrics.json, table.md, errors.png, report.html; print the table."""
-    with new_directory(output) as directory:
-        model = load_for(weights, inference)
-        settings = settings or GenerateConfig()
-        evaluation = evaluate(model, scene, examples=examples, seed=seed, cells=cells, progress=True, settings=settings)
-        facts = {
-            "weights": str(weights),
-            "scene": scene or trained_scene(model),
-            "seed": seed,
-            "noise_std": settings.noise_std,
-            "sensor": asdict(settings.sensor),
-            "device": model.device.type,
-            "precision": model.working_precision,
-            "trained": model.provenance,
-        }
-        write_evaluation(directory, evaluation, facts)
-    print(markdown_table(evaluation))
-    print(f"wrote {output}")
-    return evaluation
-
-
-def write_evaluation(directory: Path, evaluation: Evaluation, facts: dict[str, Any]) -> None:
-    """metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON."""
-    found = metrics(evaluation, facts)
-    write_json(directory / "metrics.json", found)
-    (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
-    error_picture(directory / "errors.png", evaluation.cases)
-    write_evaluation_report(directory / "report.html", found, evaluation.cases[0].colors, directory / "errors.png")
 
 
 def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
@@ -279,3 +248,11 @@ def markdown_table(evaluation: Evaluation) -> str:
 
 def _rounded(score: float) -> str:
     return "-" if np.isnan(score) else f"{score:.3f}"
+
+
+def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> EvaluatedView:
+    """Only points that count are shown."""
+    grid = one.truth.grid
+    reference = np.minimum(grid.labels, np.uint8(len(colors)))
+    shown = np.where(one.truth.kept, predicted, np.uint8(0))
+    return EvaluatedView(one.name, one.cloud, reference, shown, grid.origin, grid.spacing, colors)

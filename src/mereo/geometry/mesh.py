@@ -211,3 +211,12 @@ def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray,
     v = np.einsum("ni,ni->n", np.cross(points - a, c - a), normal) / size
     w = np.einsum("ni,ni->n", np.cross(b - a, points - a), normal) / size
     return np.stack([1 - v - w, v, w], axis=1)
+
+
+def vertex_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
+    """Unit normals, outward, weighted by the area of the faces around."""
+    a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
+    normals = np.zeros_like(segment.vertices)
+    for k in range(3):
+        np.add.at(normals, segment.faces[:, k], np.cross(b - a, c - a))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

@@ -23,7 +23,7 @@ import yaml
 from jaxtyping import Float
 
 from mereo.geometry.camera import Camera
-from mereo.io.mesh_formats import readable
+from mereo.io.errors import readable
 
 NAMED = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
 """Focal lengths and principal point: plain, RealSense, nerfstudio."""

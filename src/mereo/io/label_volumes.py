@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.io.mesh_formats import readable
+from mereo.io.errors import readable
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
 

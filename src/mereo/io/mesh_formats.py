@@ -1,7 +1,5 @@
 """Segmented meshes from files: one file with named parts, several files, or a directory with one file per segment."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -11,30 +9,12 @@ import trimesh
 from jaxtyping import Float, Int
 
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.io.errors import readable
 
 VIEWER_ROOT = "camera_frame"
 """Name of the root node of our own GLB files; below it, vertices are in the input's camera frame."""
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf")
-
-
-@contextmanager
-def readable(path: Path, kind: str) -> Iterator[None]:
-    """Refuse missing and empty files, and turn a library's exception into one sentence."""
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; a {kind} is needed: check the path")
-    if path.is_dir():
-        raise ValueError(f"{path} is a directory; a {kind} is needed: name a file in it")
-    if path.stat().st_size == 0:
-        raise ValueError(f"{path} is empty (0 bytes); a {kind} is needed: export or download it again")
-    try:
-        yield
-    except (MemoryError, ImportError):
-        raise
-    except Exception as error:
-        # a library's text may be several sentences: its first line is the reason
-        detail = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
-        raise ValueError(f"{path} cannot be read as a {kind} ({detail}): export or download it again") from error
 
 
 def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:

@@ -13,8 +13,9 @@ from PIL import Image
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.depth_formats import DEPTH_READERS, metres, read_raw_depth
+from mereo.io.errors import readable
 from mereo.io.intrinsics import Intrinsics, read_camera, read_intrinsics
-from mereo.io.mesh_formats import read_segmented_mesh, readable
+from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.point_cloud_formats import CLOUD_READERS
 
 __all__ = [

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from mereo.io.mesh_formats import readable
+from mereo.io.errors import readable
 
 FRAME_SUFFIXES = (".npz", ".ply", ".obj", ".stl", ".off")
 TETRAHEDRAL = ("rest_nodes", "tetrahedra", "nodes", "displacements")

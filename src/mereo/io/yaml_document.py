@@ -2,14 +2,16 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import (
+    BaseModel,
+    ValidationError,
+)
 from pydantic_core import ErrorDetails
-
-from mereo.scenes.files.schema import similar
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -170,3 +172,9 @@ def _inner(schema: dict[str, Any], block: dict[str, Any], step: int | str) -> di
         found: dict[str, Any] = schema["$defs"][inner["$ref"].rpartition("/")[2]]
         return found
     return inner
+
+
+def similar(word: str, known: list[str]) -> str:
+    """ "did you mean ...?" for a misspelt word, else what is known."""
+    close = get_close_matches(word, known, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"

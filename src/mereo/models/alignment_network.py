@@ -16,10 +16,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mereo.models.config import NetworkConfig
 from mereo.models.decoder import ConditionedMLP
 from mereo.models.encoders.pointnet2 import PointNet2
 from mereo.models.rigid_alignment import Alignment, fit_rigid
-from mereo.training.config import NetworkConfig
 
 
 class Aligned(NamedTuple):

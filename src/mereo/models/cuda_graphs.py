@@ -18,9 +18,9 @@ from torch import Tensor
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.models.config import MOST_ORDERED
 from mereo.models.decoder import Code
 from mereo.models.model import Model, check_enough
-from mereo.models.ops.limits import MOST_ORDERED
 from mereo.models.ops.neighbors import gpu_kernels
 
 SIZES = (4096, 10_000, 40_000)

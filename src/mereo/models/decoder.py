@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mereo.models.config import NetworkConfig
 from mereo.models.device import exact
 from mereo.models.encoders.encoding import Encoding, Level
 from mereo.models.ops.neighbors import gather, nearest
 from mereo.models.rigid_alignment import Alignment
 from mereo.models.template_lookup import RestLookup
-from mereo.training.config import NetworkConfig
 
 
 @dataclass(frozen=True, eq=False)

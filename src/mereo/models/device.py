@@ -10,8 +10,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from mereo.models.config import Device
-from mereo.training.config import Precision
+from mereo.models.config import Device, Precision
 
 
 def pick_device(rank: int = 0) -> torch.device:
@@ -94,3 +93,23 @@ def keep_freed_memory() -> None:
     trim_threshold, mmap_max = -1, -4  # M_TRIM_THRESHOLD, M_MMAP_MAX in malloc.h
     mallopt(mmap_max, 0)
     mallopt(trim_threshold, 2**31 - 1)
+
+
+def cpu_features() -> dict[str, bool | None]:
+    """Instruction sets that decide the speed; None where this torch cannot tell."""
+    probes = {
+        "avx2": "_is_avx2_supported",
+        "avx512": "_is_avx512_supported",
+        "avx512_bf16": "_is_avx512_bf16_supported",
+        "amx": "_is_amx_tile_supported",
+    }
+    return {name: _ask_torch(function) for name, function in probes.items()}
+
+
+def _ask_torch(function: str) -> bool | None:
+    """The probes are private functions of torch: they come and go, and must never stop the report."""
+    probe = getattr(torch.cpu, function, None)
+    try:
+        return None if probe is None else bool(probe())
+    except (RuntimeError, AttributeError):
+        return None

@@ -15,14 +15,15 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.geometry.mesh import Color
-from mereo.geometry.transforms import Normalizer
+from mereo.geometry.normalizer import Normalizer
 from mereo.models.batch_norm_fusion import fold_batch_norm
+from mereo.models.config import Precision
 from mereo.models.decoder import Code, Prediction
 from mereo.models.device import pick_precision
 from mereo.models.network import Network
-from mereo.training.config import MIN_POINTS, Precision
 
 SURE_LOGIT = 20.0
 """Lead of empty space where there can be nothing; trained networks reach about this in plainly empty space."""

@@ -7,12 +7,12 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mereo.models.alignment_network import AlignmentNet
+from mereo.models.config import NetworkConfig
 from mereo.models.decoder import Code, Decoder, Prediction
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.encoders.build import make_encoder
 from mereo.models.encoders.encoding import Encoding
 from mereo.models.rigid_alignment import Alignment
-from mereo.training.config import NetworkConfig
 
 ALIGNED_QUERIES = 128
 """Queries per example that train the alignment: neighbours say much the same about a nearly rigid motion."""

@@ -1,41 +1,7 @@
-"""Settings of reading a frame and of getting the object out of it; light, so that the command line may import them."""
+"""Settings of getting the object out of a frame; light, so that the command line may import them."""
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
-
-Frame = Literal["camera", "scanner"]
-"""Axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner."""
-
-
-@dataclass(frozen=True)
-class InputConfig:
-    """How a frame is read.
-
-    Attributes:
-        intrinsics: the depth camera, JSON or YAML; recordings have their own.
-        depth_scale: pixel value of one metre; by default what the intrinsics say, else 1000 (floats: 1).
-        mask: image that is not 0 on the object.
-        frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
-        drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
-        unit_m: metres per unit of a point cloud: 0.001 for millimetres; by default 1 (ZDF: 0.001).
-        topic: of a ROS recording; by default its first depth image topic, else its first cloud topic.
-        frame_index: which frame of a ROS recording, from 0, or of an intrinsics file that describes many.
-    """
-
-    intrinsics: Path | None = None
-    depth_scale: float | None = None
-    mask: Path | None = None
-    frame: Frame = "camera"
-    drop_invalid: bool = False
-    unit_m: float | None = None
-    topic: str | None = None
-    frame_index: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.unit_m is not None and not 0 < self.unit_m < math.inf:
-            raise ValueError(f"the unit is {self.unit_m} m; it must be positive: give 0.001 for millimetres")
 
 
 @dataclass(frozen=True)

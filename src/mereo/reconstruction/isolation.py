@@ -16,10 +16,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mereo.geometry.camera import DepthImage, PointCloud
+from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, spacing, thin_to_grid
 from mereo.geometry.plane_fitting import largest_plane
-from mereo.reconstruction.config import Frame, IsolationConfig
-from mereo.training.config import MIN_POINTS
+from mereo.reconstruction.config import IsolationConfig
 
 PLANE_SPACINGS = 3.0
 """Half the thickness of a plane in the middle of the cloud; the noise of depth cameras is a few pixels wide."""
@@ -71,7 +71,7 @@ def isolate(
     seen: PointCloud | DepthImage,
     config: IsolationConfig,
     unit_m: float = 1.0,
-    frame: Frame = "camera",
+    frame: CloudAxes = "camera",
     rng: np.random.Generator | None = None,
 ) -> tuple[PointCloud, tuple[IsolationStep, ...]]:
     """The points of the object, and what each step left out.
@@ -117,7 +117,7 @@ def _numbers(position: Float[np.ndarray, "3"]) -> str:
 
 
 def _steps(
-    config: IsolationConfig, unit_m: float, frame: Frame, rng: np.random.Generator
+    config: IsolationConfig, unit_m: float, frame: CloudAxes, rng: np.random.Generator
 ) -> Iterator[tuple[str, Step]]:
     """The steps that are on, in their order: what is cheap and sure comes first."""
     if config.depth_range is not None:
@@ -139,7 +139,7 @@ def _steps(
 # --- steps -----------------------------------------------------------------------------------------------------------
 
 
-def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, frame: Frame, rng: np.random.Generator) -> Keep:
+def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, frame: CloudAxes, rng: np.random.Generator) -> Keep:
     tolerance = np.full(len(points), PLANE_SPACINGS * spacing(points))
     middle = np.median(points[:, 2])
     if frame == "camera" and middle > 0:  # what lies behind the camera is refused later

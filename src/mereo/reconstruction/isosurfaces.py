@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from skimage.measure import marching_cubes
 
+from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh
 from mereo.reconstruction.coarse_to_fine import Field, Sampled, sample_coarse_to_fine, sample_dense
 
@@ -27,37 +28,6 @@ LOCATE_CELLS = 48
 
 GROWTHS = 6
 """How often a box may grow."""
-
-
-@dataclass(frozen=True, eq=False)
-class LabelGrid:
-    """Labels on a regular grid.
-
-    Attributes:
-        labels: 0 is empty space, k is ``names[k - 1]``.
-        origin: position of the centre of voxel [0, 0, 0].
-        spacing: between voxel centres along x, y, z.
-        names: of the segments.
-    """
-
-    labels: UInt8[np.ndarray, "x y z"]
-    origin: Float[np.ndarray, "3"]
-    spacing: Float[np.ndarray, "3"]
-    names: tuple[str, ...]
-
-    def axes(self) -> tuple[Float[np.ndarray, " x"], Float[np.ndarray, " y"], Float[np.ndarray, " z"]]:
-        """Coordinates of the voxel centres along each axis."""
-        x, y, z = (self.origin[i] + np.arange(self.labels.shape[i]) * self.spacing[i] for i in range(3))
-        return x, y, z
-
-    def positions(self, index: Int[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Centres of voxels given by their index."""
-        return self.origin + index * self.spacing
-
-    def touched_sides(self) -> Bool[np.ndarray, "2 3"]:
-        """Whether a segment reaches the grid's lower and upper border along x, y, z."""
-        ends = [[np.take(self.labels, end, axis=axis).any() for axis in range(3)] for end in (0, -1)]
-        return np.array(ends, dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)

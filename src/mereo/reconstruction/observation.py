@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.io.config import InputConfig
 from mereo.io.depth_formats import is_depth_image, metres, read_raw_depth
-from mereo.io.mesh_formats import readable
+from mereo.io.errors import readable
 from mereo.io.readers import read_intrinsics, read_point_cloud, usable_depth, valid_points
 from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frame
-from mereo.reconstruction.config import Frame, InputConfig, IsolationConfig
+from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import IsolationStep, isolate
 
 UNITS_M = {".zdf": 0.001}
@@ -47,7 +49,7 @@ class Observation:
     source: str
     cloud: PointCloud
     unit_m: float
-    frame: Frame
+    frame: CloudAxes
     whole: tuple[int, tuple[float, float, float]]
     steps: tuple[IsolationStep, ...] = ()
 

@@ -6,38 +6,24 @@ Everything that comes out is in the input's frame and units.
 """
 
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from rich.console import Console
-from rich.table import Table
 
-from mereo.evaluation.scans import camera_axes, into_camera
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
+from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.io.atomic_files import new_directory
-from mereo.io.config import DEFAULT_FILES, FilesConfig
-from mereo.io.writers.formats import Results, chosen_formats, write_formats
-from mereo.io.writers.glb import viewer_rotation
-from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
-from mereo.models.weights import load_for
 from mereo.reconstruction.coarse_to_fine import Field
-from mereo.reconstruction.config import Frame, InputConfig, IsolationConfig
-from mereo.reconstruction.isolation import STRAY_SHARE, stray_share
-from mereo.reconstruction.isosurfaces import LabelGrid, extract_whole, locate
-from mereo.reconstruction.observation import SizeWarning, read_observation, size_warning
-from mereo.reconstruction.segment_statistics import FoundSegment, SegmentedCloud, measure, segment_points
-from mereo.visualization.previews import render_cloud_and_segments
-from mereo.visualization.reconstruction_report import write_report
+from mereo.reconstruction.isosurfaces import extract_whole, locate
+from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Where segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one lies behind it."""
@@ -71,7 +57,7 @@ def reconstruct(
     cloud: PointCloud | Float[np.ndarray, "n 3"],
     model: Model,
     resolution: int = 128,
-    frame: Frame = "camera",
+    frame: CloudAxes = "camera",
     label_points: bool = False,
 ) -> Reconstruction:
     """All segments of the object that ``cloud`` shows.
@@ -144,127 +130,3 @@ def _turned_back(result: Reconstruction, T_scanner_camera: Float[np.ndarray, "4 
 
 
 # --- files -----------------------------------------------------------------------------------------------------------
-
-
-def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:
-    """What ``summary.json`` holds: ``facts``, then each segment and the stages' seconds."""
-    segments = [
-        {
-            "name": found.name,
-            "label": found.label,
-            "color": list(color),
-            "volume": found.volume,
-            "centroid": found.centroid.tolist(),
-            "box": found.box.tolist(),
-            "confidence": found.confidence,
-            "voxels": found.voxels,
-            "components": found.components,
-        }
-        for found, color in zip(result.segments, result.surfaces.colors, strict=True)
-    ]
-    return {
-        **facts,
-        "nested": [list(pair) for pair in result.surfaces.nested],
-        "spacing": float(result.labels.spacing[0]),
-        "evaluated_points": result.evaluated,
-        "clipped": result.clipped,
-        "segments": segments,
-        "timings_s": result.timings_s,
-    }
-
-
-def write_reconstruction(
-    result: Reconstruction,
-    cloud: PointCloud,
-    output_dir: str | Path,
-    *,
-    frame: Frame = "camera",
-    files: FilesConfig = DEFAULT_FILES,
-    unit_m: float = 1.0,
-    force: bool = False,
-    **facts: object,
-) -> None:
-    """Write preview.png, report.html and ``files`` into a new directory, all or nothing.
-
-    By default these are segments.glb, labels.npz and summary.json; ``mereo.io.writers.formats.WRITERS`` names all. The
-    format "points" needs ``reconstruct(..., label_points=True)``. ``facts`` (``title``, ``unit``, ...) are added to the
-    summary and shown in the report. Raises ``FileExistsError`` for a directory with content unless ``force``, and
-    ``ImportError`` where a format's extra is missing.
-    """
-    with new_directory(output_dir, force) as directory:
-        _write_files(directory, result, cloud, frame, files, unit_m, facts)
-
-
-def _write_files(
-    directory: Path,
-    result: Reconstruction,
-    cloud: PointCloud,
-    frame: Frame,
-    files: FilesConfig,
-    unit_m: float,
-    facts: dict[str, object],
-) -> None:
-    started = time.perf_counter()
-    formats = chosen_formats(files.formats)
-    to_viewer = viewer_rotation(frame)
-    results = Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, unit_m)
-    write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
-    to_camera = camera_axes(frame)
-    seen = PointCloud(transform_points(to_camera, cloud.points))
-    title = str(facts.get("title", "mereo reconstruction"))
-    render_cloud_and_segments(directory / "preview.png", seen, result.surfaces.transformed(to_camera), title)
-    timings_s = {**result.timings_s, "write": time.perf_counter() - started}
-    summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
-    write_report(directory / "report.html", cloud, result.surfaces, summary, to_viewer)
-    write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
-
-
-def reconstruct_file(
-    input: str | Path,
-    weights: str | Path,
-    output: str | Path,
-    *,
-    resolution: int = 128,
-    reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
-    isolation: IsolationConfig = IsolationConfig(),  # noqa: B008
-    inference: InferenceConfig = InferenceConfig(),  # noqa: B008
-    files: FilesConfig = DEFAULT_FILES,
-    force: bool = False,
-) -> Reconstruction:
-    """``mereo reconstruct``: read one frame of a sensor, reconstruct, write a new directory, print what was found."""
-    formats = chosen_formats(files.formats)  # a missing extra is said before the work, not after
-    with new_directory(output, force) as directory:
-        seen = read_observation(input, reading, isolation)
-        print(seen)
-        apart = 0.0 if isolation.largest_cluster else stray_share(seen.cloud)
-        if apart > STRAY_SHARE:
-            print(f"{apart:.1%} of it lies apart from the largest group; if that is not the object: --largest-cluster")
-        model = load_for(weights, inference)
-        warning = size_warning(seen, model.provenance)
-        if warning is not None:
-            warnings.warn(warning, SizeWarning, stacklevel=2)
-        result = reconstruct(seen.cloud, model, resolution, seen.frame, label_points="points" in formats)
-        facts = {"title": seen.source, "weights": str(weights), "resolution": resolution, "points": len(seen.cloud)}
-        facts |= {"device": model.device.type, "precision": model.working_precision}
-        _write_files(directory, result, seen.cloud, seen.frame, files, seen.unit_m, {**facts, **seen.facts()})
-    print_segments(result, f"{seen.source}, {len(seen.cloud)} points")
-    print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
-    return result
-
-
-def print_segments(result: Reconstruction, title: str) -> None:
-    """A table of the segments, and a line of the stages' seconds."""
-    table = Table(title=title, title_justify="left")
-    table.add_column("segment")
-    for column in ("volume", "confidence", "components", "centroid"):
-        table.add_column(column, justify="right")
-    for found in result.segments:
-        place = " ".join(f"{value:.4g}" for value in found.centroid)
-        row = (f"{found.volume:.4g}", f"{found.confidence:.2f}", str(found.components), place)
-        table.add_row(found.name, *(row if found.voxels else ("0", "not found", "0", "")))
-    console = Console()
-    console.print(table)
-    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in result.timings_s.items())
-    console.print(f"seconds: {stages}", highlight=False, soft_wrap=True)
-    if result.clipped:
-        console.print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")

@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy import ndimage
 from scipy.special import expit, logsumexp, softmax
 
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color, Segment
 from mereo.models.model import EncodedCloud, Model
-from mereo.reconstruction.isosurfaces import Extraction, LabelGrid
+from mereo.reconstruction.isosurfaces import Extraction
 
 CONFIDENCE_VOXELS = 2000
 """The confidence of a segment is a mean over at most this many of its voxels."""
@@ -37,28 +38,6 @@ class FoundSegment:
     confidence: float
     voxels: int
     components: int
-
-
-@dataclass(frozen=True, eq=False)
-class SegmentedCloud:
-    """The observed points and the segment that each lies on.
-
-    Attributes:
-        points: in the input's frame and units.
-        labels: of the most likely segment, from 1 up. Empty space does not compete: a point on the surface is half in
-            it, so it would win every second time.
-        confidence: probability of that segment among the segments.
-        occupancy: probability of any segment against empty space: about a half on the surface of the object, near 0 at
-            points that are not on it.
-        names, colors: of the segments; ``names[k]`` has label k + 1.
-    """
-
-    points: Float[np.ndarray, "n 3"]
-    labels: UInt8[np.ndarray, " n"]
-    confidence: Float[np.ndarray, " n"]
-    occupancy: Float[np.ndarray, " n"]
-    names: tuple[str, ...]
-    colors: tuple[Color, ...]
 
 
 def segment_points(

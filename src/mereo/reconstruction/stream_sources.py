@@ -7,10 +7,11 @@ from functools import partial
 from pathlib import Path
 
 from mereo.geometry.camera import PointCloud
+from mereo.io.config import InputConfig
 from mereo.io.depth_formats import is_depth_image
 from mereo.io.point_cloud_formats import CLOUD_READERS
 from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frames
-from mereo.reconstruction.config import InputConfig, IsolationConfig
+from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import isolate
 from mereo.reconstruction.observation import read_observation, recorded_points, recording_options
 from mereo.reconstruction.stream import StreamFrame

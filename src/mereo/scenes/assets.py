@@ -13,9 +13,6 @@ from pathlib import Path
 from types import MappingProxyType
 from urllib.parse import urlsplit
 
-import numpy as np
-from jaxtyping import Float
-
 MIRROR_VARIABLE = "MEREO_ASSETS"
 ANSWER_SECONDS = 4.0
 """A server that says nothing for this long counts as unreachable: no network is to be noticed at once."""
@@ -162,39 +159,6 @@ _ALL = (
 
 ASSETS: Mapping[str, Asset] = MappingProxyType({asset.name: asset for asset in _ALL})
 """Every downloadable file by name."""
-
-
-def _pose(*rows: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
-    pose = np.array([*rows, (0.0, 0.0, 0.0, 1.0)])
-    pose.setflags(write=False)
-    return pose
-
-
-BUNNY_SCAN_POSES: Mapping[str, Float[np.ndarray, "4 4"]] = MappingProxyType(
-    {
-        "bun000": _pose((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
-        "bun090": _pose(
-            (-0.003101617, 0.000374929, 0.99999512, 2.2076e-05),
-            (-0.001326438, 0.999999048, -0.000379044, -3.3461e-05),
-            (-0.99999431, -0.001327608, -0.003101117, -7.2088e-05),
-        ),
-        "bun270": _pose(
-            (0.000263461, -0.00406004, -0.999991723, 0.000130273),
-            (0.005368373, 0.999977354, -0.004058567, 1.5862e-05),
-            (0.999985555, -0.005367259, 0.000285251, 0.000406764),
-        ),
-        "chin": _pose(
-            (0.909091601, -0.175642136, -0.37775958, 0.00435102),
-            (-0.200252705, 0.610904628, -0.765959783, 0.0882863),
-            (0.365309888, 0.771974984, 0.520195453, -0.108853),
-        ),
-    }
-)
-"""``T_model_scan`` of each scan: scanner coordinates (metres, y up, z toward the scanner) to those of ``bunny.off``.
-
-The file published with the scans stores conjugated quaternions; these matrices have been corrected, and the scans lie
-within 0.1 mm (median) of the mesh. Rotations are given to nine decimals, so orthonormal to about 1e-6.
-"""
 
 
 def get(name: str) -> Path:

@@ -159,7 +159,7 @@ def _plain(values: Any) -> Any:
 
 
 def _trail() -> Trail:
-    """The calls from ``freedoms.play`` down to the recorder, which are what a draw is known by."""
+    """The calls from ``parameters.play`` down to the recorder, which are what a draw is known by."""
     frame: FrameType | None = sys._getframe(1)
     found: list[tuple[CodeType, int]] = []
     while frame is not None and frame.f_code.co_name != "play":

@@ -1,6 +1,6 @@
 """States of a scene as points of a cube: every number that the scene draws is one degree of freedom.
 
-    scene -play-> Played (its draws, its deformations) -freedoms-> Freedom, ... -set_value-> another Played
+    scene -play-> Played (its draws, its deformations) -parameters-> Parameter, ... -set_value-> another Played
 
 See ``mereo.scenes.draw_recorder`` for how draws are recorded, and docs/design/0013-viewer.md.
 """
@@ -16,8 +16,8 @@ from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
 from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Recorder, Shares
+from mereo.scenes.parameter_names import name_of
 from mereo.scenes.scene import Scene
-from mereo.visualization.viewer.parameter_names import name_of
 
 MANY = 48
 """An array of more numbers than this, or of more than ``MANY_NORMAL`` normal ones, gets one slider."""
@@ -62,7 +62,7 @@ class Played:
 
 
 @dataclass(frozen=True)
-class Freedom:
+class Parameter:
     """One degree of freedom.
 
     Attributes:
@@ -171,9 +171,9 @@ def _witness(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.nd
 # --- sliders ----------------------------------------------------------------------------------------------------------
 
 
-def freedoms(played: Played) -> tuple[Freedom, ...]:
+def parameters(played: Played) -> tuple[Parameter, ...]:
     """What can be moved in this state, in the order in which it is drawn, with names that differ within a group."""
-    found: list[Freedom] = []
+    found: list[Parameter] = []
     names = [name_of(call.trail) for call in played.calls]
     repeated = Counter(names)
     seen: Counter[tuple[str, str, str]] = Counter()
@@ -183,54 +183,54 @@ def freedoms(played: Played) -> tuple[Freedom, ...]:
         name = f"{name} {seen[named]}" if repeated[named] > 1 else name
         if _together(call):
             turn = played.turns.get(call.key, (0.0, call.shares))[0]
-            found.append(Freedom(call.key, None, group, name, " turns", 0.0, 1.0, turn))
+            found.append(Parameter(call.key, None, group, name, " turns", 0.0, 1.0, turn))
         else:
-            found += [_freedom(call, index, group, name, unit) for index in range(len(call.shares))]
-    return tuple(freedom for freedom in found if freedom.high > freedom.low)
+            found += [_parameter(call, index, group, name, unit) for index in range(len(call.shares))]
+    return tuple(parameter for parameter in found if parameter.high > parameter.low)
 
 
 def _together(call: Call) -> bool:
     return len(call.shares) > (MANY_NORMAL if call.kind == "normal" else MANY)
 
 
-def _freedom(call: Call, index: int, group: str, name: str, unit: str) -> Freedom:
+def _parameter(call: Call, index: int, group: str, name: str, unit: str) -> Parameter:
     if len(call.shares) > 1:
         name = f"{name} {'xyz'[index] if call.shape == (3,) and call.kind != 'permutation' else index + 1}"
     low, high, share = float(call.low[index]), float(call.high[index]), float(call.shares[index])
     if call.kind == "normal":
         value = float(np.clip(ndtri(share), -NORMAL_REACH, NORMAL_REACH))
-        return Freedom(call.key, index, group, name, " σ", -NORMAL_REACH, NORMAL_REACH, value)
+        return Parameter(call.key, index, group, name, " σ", -NORMAL_REACH, NORMAL_REACH, value)
     if call.kind in ("integers", "choice"):
         value = low + np.floor(share * (high - low))
-        return Freedom(call.key, index, group, name, "", low, high - 1, float(value), whole=True)
+        return Parameter(call.key, index, group, name, "", low, high - 1, float(value), whole=True)
     factor = 180 / np.pi if unit == "°" else 1.0
     low, high = sorted((low * factor, high * factor))
-    return Freedom(call.key, index, group, name, unit, low, high, low + share * (high - low))
+    return Parameter(call.key, index, group, name, unit, low, high, low + share * (high - low))
 
 
-def set_value(scene: Scene, played: Played, freedom: Freedom, value: float) -> Played:
+def set_value(scene: Scene, played: Played, parameter: Parameter, value: float) -> Played:
     """The state with one degree of freedom at another value, within its bounds.
 
     Draws that only the new state needs are random, and those of the old one are remembered for the way back. Raises
     ``Refused`` where the scene does not take the value.
     """
-    call = next(call for call in played.calls if call.key == freedom.key)
+    call = next(call for call in played.calls if call.key == parameter.key)
     turns = dict(played.turns)
-    if freedom.index is None:
+    if parameter.index is None:
         start = turns.get(call.key, (0.0, call.shares))[1]
         turns[call.key] = (value, start)
         shares = turned(start, value, crc32(repr(call.key).encode()) + played.seed)
     else:
         shares = call.shares.copy()
-        shares[freedom.index] = _share(call.kind, freedom, value)
+        shares[parameter.index] = _share(call.kind, parameter, value)
     given = {**played.remembered, call.key: shares}
     try:
         result = _played(scene, played.seed, given, turns, played)
     except (OutOfDraws, ValueError):  # a scene that gives up raises ValueError
-        raise Refused(_refusal(freedom)) from None
+        raise Refused(_refusal(parameter)) from None
     taken = next((c for c in result.calls if c.key == call.key), None)
     if taken is None or not np.allclose(taken.shares, shares, atol=1e-6):
-        raise Refused(_refusal(freedom))
+        raise Refused(_refusal(parameter))
     return result
 
 
@@ -246,17 +246,17 @@ def turned(shares: Shares, turn: float, seed: int) -> Shares:
     return moved
 
 
-def _share(kind: str, freedom: Freedom, value: float) -> float:
-    value = min(max(value, freedom.low), freedom.high)
+def _share(kind: str, parameter: Parameter, value: float) -> float:
+    value = min(max(value, parameter.low), parameter.high)
     if kind == "normal":
         return float(ndtr(value))
     if kind in ("integers", "choice"):
-        return float((np.rint(value) - freedom.low + 0.5) / (freedom.high - freedom.low + 1))
-    return float((value - freedom.low) / (freedom.high - freedom.low))
+        return float((np.rint(value) - parameter.low + 0.5) / (parameter.high - parameter.low + 1))
+    return float((value - parameter.low) / (parameter.high - parameter.low))
 
 
-def _refusal(freedom: Freedom) -> str:
+def _refusal(parameter: Parameter) -> str:
     return (
-        f"the scene refuses this value of {freedom.name!r}: with the other values as they are, its parts would touch, "
-        "or fold over; the last state that it allows is shown: move another slider first"
+        f"the scene refuses this value of {parameter.name!r}: with the other values as they are, its parts would "
+        "touch, or fold over; the last state that it allows is shown: move another slider first"
     )

@@ -2,22 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from importlib import import_module
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from mereo.deformation.maps import Deformation
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import rigid
-from mereo.training.config import TEST_SEED_START
-
-SCENES = (
-    *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
-    *("tumor", "liver-simulated"),
-)
-"""Built-in scenes, one module each in ``mereo.scenes.builtin``: the paper's ten, then ours."""
+from mereo.geometry.transforms import look_at, rotation_along
+from mereo.scenes.seeds import TEST_SEED_START
 
 PAPER_APERTURE_RAD = float(np.deg2rad(140.0))
 WHOLE_SPHERE_RAD = float(np.deg2rad(360.0))
@@ -56,32 +48,8 @@ class Workspace:
         """``T_world_camera`` of a camera aimed at ``target``, by its azimuth and the cosine of its tilt."""
         sine = np.sqrt(1.0 - cosine**2)
         local = np.array([sine * np.cos(azimuth_rad), sine * np.sin(azimuth_rad), cosine])
-        to_camera = _basis(np.asarray(self.axis, dtype=float)) @ local
+        to_camera = rotation_along(np.asarray(self.axis, dtype=float)) @ local
         return look_at(target + distance * to_camera, target, np.asarray(self.axis, dtype=float), roll_rad)
-
-
-def _basis(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """A rotation whose third column is ``axis``."""
-    z = axis / np.linalg.norm(axis)
-    helper = np.eye(3)[np.argmin(np.abs(z))]
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
-
-
-def look_at(
-    eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"], roll_rad: float = 0.0
-) -> Float[np.ndarray, "4 4"]:
-    """``T_world_camera`` at ``eye``, optical axis through ``target``, image up along ``up`` before the roll."""
-    z = target - eye
-    z = z / np.linalg.norm(z)
-    x = np.cross(z, up)
-    if np.linalg.norm(x) < 1e-6 * np.linalg.norm(up):  # looking along `up`: any horizon is as good
-        x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-    x = x / np.linalg.norm(x)
-    y = np.cross(z, x)
-    cosine, sine = np.cos(roll_rad), np.sin(roll_rad)
-    return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,28 +118,3 @@ class Scene:
             for index, piece in zip(members, pieces, strict=True):
                 moved[index] = piece
         return State(self.rest.with_vertices(moved), deformations)
-
-
-def is_yaml(scene: "str | Path | Scene") -> bool:
-    """Whether this names a YAML scene file."""
-    return isinstance(scene, str | Path) and Path(scene).suffix.lower() in (".yaml", ".yml")
-
-
-def load_scene(name: str | Path) -> Scene:
-    """A scene by its built-in name, or from a file: YAML (``scene_file``), or Python (``scene_code``), which is run.
-
-    Raises ``ValueError`` listing what there is for an unknown name, or saying what is wrong with a file;
-    ``FileNotFoundError`` where it, or a mesh that it names, does not exist.
-    """
-    if is_yaml(name):
-        scene: Scene = import_module("mereo.scenes.builtin.files.build").load(Path(name))
-    elif Path(name).suffix == ".py":
-        scene = import_module("mereo.scenes.builtin.files.python").load(Path(name))
-    elif name in SCENES:
-        scene = import_module(f"mereo.scenes.builtin.{str(name).replace('-', '_')}").scene()
-    else:
-        raise ValueError(
-            f"scene {str(name)!r} is unknown; it must be one of {', '.join(SCENES)}, or a file of your own (.yaml, as "
-            "`mereo scene new` writes it, or .py with a function scene()): check the spelling"
-        )
-    return scene

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 
 from mereo.geometry.raycasting import Hits, toward
 from mereo.geometry.solids import Solids
-from mereo.training.config import SensorConfig
+from mereo.synthesis.config import SensorConfig
 
 NOTHING, OBJECT, OCCLUDER, BACKGROUND = range(4)
 """What a pixel's ray meets first."""
@@ -76,7 +76,7 @@ def _entry(
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class Backdrop:
     """All points with ``normal @ point = offset``; ``offset`` is positive, so that the normal points away."""
 
     normal: Vector
@@ -94,7 +94,7 @@ class Surroundings:
     """All that is not the object."""
 
     occluders: tuple[Capsule, ...] = ()
-    background: Plane | None = None
+    background: Backdrop | None = None
 
     def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
         """Let what is nearer replace the hits of the object, in place; returns what each ray meets first."""
@@ -134,12 +134,12 @@ def sample_surroundings(
     return Surroundings(tuple(occluders), plane)
 
 
-def sample_plane(solids: Solids, unit: float, rng: np.random.Generator) -> Plane:
+def sample_plane(solids: Solids, unit: float, rng: np.random.Generator) -> Backdrop:
     """A table or wall behind the object: up to 45 degrees off the image plane, touching to 5 cm behind."""
     normal = _polar(np.tan(rng.uniform(0, np.pi / 4)), rng.uniform(0, 2 * np.pi))
     normal = normal / np.linalg.norm(normal)
     farthest = max(float((segment.vertices @ normal).max()) for segment in solids.mesh.segments)
-    return Plane(normal, farthest + rng.uniform(0, 0.05) * unit)
+    return Backdrop(normal, farthest + rng.uniform(0, 0.05) * unit)
 
 
 def _polar(radius: float, angle_rad: float) -> Vector:

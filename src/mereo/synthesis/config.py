@@ -1,7 +1,9 @@
-"""Settings of simulated depth cameras; a part of ``mereo.training.config``, which is where to import them from."""
+"""Settings of making examples: simulated depth cameras and query points; light, for the command line."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
+
+from tyro.conf import OmitArgPrefixes
 
 SensorModel = Literal["structured-light", "time-of-flight"]
 
@@ -87,3 +89,53 @@ SENSORS: dict[Sensor, SensorConfig] = {
         mask_shift_px=0.3,
     ),
 }
+
+
+TEMPLATE = "template.safetensors"
+"""A dataset's file with the segments at rest (``rest_pose``)."""
+
+
+Sampler = Literal["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"]
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """Where training queries are drawn (paper, section 3.2, "Sampling Method for Query Points").
+
+    Attributes:
+        sampler: one of the paper's three samplers, or the authors' later NestedSortSample.
+        per_segment: points kept for each segment, half inside and half outside except for volume-uniform.
+        oversample: SortSample's n / k; 1 keeps about all inside points, 2 points closer to the surface.
+        box_margin: each segment's box is extended by this fraction of its size, half on each side.
+        uniform_fraction: further points drawn uniformly in the joint box, as a fraction of all per-segment points.
+    """
+
+    sampler: Sampler = "sort-sample"
+    per_segment: int = 256
+    oversample: int = 1
+    box_margin: float = 0.5
+    uniform_fraction: float = 0.15
+
+    def total(self, segments: int) -> int:
+        """Number of queries of one example."""
+        return self.per_segment * segments + round(self.uniform_fraction * self.per_segment * segments)
+
+
+@dataclass(frozen=True)
+class GenerateConfig:
+    """How one example is made (paper, appendix B).
+
+    Attributes:
+        image_size: the depth image is square, in pixels.
+        noise_std: Gaussian noise on the depth, standard deviation in scene units.
+        points: the observed cloud is kept in farthest-point order, at most this many points.
+        sampling: where queries are drawn.
+        sensor: what else is wrong with the depth image; nothing in the paper.
+    """
+
+    image_size: int = 96
+    noise_std: float = 0.1
+    points: int = 1024
+    # the marker keeps --sampler short on the command line, where --sensor.axial keeps its prefix
+    sampling: OmitArgPrefixes[SamplingConfig] = field(default_factory=SamplingConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)

@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.raycasting import Hits
 from mereo.geometry.solids import Solids
 from mereo.synthesis.clutter import NOTHING, OBJECT, sample_surroundings
-from mereo.synthesis.config import SENSOR_TERMS, SensorModel
+from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
 from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
-from mereo.training.config import MIN_POINTS, SensorConfig
 
 STEEPEST_RAD = float(np.deg2rad(80.0))
 """The noise formulas have a pole at 90 degrees; surfaces seen at a larger angle count as seen at this one."""
@@ -37,7 +37,7 @@ PROBABILITIES = ("flying", "dropout", "tool", "hand", "background")
 
 
 @dataclass(frozen=True, eq=False)
-class Observation:
+class SimulatedView:
     """What a camera gives, and the truth about it.
 
     Attributes:
@@ -76,7 +76,7 @@ def check_sensor(sensor: SensorConfig) -> None:
 
 def observe(
     solids: Solids, camera: Camera, noise_std: float, sensor: SensorConfig, rng: np.random.Generator
-) -> Observation:
+) -> SimulatedView:
     """One picture of an object in the camera frame.
 
     The Gaussian noise of ``noise_std`` is drawn from ``rng`` itself, every other term from a stream of its own that is
@@ -88,7 +88,7 @@ def observe(
     check_sensor(sensor)
     if not sensor.on:
         image = add_depth_noise(render_depth(solids, camera), noise_std, rng)
-        return Observation(image, image.valid, np.where(image.valid, OBJECT, NOTHING).astype(np.uint8))
+        return SimulatedView(image, image.valid, np.where(image.valid, OBJECT, NOTHING).astype(np.uint8))
     streams = dict(zip(SENSOR_TERMS, rng.spawn(len(SENSOR_TERMS)), strict=True))
     hits, source = _look(solids, camera, sensor, streams)
     shape = (camera.height, camera.width)
@@ -103,7 +103,7 @@ def observe(
         depth = quantize(depth * sensor.metres_per_unit, sensor.quantization) / sensor.metres_per_unit
     missing = streams["dropout"].random(shape) < dropout_probability(angle_rad, sensor.dropout)
     missing |= sample_holes(depth, seen, camera.focal_x_px, sensor, streams["holes"])
-    return Observation(DepthImage(np.where(missing, 0.0, depth), camera), sample_mask(seen, sensor, streams), source)
+    return SimulatedView(DepthImage(np.where(missing, 0.0, depth), camera), sample_mask(seen, sensor, streams), source)
 
 
 # --- where rays go ----------------------------------------------------------------------------------------------------

@@ -15,15 +15,17 @@ from jaxtyping import Float, Int, UInt8
 
 from mereo.deformation.maps import Deformation, invert
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.geometry.mesh import SegmentedMesh, barycentric
+from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.solids import Nearest, Solids, signed_distance_and_direction
-from mereo.geometry.transforms import Normalizer, inverse_rigid, transform_points
+from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene
+from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.query_sampling import Samples, sample_queries
-from mereo.training.config import MIN_POINTS, GenerateConfig
 
 ATTEMPTS = 100
 """Views drawn before giving up on a scene."""
@@ -78,11 +80,6 @@ class Example:
     cloud: Float[np.ndarray, "p 3"]
     normalizer: Normalizer
     queries: LabelledPoints
-
-
-def example_rng(seed: int, index: int) -> np.random.Generator:
-    """The generator of example ``index``: any example can be remade alone, in any order, by any process."""
-    return np.random.default_rng(np.random.SeedSequence([seed, index]))
 
 
 def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> Example:

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.synthesis.config import SamplingConfig
 from mereo.synthesis.label_rules import Shape, owner_labels
-from mereo.training.config import SamplingConfig
 
 MAX_DRAWS = 2_000_000
 """Draws for one segment after which sampling gives up: its share of its box is too small to be sampled from."""

@@ -28,14 +28,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from mereo.io.atomic_files import atomic_file, write_json
+from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.rest_pose import rest_distances
-from mereo.scenes.scene import Scene, is_yaml, load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import TEMPLATE, GenerateConfig
 from mereo.synthesis.depth_sensor import check_sensor
-from mereo.synthesis.examples import Example, example_rng, synthesize
+from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.progress import progress
 from mereo.synthesis.query_sampling import check_settings
 from mereo.synthesis.workers import in_processes
-from mereo.training.config import TEMPLATE, TEST_SEED_START, GenerateConfig
 
 SHARD_SIZE = 64
 MANIFEST = "manifest.json"

@@ -14,7 +14,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from mereo.training.config import MIN_POINTS, TEMPLATE, AugmentConfig
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.synthesis.config import TEMPLATE
+from mereo.training.config import AugmentConfig
 
 
 @dataclass(frozen=True, eq=False)

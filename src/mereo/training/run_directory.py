@@ -11,10 +11,12 @@ import torch.distributed as dist
 from torch import Tensor
 
 from mereo.io.atomic_files import write_json
+from mereo.models.config import NetworkConfig
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
 from mereo.models.weights import load_model
-from mereo.training.config import TEMPLATE, AugmentConfig, NetworkConfig, TrainConfig
+from mereo.synthesis.config import TEMPLATE
+from mereo.training.config import AugmentConfig, TrainConfig
 from mereo.training.dataset import Dataset
 
 

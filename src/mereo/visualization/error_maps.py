@@ -1,14 +1,13 @@
 """The paper's error pictures: over- and under-reconstruction, and wrong segments (figure of section 4.2)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import gaussian_filter
 
-from mereo.geometry.camera import PointCloud
+from mereo.evaluation.scoring import EvaluatedView
 from mereo.geometry.mesh import Color
 from mereo.visualization.contact_sheets import Picture, cloud_picture, contact_sheet, name_plate, save_png
 from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
@@ -21,30 +20,9 @@ UNDER: Color = (245, 130, 20)
 WRONG: Color = (214, 39, 60)
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorCase:
-    """One row of the paper's figure of reconstructions.
-
-    Attributes:
-        name: the label at the left.
-        cloud: the input.
-        reference, predicted: labels on the same grid; 0 is empty space.
-        origin, spacing: voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the cloud's frame.
-        colors: of the segments; label k has ``colors[k - 1]``.
-    """
-
-    name: str
-    cloud: PointCloud
-    reference: UInt8[np.ndarray, "x y z"]
-    predicted: UInt8[np.ndarray, "x y z"]
-    origin: Float[np.ndarray, "3"]
-    spacing: Float[np.ndarray, "3"]
-    colors: Sequence[Color]
-
-
 def error_picture(
     path: str | Path,
-    cases: Sequence[ErrorCase],
+    cases: Sequence[EvaluatedView],
     direction: tuple[float, float, float] = (0.0, 0.0, 1.0),
     up: tuple[float, float, float] = (0.0, -1.0, 0.0),
     size: int = 240,
@@ -70,7 +48,7 @@ def error_picture(
 
 
 def _error_row(
-    case: ErrorCase, direction: tuple[float, float, float], up: tuple[float, float, float], size: int
+    case: EvaluatedView, direction: tuple[float, float, float], up: tuple[float, float, float], size: int
 ) -> list[Picture]:
     view = Viewpoint.along(_bounds(case), direction, up)
     grids = error_grids(case.reference, case.predicted)
@@ -105,7 +83,7 @@ def error_grids(
     }
 
 
-def _bounds(case: ErrorCase) -> Float[np.ndarray, "2 3"]:
+def _bounds(case: EvaluatedView) -> Float[np.ndarray, "2 3"]:
     """The box of the cloud and of every occupied voxel."""
     occupied = np.argwhere((case.reference > 0) | (case.predicted > 0))
     corners = [case.origin + (occupied + side) * case.spacing for side in (-0.5, 0.5)]
@@ -114,7 +92,7 @@ def _bounds(case: ErrorCase) -> Float[np.ndarray, "2 3"]:
 
 
 def _voxel_picture(
-    case: ErrorCase, grid: UInt8[np.ndarray, "x y z"], colors: Float[np.ndarray, "k 3"], view: Viewpoint, size: int
+    case: EvaluatedView, grid: UInt8[np.ndarray, "x y z"], colors: Float[np.ndarray, "k 3"], view: Viewpoint, size: int
 ) -> Picture:
     canvas = Canvas.empty(view, (size, size))
     if grid.any():

@@ -10,13 +10,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from mereo.evaluation.scoring import EvaluatedView
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.scenes.scene import Scene
-from mereo.synthesis.examples import View, example_rng, sample_view
-from mereo.training.config import GenerateConfig
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import View, sample_view
 from mereo.visualization.contact_sheets import (
     Picture,
     cloud_picture,
@@ -26,11 +28,11 @@ from mereo.visualization.contact_sheets import (
     legend,
     save_png,
 )
-from mereo.visualization.error_maps import ErrorCase, error_picture
+from mereo.visualization.error_maps import error_picture
 from mereo.visualization.renderer import Viewpoint, shade
 
 __all__ = [
-    "ErrorCase",
+    "EvaluatedView",
     "contact_sheet",
     "depth_to_rgb",
     "error_picture",

@@ -7,9 +7,11 @@ import numpy as np
 
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import transform_points
-from mereo.scenes.scene import SCENES, Scene, load_scene
-from mereo.synthesis.examples import example_rng, sample_view
-from mereo.training.config import GenerateConfig
+from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
 from mereo.visualization.contact_sheets import Picture, contact_sheet, depth_to_rgb, enlarge, save_png
 from mereo.visualization.renderer import Viewpoint, shade
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
-from mereo.geometry.mesh import Color, Segment, SegmentedMesh
+from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.solids import Solids
 from mereo.models.model import Answer
 from mereo.visualization.error_maps import OVER, UNDER
@@ -98,15 +98,6 @@ def _confidence(segment: Segment, labels: list[int], ask: Ask, step: float) -> F
     inside, outside = (ask(segment.vertices + sign * offset).probability[:, labels].sum(axis=1) for sign in (-1, 1))
     result: Float[np.ndarray, " v"] = np.clip(inside - outside, 0.0, 1.0).astype(np.float64)
     return result
-
-
-def vertex_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
-    """Unit normals, outward, weighted by the area of the faces around."""
-    a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
-    normals = np.zeros_like(segment.vertices)
-    for k in range(3):
-        np.add.at(normals, segment.faces[:, k], np.cross(b - a, c - a))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
 def observed_distance(surfaces: SegmentedMesh, observed: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, " _"]]:

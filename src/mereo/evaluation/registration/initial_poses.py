@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from mereo.evaluation.registration.placement import Start, scale_of
 from mereo.evaluation.registration.visible_surface import diagonal
-from mereo.evaluation.scans import into_camera
+from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
-from mereo.io.mesh_formats import readable
+from mereo.io.errors import readable
 from mereo.models.model import Model
-from mereo.reconstruction.config import Frame
 from mereo.scenes.rest_pose import rest_frame
 
 LEAST_PAIRS = 3
@@ -183,7 +183,7 @@ def misfit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -
 
 
 def start_from_model(
-    model: Model, points: Float[np.ndarray, "n 3"], frame: Frame, rest: SegmentedMesh, scale: float | None
+    model: Model, points: Float[np.ndarray, "n 3"], frame: CloudAxes, rest: SegmentedMesh, scale: float | None
 ) -> Start:
     """Poses from a trained network: where it believes the seen points were at rest, fitted segment by segment.
 

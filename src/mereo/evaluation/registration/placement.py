@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from mereo.evaluation.registration.icp import SEGMENT_LIMITS, WHOLE_LIMITS, Registration, Scan, match, register
 from mereo.evaluation.registration.visible_surface import CONTACT, Poses, diagonal, exposed, facing, moved
+from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
-from mereo.reconstruction.config import Frame
 
 FAR = 1000.0
 """A scanner's distance where the scan does not say it, in diagonals of the object."""
@@ -99,7 +99,7 @@ def scale_of(pose: Float[np.ndarray, "4 4"]) -> float:
     return float(np.cbrt(np.linalg.det(pose[:3, :3])))
 
 
-def viewpoint_of(points: Float[np.ndarray, "n 3"], frame: Frame, size: float) -> Float[np.ndarray, "3"]:
+def viewpoint_of(points: Float[np.ndarray, "n 3"], frame: CloudAxes, size: float) -> Float[np.ndarray, "3"]:
     """Where the scanner stood: the origin of a camera frame, far off along z of a scanner's."""
     return np.zeros(3) if frame == "camera" else points.mean(axis=0) + np.array([0.0, 0.0, FAR * size])
 
@@ -108,7 +108,7 @@ def place(
     rest: SegmentedMesh,
     points: Float[np.ndarray, "n 3"],
     start: Start,
-    frame: Frame = "camera",
+    frame: CloudAxes = "camera",
     *,
     as_one: bool = False,
     hold: Collection[str] = (),

@@ -12,12 +12,12 @@ import numpy as np
 from mereo.evaluation.registration.placement import Placement
 from mereo.evaluation.registration.visible_surface import diagonal, moved
 from mereo.evaluation.scans import PosedScan
+from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import write_json
-from mereo.io.mesh_formats import readable
+from mereo.io.errors import readable
 from mereo.io.readers import read_point_cloud
-from mereo.reconstruction.config import Frame
-from mereo.scenes.scene import SCENES, load_scene
+from mereo.scenes.registry import SCENES, load_scene
 
 TRUTH = "truth.json"
 FORMAT = 1
@@ -36,7 +36,7 @@ class ScanFile:
 
     path: Path
     unit: str = "m"
-    frame: Frame = "camera"
+    frame: CloudAxes = "camera"
     drop_invalid: bool = False
 
 

@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 from mereo.experiments.paper.result import Claim, Result, Row, better, published
-from mereo.experiments.paper.scales import Scale
+from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
-from mereo.training.config import PRESETS, Encoder, GenerateConfig, Loss, TrainConfig
+from mereo.models.config import Encoder
+from mereo.synthesis.config import GenerateConfig
+from mereo.training.config import PRESETS, Loss, TrainConfig
 
 OBJECTS = ("rope", "shapes", "robot", "lizard", "human")
 ENCODERS: tuple[Encoder, ...] = ("pointnet2", "point-transformer", "autodecoder")
@@ -42,7 +44,7 @@ def recipe(base: TrainConfig, encoder: Encoder, loss: Loss) -> TrainConfig | Non
     )
 
 
-def run(store: Store, scale: Scale) -> Result:
+def run(store: Store, scale: ExperimentScale) -> Result:
     """One training for each object, encoder and loss; by default one object, because there are eleven of them."""
     rows: list[Row] = []
     scores: dict[tuple[str, str, str], Score] = {}

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 from mereo.experiments.paper.result import Claim, Result, Row, published
-from mereo.experiments.paper.scales import Scale
+from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
-from mereo.training.config import GenerateConfig
+from mereo.synthesis.config import GenerateConfig
 
 OBJECTS = ("robot", "rope")
 """The paper's, and one more."""
@@ -14,7 +14,7 @@ LEVELS = (0.1, 0.5, 2.0)
 """Standard deviations in scene units."""
 
 
-def run(store: Store, scale: Scale) -> Result:
+def run(store: Store, scale: ExperimentScale) -> Result:
     """Three trainings and nine evaluations per object."""
     rows, claims = [], []
     scores: dict[tuple[str, float, float], Score] = {}

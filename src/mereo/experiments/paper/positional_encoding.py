@@ -3,14 +3,14 @@
 from dataclasses import replace
 
 from mereo.experiments.paper.result import Claim, Result, Row, better, published
-from mereo.experiments.paper.scales import Scale
+from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Store
-from mereo.training.config import GenerateConfig
+from mereo.synthesis.config import GenerateConfig
 
 OBJECTS = ("rope", "shapes", "lizard", "robot", "human")
 
 
-def run(store: Store, scale: Scale) -> Result:
+def run(store: Store, scale: ExperimentScale) -> Result:
     """Two trainings per object that differ in nothing else."""
     rows, holds = [], {}
     for scene in scale.choose(OBJECTS):

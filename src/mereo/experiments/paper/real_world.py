@@ -6,15 +6,15 @@ poses.
 
 from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.experiments.paper.result import Claim, Result, Row, published
-from mereo.experiments.paper.scales import Scale
+from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
 from mereo.models.weights import load_model
-from mereo.training.config import GenerateConfig
+from mereo.synthesis.config import GenerateConfig
 
 NOTES = ("The paper's figures are those of its printed lizard (15 scans), ours of the bunny (4 scans).",)
 
 
-def run(store: Store, scale: Scale) -> Result:
+def run(store: Store, scale: ExperimentScale) -> Result:
     """One training; the synthetic score beside the real one."""
     weights = store.run(store.dataset("bunny", GenerateConfig(), scale.examples), scale.recipe)
     synthetic = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)

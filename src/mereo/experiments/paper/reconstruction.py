@@ -1,18 +1,18 @@
 """Every object, reconstructed and segmented (paper, section 4.2 and appendix A)."""
 
+from mereo.evaluation.scoring import EvaluatedView
 from mereo.experiments.paper.result import Claim, Result, Row, published
-from mereo.experiments.paper.scales import Scale
+from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store, example_case
-from mereo.training.config import GenerateConfig
-from mereo.visualization.error_maps import ErrorCase
+from mereo.synthesis.config import GenerateConfig
 
 OBJECTS = ("rope", "shapes", "robot", "lizard", "sheet", "bunny", "human", "skull", "liver", "engine")
 
 
-def run(store: Store, scale: Scale) -> Result:
+def run(store: Store, scale: ExperimentScale) -> Result:
     """One training per object and recipe; with a rival recipe both are reported on the same data."""
     rows: list[Row] = []
-    cases: list[ErrorCase] = []
+    cases: list[EvaluatedView] = []
     ours: dict[str, Score] = {}
     recipes = {"recipe": scale.recipe} if scale.rival is None else {"paper": scale.recipe, "large": scale.rival}
     for scene in OBJECTS if scale.decides else scale.choose(OBJECTS):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 from mereo.experiments.paper.result import Result, write_result
-from mereo.experiments.paper.scales import SCALES, ExperimentName, Scale
+from mereo.experiments.paper.scales import SCALES, ExperimentName, ExperimentScale
 from mereo.experiments.paper.store import Store
 
 EXPERIMENTS = get_args(ExperimentName)
@@ -26,7 +26,7 @@ def run_experiment(name: str, scale: str, root: Path, workers: int = 1) -> Path:
     if scale not in SCALES:
         raise ValueError(f"scale {scale!r} is unknown; it must be one of {', '.join(SCALES)}: correct it")
     module = import_module(f"mereo.experiments.paper.{name.replace('-', '_')}")
-    run: Callable[[Store, Scale], Result] = module.run
+    run: Callable[[Store, ExperimentScale], Result] = module.run
     result = run(Store(root, workers), SCALES[scale])
     if not SCALES[scale].decides:
         untried = tuple(replace(claim, holds={}) for claim in result.claims)

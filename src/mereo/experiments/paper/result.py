@@ -13,9 +13,10 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from mereo.evaluation.scoring import EvaluatedView
 from mereo.experiments.paper.store import Score
 from mereo.io.atomic_files import atomic_file, new_directory, write_json
-from mereo.visualization.error_maps import ErrorCase, error_picture
+from mereo.visualization.error_maps import error_picture
 
 Figures = dict[str, float]
 """``iou`` and ``miou``, or only one of them."""
@@ -92,7 +93,7 @@ class Result:
     rows: tuple[Row, ...]
     claims: tuple[Claim, ...]
     notes: tuple[str, ...] = ()
-    cases: tuple[ErrorCase, ...] = ()
+    cases: tuple[EvaluatedView, ...] = ()
     figures: Mapping[str, Figure] = field(default_factory=dict)
 
 

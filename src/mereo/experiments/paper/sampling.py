@@ -6,9 +6,9 @@ import numpy as np
 
 from mereo.experiments.paper.result import Claim, Result, Row, better, published
 from mereo.experiments.paper.sampling_figure import draw_figure
-from mereo.experiments.paper.scales import Scale
+from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
-from mereo.training.config import GenerateConfig, Sampler, SamplingConfig
+from mereo.synthesis.config import GenerateConfig, Sampler, SamplingConfig
 
 OBJECTS = ("lizard", "human", "engine")
 
@@ -22,7 +22,7 @@ SETTINGS: dict[str, SamplingConfig] = {
 """The paper's three at n = k, what it describes besides, and its authors' later sampler."""
 
 
-def run(store: Store, scale: Scale) -> Result:
+def run(store: Store, scale: ExperimentScale) -> Result:
     """One training per object and sampler, with one recipe and one seed."""
     rows = []
     for scene in scale.choose(OBJECTS):

@@ -13,7 +13,7 @@ TRAINING_SEED = 1
 
 
 @dataclass(frozen=True)
-class Scale:
+class ExperimentScale:
     """A budget.
 
     Attributes:
@@ -56,9 +56,9 @@ _SHORT = replace(
 )
 
 _ALL = (
-    Scale("smoke", replace(_TINY, epochs=1, holdout=4), None, 64, 2, 24, 1, downloads=False, decides=False),
-    Scale("cpu", _SHORT, None, 1536, 32, 64, 2, downloads=True),
-    Scale("paper", _PAPER, PRESETS["large"], 28_800, 128, 100, None, downloads=True),
+    ExperimentScale("smoke", replace(_TINY, epochs=1, holdout=4), None, 64, 2, 24, 1, downloads=False, decides=False),
+    ExperimentScale("cpu", _SHORT, None, 1536, 32, 64, 2, downloads=True),
+    ExperimentScale("paper", _PAPER, PRESETS["large"], 28_800, 128, 100, None, downloads=True),
 )
 
 SCALES = {str(scale.name): scale for scale in _ALL}

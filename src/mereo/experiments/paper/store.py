@@ -11,15 +11,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mereo.evaluation.scoring import evaluate, evaluate_weights
+from mereo.evaluation.scoring import EvaluatedView, evaluate
 from mereo.experiments.paper.scales import TRAINING_SEED
 from mereo.io.atomic_files import write_json
 from mereo.models.weights import load_model
-from mereo.scenes.scene import load_scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.shards import MANIFEST, NOT_COMPARED, generate, make_manifest
-from mereo.training.config import TEST_SEED_START, GenerateConfig, TrainConfig
+from mereo.training.config import TrainConfig
 from mereo.training.trainer import train
-from mereo.visualization.error_maps import ErrorCase
+from mereo.visualization.result_files import evaluate_weights
 
 FINISHED = "finished.json"
 """Written into a run's folder after its last step."""
@@ -77,7 +79,7 @@ class Store:
         return read_score(path / "metrics.json")
 
 
-def example_case(weights: Path, settings: GenerateConfig, cells: int) -> ErrorCase:
+def example_case(weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
     """The first test view with its labels, for pictures."""
     evaluation = evaluate(load_model(weights), examples=1, cells=cells, settings=settings)
     return evaluation.cases[0]

@@ -7,18 +7,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mereo.evaluation.sample_views import Frame
+from mereo.evaluation.sample_views import SampleView
+from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import PALETTE
-from mereo.geometry.transforms import Normalizer
+from mereo.geometry.normalizer import Normalizer
 from mereo.models.model import Box, Model
 from mereo.models.network import Network
-from mereo.reconstruction.isosurfaces import LabelGrid
 from mereo.training.config import PRESETS
 
 STEPS, QUERIES = 200, 2048
 
 
-def fitted_model(preset: str, frame: Frame) -> Model:
+def fitted_model(preset: str, frame: SampleView) -> Model:
     """The preset's network, fitted to the labels of one frame in ``STEPS`` steps (seconds to a minute on a CPU).
 
     It knows nothing else: how long it takes can be measured with it, not how good it is.

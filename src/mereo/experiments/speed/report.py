@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from mereo.cli.doctor import cpu_features
-from mereo.evaluation.sample_views import Frame, load_frame, shipped_frames
+from mereo.evaluation.sample_views import SampleView, load_frame, shipped_frames
 from mereo.experiments.speed.fitted_model import fitted_model
 from mereo.experiments.speed.roofline import Machine, measure_machine
 from mereo.experiments.speed.stages import Bench, Stage, random_points
 from mereo.io.atomic_files import write_json
+from mereo.models.config import Precision
+from mereo.models.device import cpu_features
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo.training.config import Precision
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def benchmark(
     return stages
 
 
-def _subject(weights: str | None, preset: str) -> tuple[Model, Frame]:
+def _subject(weights: str | None, preset: str) -> tuple[Model, SampleView]:
     if weights is None:
         frame = load_frame(shipped_frames()[0])
         return fitted_model(preset, frame), frame
@@ -91,7 +91,7 @@ def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:
     }
 
 
-def _cost(exact: Model, fast: Model, frame: Frame) -> Cost:
+def _cost(exact: Model, fast: Model, frame: SampleView) -> Cost:
     cloud = frame.depth.to_points()
     points = random_points(frame, 40_000, seed=1)
     code = exact.encode(cloud)

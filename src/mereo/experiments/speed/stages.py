@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
-from mereo.evaluation.sample_views import Frame
+from mereo.evaluation.sample_views import SampleView
 from mereo.experiments.speed.baseline import Rival
 from mereo.experiments.speed.roofline import Machine, Work, count_operations, seconds
-from mereo.geometry.transforms import Normalizer
+from mereo.geometry.normalizer import Normalizer
 from mereo.models.cuda_graphs import StaticFrames
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import changing_cells, over_corners, sample_coarse_to_fine, sample_dense
@@ -53,7 +53,7 @@ class Bench:
     """
 
     model: Model
-    frame: Frame
+    frame: SampleView
     machine: Machine
     repeats: int = 7
     rival: bool = False
@@ -217,7 +217,7 @@ class Bench:
             raise RuntimeError(f"{wrong} of {len(ours)} labels differ between the model and the rival; they must agree")
 
 
-def random_points(frame: Frame, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+def random_points(frame: SampleView, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
     """Places in the box of the frame's object."""
     grid = frame.truth.grid
     return grid.origin + np.random.default_rng(seed).random((count, 3)) * grid.spacing * grid.labels.shape

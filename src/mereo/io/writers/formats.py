@@ -8,6 +8,7 @@ from typing import Any, get_args
 import numpy as np
 from jaxtyping import Float
 
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import write_json
 from mereo.io.config import FilesConfig, Format
@@ -18,8 +19,6 @@ from mereo.io.writers.ply import write_points_ply, write_segments_ply
 from mereo.io.writers.points import write_points_npz
 from mereo.io.writers.stl import write_segments_stl
 from mereo.io.writers.volumes import write_labels_npz, write_labels_vti
-from mereo.reconstruction.isosurfaces import LabelGrid
-from mereo.reconstruction.segment_statistics import SegmentedCloud
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
 from mereo.io.mesh_formats import VIEWER_ROOT
 from mereo.io.writers.segment_table import with_faces
-from mereo.reconstruction.config import Frame
 
 OUTER_OPACITY = 0.35
 """Of segments with others nested in them, which viewers draw see-through."""
@@ -21,7 +21,7 @@ GLTF_CAMERA_ROTATION = np.diag([1.0, -1.0, -1.0])
 """Half a turn about x: from the camera frame (y down, z forward) to glTF (y up, z toward the viewer)."""
 
 
-def viewer_rotation(frame: Frame) -> Float[np.ndarray, "3 3"]:
+def viewer_rotation(frame: CloudAxes) -> Float[np.ndarray, "3 3"]:
     """From the input's axes to glTF's, which a scanner's already are."""
     return GLTF_CAMERA_ROTATION if frame == "camera" else np.eye(3)
 

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.segment_table import segment_table
-from mereo.reconstruction.isosurfaces import LabelGrid
 
 MM_PER_M = 1000.0
 

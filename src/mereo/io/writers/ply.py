@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.segment_table import comment_lines, with_faces
-from mereo.reconstruction.segment_statistics import SegmentedCloud
 
 COLOR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 TYPES = {"u1": "uchar", "i4": "int", "f4": "float"}

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mereo.geometry.labels import SegmentedCloud
 from mereo.io.atomic_files import atomic_file
-from mereo.reconstruction.segment_statistics import SegmentedCloud
 
 
 def write_points_npz(path: str | Path, cloud: SegmentedCloud) -> None:

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
-from mereo.reconstruction.isosurfaces import LabelGrid
 
 VTI = """<?xml version="1.0"?>
 <VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64" \

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mereo.training.config import NetworkConfig
+from mereo.models.config import NetworkConfig
 
 CODES = "encoder.codes"
 """Name of the training examples' codes among a network's parameters."""

@@ -1,9 +1,9 @@
 """Point cloud encoders: each maps a normalized cloud to an ``Encoding``."""
 
+from mereo.models.config import NetworkConfig
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.encoders.point_transformer import PointTransformer
 from mereo.models.encoders.pointnet2 import PointNet2
-from mereo.training.config import NetworkConfig
 
 
 def make_encoder(config: NetworkConfig) -> PointNet2 | PointTransformer | Autodecoder:

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from mereo.models.config import NetworkConfig
 from mereo.models.encoders.encoding import Encoding, Level, SharedMLP
 from mereo.models.ops.neighbors import distinct_distances, gather
-from mereo.training.config import NetworkConfig
 
 STRIDE = 4
 """From one block to the next a quarter of the points stay."""

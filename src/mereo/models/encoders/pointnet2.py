@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mereo.models.config import NetworkConfig
 from mereo.models.encoders.encoding import Encoding, Level, SharedMLP, share
 from mereo.models.ops.neighbors import ball_query, gather
-from mereo.training.config import NetworkConfig
 
 
 class SetAbstraction(nn.Module):

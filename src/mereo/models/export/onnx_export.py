@@ -25,6 +25,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
+from mereo.geometry.conventions import MIN_POINTS
 from mereo.io.atomic_files import new_directory, write_json
 from mereo.models.decoder import Code
 from mereo.models.encoders.encoding import Level
@@ -32,7 +33,6 @@ from mereo.models.model import DENSE_FACTOR, Model
 from mereo.models.network import Network
 from mereo.models.rigid_alignment import Alignment
 from mereo.models.weights import load_model
-from mereo.training.config import MIN_POINTS
 
 FORMAT_VERSION = 1
 

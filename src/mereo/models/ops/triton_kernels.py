@@ -16,7 +16,7 @@ import triton.language as tl
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mereo.models.ops.limits import MOST_ORDERED
+from mereo.models.config import MOST_ORDERED
 
 MOST_COMPARED = 2048
 """Points that a query may be compared with."""

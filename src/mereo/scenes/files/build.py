@@ -15,13 +15,14 @@ from jaxtyping import Float
 from mereo.deformation import samplers as motion
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.mesh_check import examine
-from mereo.geometry.transforms import Normalizer
-from mereo.io.yaml_document import Document
-from mereo.scenes.files import schema as schema
-from mereo.scenes.files.schema import SceneFile, similar
+from mereo.geometry.normalizer import Normalizer
+from mereo.io.yaml_document import Document, similar
+from mereo.scenes.files import schema
+from mereo.scenes.files.schema import SceneFile
 from mereo.scenes.files.segments import read_segments
 from mereo.scenes.recorded_states import load_states
-from mereo.scenes.scene import SCENES, Scene, Workspace
+from mereo.scenes.registry import SCENES
+from mereo.scenes.scene import Scene, Workspace
 
 ELSEWHERE = {"source", "segments", "model", "parts", "labels", "names", "cells"}
 """Keys that decide the meshes, which identify themselves, or nothing."""

@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from mereo.geometry.camera import Camera
+from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, examine, likely_unit
 from mereo.geometry.mesh_repair import repaired, without_overlaps
@@ -16,10 +17,10 @@ from mereo.io.atomic_files import atomic_file
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read
 from mereo.scenes.files.rewrite import with_segment_files
-from mereo.scenes.files.schema import UNITS
 from mereo.scenes.files.segments import read_segments
-from mereo.scenes.scene import SCENES, Scene, is_yaml, load_scene
-from mereo.synthesis.examples import example_rng
+from mereo.scenes.registry import SCENES, is_yaml, load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
 
 STATES = 6
 """Random states in which segments of a user's scene are tested for overlap, and for being in view."""
@@ -48,7 +49,7 @@ def check_scene(name: str, repair: bool = False) -> None:
         file = read(document)
         mesh = read_segments(document, file)
         health = _examined(mesh)
-        unit = next((key for key, value in UNITS.items() if value == file.units), "unit")
+        unit = next((key for key, value in UNITS_M.items() if value == file.units), "unit")
         faults = _report(mesh, health, f"{unit}³")
         _report_size(mesh, file.units, unit)
         if faults and repair:

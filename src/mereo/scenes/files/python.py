@@ -5,7 +5,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.registry import SCENES
+from mereo.scenes.scene import Scene
 
 
 def load(path: Path) -> Scene:

@@ -4,21 +4,19 @@ Lengths and places are in the file's own unit and frame, those of its meshes; th
 scene units, the unit of datasets and weights. Angles are in degrees. ``docs/own-object.md`` explains every key.
 """
 
-from difflib import get_close_matches
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
 
-UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
-"""Metres per unit."""
+from mereo.geometry.conventions import UNITS_M
 
 
 def _unit_m(value: object) -> object:
     """Metres per unit, of a unit's name."""
-    if isinstance(value, str) and value in UNITS:
-        return UNITS[value]
+    if isinstance(value, str) and value in UNITS_M:
+        return UNITS_M[value]
     if isinstance(value, str):
-        raise ValueError(f"it must be one of {', '.join(UNITS)}, or a number of metres per unit")
+        raise ValueError(f"it must be one of {', '.join(UNITS_M)}, or a number of metres per unit")
     return value
 
 
@@ -248,9 +246,3 @@ class SceneFile(Block):
         if self.labels is not None and self.names is None:
             raise ValueError("it has labels but no names; names says which values of the volume are which segments")
         return self
-
-
-def similar(word: str, known: list[str]) -> str:
-    """ "did you mean ...?" for a misspelt word, else what is known."""
-    close = get_close_matches(word, known, n=1)
-    return f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"

@@ -8,8 +8,8 @@ from manifold3d import Manifold, OpType
 from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.yaml_document import Document
-from mereo.scenes.files.schema import FilePart, ModelPart, PartLook, SceneFile, similar
+from mereo.io.yaml_document import Document, similar
+from mereo.scenes.files.schema import FilePart, ModelPart, PartLook, SceneFile
 
 
 def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:

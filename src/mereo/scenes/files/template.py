@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.deformation.samplers import default_cells
+from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.mesh_check import likely_unit
 from mereo.io.atomic_files import atomic_file
 from mereo.io.label_volumes import is_volume, read_label_volume, segment_surfaces
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.files.rewrite import quoted
-from mereo.scenes.files.schema import UNITS
-from mereo.scenes.scene import SCENES
+from mereo.scenes.registry import SCENES
 
 SIZE = 20.0
 """Shortest side in scene units, as in the paper, unless the object is longer than ``LONGEST`` then."""
@@ -57,7 +57,7 @@ def write_scene_file(files: Sequence[Path], output: Path | None = None, units: s
     Args:
         files: one mesh for each segment, one file of named parts, or one label volume.
         output: by default ``NAME.yaml`` in the working directory, after the first file.
-        units: a key of ``scene_schema.UNITS``; None guesses.
+        units: a key of ``scene_schema.UNITS_M``; None guesses.
 
     Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files.
     """
@@ -136,7 +136,7 @@ def _unit_of(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str]:
     if file.suffix.lower() == ".3mf":
         return "mm", "the default of 3MF"
     unit = likely_unit(bounds)
-    longest_m = float((bounds[1] - bounds[0]).max()) * UNITS[unit]
+    longest_m = float((bounds[1] - bounds[0]).max()) * UNITS_M[unit]
     return unit, f"guessed: the object would be {longest_m:.3g} m long"
 
 

@@ -15,8 +15,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
 
-from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.visualization.vertex_colors import vertex_normals
+from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 
 BACKDROP = ((58, 65, 78), (22, 25, 32))
 """Top and bottom of the background, neutral and dark: the palette's yellow is hard to see on white."""
@@ -83,7 +82,7 @@ class Shown(Protocol):
     def opacity(self) -> list[float]: ...
 
 
-class Stage:
+class Display:
     """Places things of the input's frame on the stage.
 
     Attributes:
@@ -129,7 +128,7 @@ class Stage:
 class SegmentLayer:
     """The surfaces of an object, in the segments' colours or coloured vertex by vertex."""
 
-    def __init__(self, stage: Stage, name: str) -> None:
+    def __init__(self, stage: Display, name: str) -> None:
         self.stage, self.name = stage, name
         self.handles: list[Any] = []
 

@@ -9,8 +9,8 @@ from jaxtyping import Float, UInt8
 from mereo.reconstruction.pipeline import segment_names
 from mereo.visualization.vertex_colors import CONFIDENCE, confidence, distance_scale, observed_distance
 from mereo.visualization.viewer import html
+from mereo.visualization.viewer.display import CLOUD_COLOR, CLOUD_SIZE, Display, SegmentControls, SegmentLayer
 from mereo.visualization.viewer.probe import Inspection, first_hit
-from mereo.visualization.viewer.stage import CLOUD_COLOR, CLOUD_SIZE, SegmentControls, SegmentLayer, Stage
 
 COLORINGS = ("segment", "confidence", "distance")
 EMPTY_COLOR = (150, 156, 168)
@@ -25,7 +25,7 @@ class FramePage:
         self._drawing = threading.Lock()
         scanner = not np.allclose(inspection.T_camera_input, np.eye(4))
         y, self.toward = (1.0, np.array([0.0, 0.0, 1.0])) if scanner else (-1.0, np.array([0.0, 0.0, -1.0]))
-        self.stage = Stage(server, self._bounds(), np.array([0.0, y, 0.0]))
+        self.stage = Display(server, self._bounds(), np.array([0.0, y, 0.0]))
         self.layer = SegmentLayer(self.stage, "/segments")
         self._painted: dict[str, tuple[list[UInt8[np.ndarray, "_ 3"]], str]] = {}
         self._build(title, facts)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
-from mereo.scenes.parameters import Freedom, Played, Refused, freedoms, random_state, set_value
+from mereo.scenes.parameters import Parameter, Played, Refused, parameters, random_state, set_value
 from mereo.synthesis.examples import View
 from mereo.visualization.vertex_colors import (
     CONFIDENCE,
@@ -27,10 +27,10 @@ from mereo.visualization.vertex_colors import (
     surface_error,
 )
 from mereo.visualization.viewer import html
+from mereo.visualization.viewer.display import CLOUD_COLOR, CLOUD_SIZE, Display, SegmentControls, SegmentLayer
 from mereo.visualization.viewer.laboratory import Laboratory, Trial, depth_picture
 from mereo.visualization.viewer.latest_request import LatestWins
-from mereo.visualization.viewer.sliders import CameraSliders, FreedomSliders
-from mereo.visualization.viewer.stage import CLOUD_COLOR, CLOUD_SIZE, SegmentControls, SegmentLayer, Stage
+from mereo.visualization.viewer.sliders import CameraSliders, ParameterSliders
 
 SHOWN = ("reconstruction", "truth", "side by side")
 COLORINGS = ("segment", "error", "confidence", "distance")
@@ -56,13 +56,13 @@ class LabPage:
         self.server, self.laboratory = server, laboratory
         self._drawing, self._wishing = threading.Lock(), threading.Lock()
         self._seeds = np.random.default_rng(seed)
-        self._wishes: dict[tuple[Any, int | None], tuple[Freedom, float]] = {}
+        self._wishes: dict[tuple[Any, int | None], tuple[Parameter, float]] = {}
         self._new_seed: int | None = seed
         self._scores: list[tuple[float, float]] = []
         self.played: Played | None = None
         self.moment: Moment | None = None
         rest = laboratory.scene.rest
-        self.stage = Stage(server, rest.bounds, np.asarray(laboratory.scene.workspace.axis, dtype=float))
+        self.stage = Display(server, rest.bounds, np.asarray(laboratory.scene.workspace.axis, dtype=float))
         self.found, self.true = SegmentLayer(self.stage, "/found"), SegmentLayer(self.stage, "/true")
         self._build_results(title, facts)
         self._build_controls(rest)
@@ -115,7 +115,7 @@ class LabPage:
         gui.add_button("Random state").on_click(lambda _: self._wish_anew())
         with gui.add_folder("Camera"):
             self._camera = CameraSliders(gui, self.laboratory, lambda: self.worker.submit(None))
-        self._sliders = FreedomSliders(gui, gui.add_folder("Deformation"), self._wish)
+        self._sliders = ParameterSliders(gui, gui.add_folder("Deformation"), self._wish)
         self.controls = SegmentControls(gui, rest, self._draw)
 
     def _look(self, name: str = "camera") -> None:
@@ -133,9 +133,9 @@ class LabPage:
 
     # --- wishes -------------------------------------------------------------------------------------------------------
 
-    def _wish(self, freedom: Freedom, value: float) -> None:
+    def _wish(self, parameter: Parameter, value: float) -> None:
         with self._wishing:
-            self._wishes[freedom.key, freedom.index] = (freedom, value)
+            self._wishes[parameter.key, parameter.index] = (parameter, value)
         self.worker.submit(None)
 
     def _wish_anew(self) -> None:
@@ -152,11 +152,11 @@ class LabPage:
         if seed is not None or self.played is None:
             return random_state(scene, seed or 0), None
         played = self.played
-        for freedom, value in wishes:
-            if freedom.key not in played.keys:
+        for parameter, value in wishes:
+            if parameter.key not in played.keys:
                 continue  # a slider of a part that has just gone has nothing left to move
             try:
-                played = set_value(scene, played, freedom, value)
+                played = set_value(scene, played, parameter, value)
             except Refused as error:
                 refusal = error
         return played, refusal
@@ -165,7 +165,7 @@ class LabPage:
 
     def _quick(self, _: None) -> None:
         self.played, refusal = self._fulfil()
-        self._sliders.show(freedoms(self.played))
+        self._sliders.show(parameters(self.played))
         view, is_first = self.laboratory.look(self.played, self._camera.place()), self.moment is None
         self.moment = Moment(view)
         if is_first:

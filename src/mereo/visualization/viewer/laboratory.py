@@ -14,15 +14,16 @@ from jaxtyping import Float, UInt8
 from mereo.evaluation.metrics import Scores
 from mereo.evaluation.scoring import check_names, grid_scores
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.scenes.parameters import Played
 from mereo.scenes.scene import Scene
+from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View
-from mereo.training.config import MIN_POINTS, GenerateConfig
 
 NEAR: tuple[int, int, int] = (255, 236, 190)
 FAR: tuple[int, int, int] = (38, 30, 84)

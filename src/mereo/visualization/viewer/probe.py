@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from mereo.evaluation.scans import into_camera
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.models.model import Answer, EncodedCloud, Model
-from mereo.reconstruction.config import Frame
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct, segment_names
 
 
@@ -31,7 +31,7 @@ class Inspection:
     T_camera_input: Float[np.ndarray, "4 4"]
 
     @classmethod
-    def of(cls, cloud: PointCloud, model: Model, resolution: int = 128, frame: Frame = "camera") -> "Inspection":
+    def of(cls, cloud: PointCloud, model: Model, resolution: int = 128, frame: CloudAxes = "camera") -> "Inspection":
         """Reconstruct a cloud. Raises as ``reconstruct`` does."""
         result = reconstruct(cloud, model, resolution, frame)
         T_camera_input = into_camera(cloud.points, frame)

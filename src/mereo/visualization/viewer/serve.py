@@ -5,16 +5,18 @@ from pathlib import Path
 from typing import Any
 
 from mereo.evaluation.sample_views import load_frame, shipped_frames
+from mereo.geometry.conventions import CloudAxes
+from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for, shipped_names
-from mereo.reconstruction.config import Frame, InputConfig, IsolationConfig
+from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import read_observation
-from mereo.scenes.scene import load_scene
+from mereo.scenes.registry import load_scene
+from mereo.visualization.viewer.display import import_viser, start_server, stop_server
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.probe import Inspection
-from mereo.visualization.viewer.stage import import_viser, start_server, stop_server
 
 PORT = 8080
 
@@ -31,7 +33,7 @@ def view_frame(
 ) -> None:
     """Show a frame and its reconstruction; without ``input`` the shipped frame of the weights."""
     import_viser()
-    frame: Frame
+    frame: CloudAxes
     if input is None:
         name = weights or shipped_frames()[0]
         if name not in shipped_frames():

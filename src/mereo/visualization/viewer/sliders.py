@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from mereo.scenes.draw_recorder import Key
-from mereo.scenes.parameters import Freedom
+from mereo.scenes.parameters import Parameter
 from mereo.visualization.viewer.laboratory import CameraPlace, Laboratory
 
-Moved = Callable[[Freedom, float], None]
+Moved = Callable[[Parameter, float], None]
 
 
-class FreedomSliders:
+class ParameterSliders:
     """One slider for each degree of freedom, in a folder for each group, all in ``folder``.
 
     Sliders that a new state still has stay as they are, also while they are being dragged; others come and go.
@@ -22,66 +22,68 @@ class FreedomSliders:
         self._gui, self._folder, self._moved = gui, folder, moved
         self._folders: dict[str, Any] = {}
         self._handles: dict[tuple[Key, int | None], Any] = {}
-        self._freedoms: dict[tuple[Key, int | None], Freedom] = {}
+        self._parameters: dict[tuple[Key, int | None], Parameter] = {}
 
-    def show(self, freedoms: Sequence[Freedom]) -> None:
+    def show(self, parameters: Sequence[Parameter]) -> None:
         """Bring the sliders to a state."""
-        wanted = {(freedom.key, freedom.index): freedom for freedom in freedoms}
+        wanted = {(parameter.key, parameter.index): parameter for parameter in parameters}
         for gone in self._handles.keys() - wanted.keys():
             self._handles.pop(gone).remove()
-        groups = {freedom.group for freedom in freedoms}
+        groups = {parameter.group for parameter in parameters}
         for group in self._folders.keys() - groups:
             self._folders.pop(group).remove()
-        for place, freedom in wanted.items():
+        for place, parameter in wanted.items():
             if place in self._handles:
-                self._update(place, freedom)
+                self._update(place, parameter)
             else:
-                self._handles[place] = self._add(place, freedom)
-        self._freedoms = wanted
+                self._handles[place] = self._add(place, parameter)
+        self._parameters = wanted
 
-    def _update(self, place: tuple[Key, int | None], freedom: Freedom) -> None:
+    def _update(self, place: tuple[Key, int | None], parameter: Parameter) -> None:
         """Bounds may depend on other draws; values change when a state is refused or drawn anew."""
-        handle, before = self._handles[place], self._freedoms[place]
-        if (before.low, before.high) != (freedom.low, freedom.high):
-            handle.min, handle.max, handle.step = _range(freedom)
-        handle.value = _on_range(freedom)
+        handle, before = self._handles[place], self._parameters[place]
+        if (before.low, before.high) != (parameter.low, parameter.high):
+            handle.min, handle.max, handle.step = _range(parameter)
+        handle.value = _on_range(parameter)
 
-    def _add(self, place: tuple[Key, int | None], freedom: Freedom) -> Any:
-        if freedom.group not in self._folders:
+    def _add(self, place: tuple[Key, int | None], parameter: Parameter) -> Any:
+        if parameter.group not in self._folders:
             with self._folder:
-                self._folders[freedom.group] = self._gui.add_folder(freedom.group, expand_by_default=not self._folders)
-        with self._folders[freedom.group]:
-            unit = f" ({freedom.unit.strip()})" if freedom.unit else ""
-            handle = self._gui.add_slider(f"{freedom.name}{unit}", *_range(freedom), _on_range(freedom))
+                self._folders[parameter.group] = self._gui.add_folder(
+                    parameter.group, expand_by_default=not self._folders
+                )
+        with self._folders[parameter.group]:
+            unit = f" ({parameter.unit.strip()})" if parameter.unit else ""
+            handle = self._gui.add_slider(f"{parameter.name}{unit}", *_range(parameter), _on_range(parameter))
         handle.on_update(lambda event: self._told(event, place))
         return handle
 
     def _told(self, event: Any, place: tuple[Key, int | None]) -> None:
         """A person's hand has a client, our own ``show`` has none."""
         if event.client is not None and place in self._handles:
-            self._moved(self._freedoms[place], float(self._handles[place].value))
+            self._moved(self._parameters[place], float(self._handles[place].value))
 
 
-def _range(freedom: Freedom) -> tuple[float, float, float]:
+def _range(parameter: Parameter) -> tuple[float, float, float]:
     """Ends and step of a slider, in numbers with few digits: a step of 0.01, 0.1, ... that divides it into 100 or more.
 
     Ends move outward by less than a step; ``set_value`` keeps to the true ones.
     """
-    if freedom.whole:
-        return freedom.low, freedom.high, 1.0
-    digits = _digits(freedom)
+    if parameter.whole:
+        return parameter.low, parameter.high, 1.0
+    digits = _digits(parameter)
     step = 10.0**-digits
-    low, high = np.floor(freedom.low / step + 1e-6) * step, np.ceil(freedom.high / step - 1e-6) * step
+    low, high = np.floor(parameter.low / step + 1e-6) * step, np.ceil(parameter.high / step - 1e-6) * step
     return round(float(low), digits), round(float(high), digits), step
 
 
-def _digits(freedom: Freedom) -> int:
-    return int(np.ceil(2 - np.log10(freedom.high - freedom.low) - 1e-9))
+def _digits(parameter: Parameter) -> int:
+    return int(np.ceil(2 - np.log10(parameter.high - parameter.low) - 1e-9))
 
 
-def _on_range(freedom: Freedom) -> float:
-    low, high, _ = _range(freedom)
-    value = freedom.value if freedom.whole else round(freedom.value, _digits(freedom))
+def _on_range(parameter: Parameter) -> float:
+    low, high, _ = _range(parameter)
+    value = parameter.value if parameter.whole else round(parameter.value, _digits(parameter))
     return min(max(value, low), high)
 
 
