@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from mereo.fitting.interpolation import spread
-from mereo.model import EncodedCloud, Model
+from mereo.deformation.moving_least_squares import spread
+from mereo.models.model import EncodedCloud, Model
 
 SIGHT_LINES = 256
 """Lines of sight along which the hidden inside is asked for."""

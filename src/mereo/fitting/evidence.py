@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from mereo.fitting.interpolation import spread
+from mereo.deformation.moving_least_squares import spread
 
 MOST_POINTS = 6000
 """Denser clouds are thinned."""

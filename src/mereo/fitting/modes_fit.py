@@ -9,8 +9,8 @@ from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed
 from mereo.fitting.residuals import NetworkTerm, Surface, add_witnesses, witness_vertices
-from mereo.fitting.rigid_alignment import robust_rigid
-from mereo.fitting.statistical_model import StatisticalModel
+from mereo.geometry.procrustes import robust_rigid
+from mereo.scenes.statistical_model import StatisticalModel
 
 
 @dataclass(frozen=True)

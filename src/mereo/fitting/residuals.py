@@ -14,9 +14,9 @@ from jaxtyping import Float, Float32, Int
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed, along, geman_mcclure, in_space
-from mereo.fitting.interpolation import spread
-from mereo.fitting.statistical_model import StatisticalModel
-from mereo.mesh import barycentric
+from mereo.deformation.moving_least_squares import spread
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.geometry.mesh import barycentric
 
 ROBUST = 2.5
 """Residuals beyond this many sigma count for little."""

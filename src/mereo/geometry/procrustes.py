@@ -6,7 +6,7 @@ A motion is ``y = R x + t``. Notation: n points, s sets of points; ``T_a_b`` map
 import numpy as np
 from jaxtyping import Float
 
-from mereo.frame import rigid
+from mereo.geometry.transforms import rigid
 
 ROUNDS = 20
 """Of reweighting in ``robust_rigid``; it has converged by then."""

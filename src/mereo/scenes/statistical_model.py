@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from mereo.fitting.interpolation import ANCHORS, Anchors, PointWeights, spread
-from mereo.fitting.rigid_alignment import align_all, fit_rigid
-from mereo.mesh import SegmentedMesh
+from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
+from mereo.geometry.procrustes import align_all, fit_rigid
+from mereo.geometry.mesh import SegmentedMesh
 
 PROCRUSTES_ROUNDS = 100
 PROCRUSTES_POINTS = 600

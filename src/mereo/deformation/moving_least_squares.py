@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from mereo.ordering import farthest_point_order
+from mereo.geometry.farthest_point_sampling import farthest_point_order
 
 ANCHORS = 200
 """Surface vertices of each segment that points may follow, spread evenly: the nearest of all lie on one small patch,

@@ -3,12 +3,12 @@
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from mereo.fitting.interpolation import spread
-from mereo.fitting.statistical_model import StatisticalModel, build_model, material_points
-from mereo.mesh import SegmentedMesh
-from mereo.scene import Scene, State
-from mereo.solid import Solids
-from mereo.synthesis import example_rng
+from mereo.deformation.moving_least_squares import spread
+from mereo.scenes.statistical_model import StatisticalModel, build_model, material_points
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.scenes.scene import Scene, State
+from mereo.geometry.solids import Solids
+from mereo.scenes.seeds import example_rng
 
 STATES = 1500
 STATES_SEED = 500_000
