@@ -80,3 +80,4 @@ class Evidence:
         direction = np.where(beside[:, None], out, toward)
         amount = np.where(beside, length - self.pitch * distance, np.where(np.isfinite(ahead), np.maximum(ahead, 0.0), 0.0))
         return direction, np.maximum(amount, 0.0)
+

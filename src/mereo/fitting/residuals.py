@@ -14,18 +14,22 @@ from jaxtyping import Float, Float32, Int
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed, along, geman_mcclure, in_space
-from mereo.deformation.moving_least_squares import spread
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.geometry.mesh import barycentric
 
 ROBUST = 2.5
 """Residuals beyond this many sigma count for little."""
 
-WITNESSES = 1500
-"""Vertices, evenly spread, that may not be where the frame rules them out."""
-
 MOST_VIOLATIONS = 400
 WITNESS_WEIGHT = 0.2
+
+
+def robust_square(
+    residual: Float[np.ndarray, " r"], sigma: float, robust: float = ROBUST
+) -> Float[np.ndarray, " r"]:
+    """Geman and McClure's loss, in squared sigmas; ``geman_mcclure`` are its weights."""
+    squared = (residual / sigma) ** 2
+    return squared / (1.0 + squared / robust**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +111,11 @@ class NetworkTerm:
         """Where the state has the points."""
         return posed.place(self.mean + self.modes @ posed.z.astype(np.float32))
 
+    def energy(self, posed: Posed, sigma: float) -> float:
+        """Mean robust squared distance, in squared sigmas."""
+        distance = np.linalg.norm(self.place(posed) - self.target, axis=1)
+        return float(self.confidence / self.confidence.sum() @ robust_square(distance, sigma))
+
     def add_to(self, normal: NormalEquations, posed: Posed, sigma: float, worth: float, robust: bool) -> NormalEquations:
         """With the squared distances, together worth as many independent points as ``worth``."""
         points = self.place(posed)
@@ -115,11 +124,6 @@ class NetworkTerm:
         if robust:
             weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
         return normal.add(in_space(posed, points, self.modes), offset.T.ravel(), np.tile(weight, 3))
-
-
-def witness_vertices(model: StatisticalModel) -> Int[np.ndarray, " w"]:
-    """Material points on the surface that are compared with what the frame rules out."""
-    return spread(model.rest_points[: sum(model.vertex_counts)], WITNESSES)
 
 
 def add_witnesses(

@@ -15,6 +15,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
 from mereo.geometry.procrustes import align_all, fit_rigid
+from mereo.scenes.pair_distances import PairDistances, kept_distances
 from mereo.geometry.mesh import SegmentedMesh
 
 PROCRUSTES_ROUNDS = 100
@@ -29,6 +30,15 @@ HELD_OUT = 0.05
 
 LEAST_MOTION = 2e-4
 """Of half the rest box's longest side: modes whose root mean square motion is smaller are left out."""
+
+PAIR_POINTS = 160
+"""Material points among which distances are compared."""
+
+SPARSE = 200
+"""Material points by which states of the library are compared."""
+
+WITNESSES = 1500
+"""Vertices that are compared with what a frame rules out."""
 
 MOST_MODES = 160
 PROJECTIONS = 5
@@ -46,6 +56,7 @@ class StatisticalModel:
         modes: motion of each material point for one standard deviation, largest first.
         library: coefficients of the states that the model was built from.
         residue: root mean square distance of held-out states from the model.
+        pairs: distances that the states keep, which the linear model alone does not.
     """
 
     rest: SegmentedMesh
@@ -55,6 +66,7 @@ class StatisticalModel:
     modes: Float32[np.ndarray, "m 3 k"]
     library: Float32[np.ndarray, "n k"]
     residue: float
+    pairs: PairDistances
 
     @property
     def count(self) -> int:
@@ -107,9 +119,31 @@ class StatisticalModel:
         """The same at rest."""
         return tuple(Anchors(index, self.rest_points[index]) for index in self.anchors)
 
+    @cached_property
+    def witnesses(self) -> Int[np.ndarray, " w"]:
+        """Surface vertices, evenly spread."""
+        return spread(self.rest_points[: sum(self.vertex_counts)], WITNESSES)
+
+    @cached_property
+    def sparse(self) -> Int[np.ndarray, " p"]:
+        """A few material points that tell shapes apart."""
+        return spread(self.rest_points, SPARSE)
+
+    @cached_property
+    def sparse_library(self) -> Float32[np.ndarray, "n p 3"]:
+        """Where these are in all states of the library."""
+        motion = self.library @ self.modes[self.sparse].reshape(-1, self.count).T
+        return self.mean[self.sparse].astype(np.float32) + motion.reshape(len(self.library), -1, 3)
+
     def material(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "m 3"]:
         """Positions of all material points, unposed."""
-        return self.mean + self.modes @ z.astype(np.float32)
+        return self.mean + (self.modes.reshape(-1, self.count) @ z.astype(np.float32)).reshape(-1, 3)
+
+    @cached_property
+    def motion(self) -> Float[np.ndarray, " k"]:
+        """Root mean square motion of the material points for one standard deviation of each mode."""
+        squared: np.ndarray = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
+        return np.sqrt(squared / len(self.modes))
 
     def mesh(self, material: Float[np.ndarray, "m 3"]) -> SegmentedMesh:
         """The segments, with the rest mesh's faces, at these positions."""
@@ -178,7 +212,8 @@ def build_model(
     left = unseen - (unseen @ np.linalg.pinv(modes)) @ modes if len(modes) else unseen
     residue = float(np.sqrt((left.astype(np.float64) ** 2).sum() / (left.size / 3)))
     layout = np.ascontiguousarray(modes.reshape(len(modes), -1, 3).transpose(1, 2, 0))
-    return StatisticalModel(rest, nodes, node_labels, mean, layout, library, residue)
+    pairs = kept_distances(spread(material_points(rest, nodes), PAIR_POINTS), mean, layout, library, half)
+    return StatisticalModel(rest, nodes, node_labels, mean, layout, library, residue, pairs)
 
 
 def _aligned(

@@ -1,0 +1,50 @@
+"""Constants of the fit. Imports neither numpy nor torch."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Constants of the fit; lengths are shares of half the rest box's longest side where not said otherwise.
+
+    Attributes:
+        start_sigma: standard deviation of the network's correspondences.
+        first_steps: steps on the correspondences alone, their sigma falling from ``first_widening`` times to once.
+        first_worth: how many independent points the correspondences are worth in these.
+        last_steps: steps on cloud, witnesses and correspondences; the cloud's sigma falls by ``cooling`` in each.
+        cloud_sigma: last standard deviation of the cloud, in scene units, where its noise is not larger.
+        cloud_worth: how many independent points the cloud is worth.
+        network_worth: the same of the correspondences, at the first and at the last of these steps.
+        pair_worth: the same of the distances that the states keep.
+        pair_slack: how far these distances may be off at first; it falls by ``pair_cooling`` in each step.
+        damping: of every step, relative to the diagonal.
+        neighbors: states of the library around an answer whose Gaussian is the prior of the next.
+        neighbor_std: standard deviation of each coefficient that is added to theirs.
+        refine_sigma, refine_steps: the cloud's first sigma, and steps, under the prior of the neighbours.
+        explained: the cloud's misfit, in squared standard deviations of a partner, above which other states are tried.
+        tries, refined, rounds: states that are tried, refined and how often.
+        scale_std: standard deviation of the scale's logarithm where the unit is not known.
+    """
+
+    start_sigma: float = 0.06
+    first_steps: int = 8
+    first_widening: float = 2.5
+    first_worth: float = 500.0
+    last_steps: int = 15
+    cooling: float = 0.75
+    cloud_sigma: float = 0.2
+    cloud_worth: float = 1500.0
+    network_worth: tuple[float, float] = (100.0, 30.0)
+    pair_worth: float = 100.0
+    pair_slack: float = 0.05
+    pair_cooling: float = 0.7
+    damping: float = 1e-3
+    neighbors: int = 50
+    neighbor_std: float = 0.17
+    refine_sigma: float = 0.02
+    refine_steps: int = 10
+    explained: float = 0.147
+    tries: int = 12
+    refined: int = 3
+    rounds: int = 2
+    scale_std: float = 0.1

@@ -1,0 +1,102 @@
+"""One frame to be explained by one object: all terms of the fit, and how badly a state explains them."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mereo.fitting.config import FitConfig
+from mereo.fitting.correspondences import Correspondences
+from mereo.fitting.evidence import Evidence
+from mereo.fitting.gauss_newton import NormalEquations, Posed
+from mereo.fitting.priors import PairTerm, Prior
+from mereo.fitting.residuals import ROBUST, WITNESS_WEIGHT, NetworkTerm, Surface, add_witnesses, robust_square
+from mereo.scenes.statistical_model import StatisticalModel
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How badly a state explains a frame, as squared standard deviations.
+
+    Attributes:
+        cloud: of one partner on average.
+        network: of all correspondences, as much as they are worth.
+        witnesses: of all vertices that the frame rules out.
+        prior: of the coefficients, under the Gaussian of all states.
+        pairs: of the kept distances, as much as they are worth.
+        total: all of it, the cloud as much as it is worth.
+    """
+
+    cloud: float
+    network: float
+    witnesses: float
+    prior: float
+    pairs: float
+    total: float
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything a fit of one frame works on; scene units, camera frame.
+
+    Attributes:
+        model: the statistical model.
+        network: correspondences.
+        evidence: the frame.
+        scale_std: how far the scale is unsure.
+        config: constants.
+    """
+
+    model: StatisticalModel
+    network: NetworkTerm
+    evidence: Evidence
+    scale_std: float
+    config: FitConfig
+
+    @classmethod
+    def of(
+        cls, model: StatisticalModel, found: Correspondences, evidence: Evidence, scale_std: float, config: FitConfig
+    ) -> "Problem":
+        return cls(model, NetworkTerm.of(model, found), evidence, scale_std, config)
+
+    @cached_property
+    def pairs(self) -> PairTerm:
+        return PairTerm.of(self.model)
+
+    @property
+    def witnesses(self) -> Int[np.ndarray, " w"]:
+        """Surface vertices that are compared with silhouette and free space."""
+        return self.model.witnesses
+
+    @property
+    def network_sigma(self) -> float:
+        return self.config.start_sigma * self.model.half
+
+    def known(self, posed: Posed, prior: Prior, slack: float) -> NormalEquations:
+        """What is known without the frame: prior, scale, kept distances up to ``slack``."""
+        normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
+        return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
+
+    def seen(self, normal: NormalEquations, posed: Posed, sigma: float, network_worth: float) -> NormalEquations:
+        """With cloud, witnesses and correspondences."""
+        surface = Surface.of(self.model, posed)
+        normal = self.network.add_to(normal, posed, self.network_sigma, network_worth, robust=True)
+        normal = normal.add(*surface.cloud_term(posed, self.evidence.partners, sigma, self.config.cloud_worth))
+        return add_witnesses(normal, surface, posed, self.evidence, self.witnesses, sigma)
+
+    def misfit(self, posed: Posed, sigma: float | None = None) -> Misfit:
+        """Of a state; ``sigma`` of the cloud is its last one where not given."""
+        sigma = self.config.cloud_sigma if sigma is None else sigma
+        surface = Surface.of(self.model, posed)
+        cloud = float(robust_square(surface.nearest(self.evidence.partners)[0], sigma).mean())
+        network = self.network.energy(posed, self.network_sigma) * self.config.network_worth[1]
+        amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * sigma)[1]
+        witnesses = WITNESS_WEIGHT * float(robust_square(amount, sigma, 4 * ROBUST).sum())
+        prior, pairs = float(posed.z @ posed.z), self.config.pair_worth * self.pairs.energy(posed.z)
+        total = self.config.cloud_worth * cloud + network + witnesses + prior + pairs
+        return Misfit(cloud, network, witnesses, prior, pairs, total)
+
+    def unposed(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 3"]:
+        """The correspondences' places in the model's frame."""
+        return self.network.mean + self.network.modes @ z.astype(np.float32)
