@@ -23,7 +23,10 @@ class FitConfig:
         refine_sigma, refine_steps: the cloud's first sigma, and steps, under the prior of the neighbours.
         explained: the cloud's misfit, in squared standard deviations of a partner, above which other states are tried.
         tries, refined, rounds: states that are tried, refined and how often.
+        curved: other states are tried only where this many distances are kept: smooth bending has one optimum.
         scale_std: standard deviation of the scale's logarithm where the unit is not known.
+        accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface,
+            in scene units.
     """
 
     start_sigma: float = 0.06
@@ -47,4 +50,7 @@ class FitConfig:
     tries: int = 12
     refined: int = 3
     rounds: int = 2
+    curved: int = 300
     scale_std: float = 0.1
+    accepted: float = 0.95
+    tolerance: float = 0.45

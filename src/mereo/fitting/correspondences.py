@@ -49,9 +49,13 @@ class Correspondences:
         parts = (self.points, self.rest, self.labels, self.confidence, self.observed)
         return Correspondences(*(part[chosen] for part in parts))
 
+    def scaled(self, factor: float) -> "Correspondences":
+        """With the camera frame in another unit."""
+        return Correspondences(self.points * factor, self.rest, self.labels, self.confidence, self.observed)
+
     def evenly(self, each: int = EACH) -> "Correspondences":
         """At most ``each`` observed and as many inside, evenly spread in space."""
-        chosen = []
+        chosen = [np.empty(0, dtype=np.int64)]
         for rows in (np.flatnonzero(self.observed), np.flatnonzero(~self.observed)):
             if len(rows):
                 chosen.append(rows[spread(self.points[rows], each)])

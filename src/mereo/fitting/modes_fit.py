@@ -4,7 +4,7 @@
 2. Cloud, silhouette, free space, and less and less the correspondences.
 3. The same again under the Gaussian of the library's states near the answer: states lie on curved sets, of which it is
    the tangent.
-4. While the cloud is not explained, other states of the library.
+4. While the cloud is not explained, other states of the library, where the states lie on a curved set at all.
 """
 
 import numpy as np
@@ -21,7 +21,8 @@ def fit_modes(problem: Problem) -> Posed:
     first = fit_whole(problem)
     best = better(problem, first, refine(problem, first))
     config = problem.config
-    for number in range(config.rounds):
+    curved = len(problem.model.pairs) >= config.curved
+    for number in range(config.rounds if curved else 0):
         if problem.misfit(best).cloud < config.explained:
             break
         others = by_likeness(problem, best, config.tries) + (by_network(problem, config.refined) if number == 0 else [])

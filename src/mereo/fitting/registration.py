@@ -1,0 +1,129 @@
+"""The model registered to a frame: where every point of the object is, and where every point of the frame was at rest."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mereo.deformation.maps import newton
+from mereo.deformation.moving_least_squares import Anchors
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids, signed_distance_and_direction
+from mereo.scenes.statistical_model import StatisticalModel, following
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """What a registration says about points of the frame.
+
+    Attributes:
+        label: 0 for empty space, i + 1 for segment i.
+        distance: to the nearest segment surface, negative inside; input unit.
+        direction: unit vector to that surface.
+        rest: where the point was at rest, scene units; outside, as if it moved along with the nearest segment.
+    """
+
+    label: UInt8[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]
+    direction: Float[np.ndarray, "n 3"]
+    rest: Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentMotion:
+    """From rest to the frame, for points of one segment. Satisfies ``Deformation``."""
+
+    rest: Anchors
+    moved: Float[np.ndarray, "m 3"]
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        return self.rest.weights(points)(self.moved)
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A state of the object's own deformation model, in the frame of an observed cloud.
+
+    Attributes:
+        model: the statistical model: rest mesh and material points.
+        material: positions of all material points in the camera frame, input unit.
+        method: which description of the states it was found in.
+        z: coefficients of the modes, or standard normal draws of the scene.
+        scene_unit: length of a scene unit in the input's.
+        explained: share of the observed points that lie on the model's facing surface, up to the tolerance.
+        accepted: whether that is enough to believe it.
+        seconds: of the fit alone.
+    """
+
+    model: StatisticalModel
+    material: Float[np.ndarray, "m 3"]
+    method: str
+    z: Float[np.ndarray, " k"]
+    scene_unit: float
+    explained: float
+    accepted: bool
+    seconds: float
+
+    @cached_property
+    def mesh(self) -> SegmentedMesh:
+        """The segments, with the rest mesh's own faces, in the camera frame and input unit."""
+        return self.model.mesh(self.material)
+
+    @cached_property
+    def solids(self) -> Solids:
+        return Solids(self.mesh)
+
+    @cached_property
+    def rest_solids(self) -> Solids:
+        return Solids(self.model.rest)
+
+    def to_camera(
+        self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"] | None = None
+    ) -> Float[np.ndarray, "n 3"]:
+        """Where points of the rest model are in the camera frame.
+
+        Args:
+            points: rest pose, scene units.
+            labels: of the segments that they move along with, 1 or more; by default those that hold them, or are nearest.
+        """
+        labels = nearest_labels(self.rest_solids, points) if labels is None else labels
+        return self.model.weights(points, labels)(self.material)
+
+    def to_rest(
+        self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"] | None = None
+    ) -> Float[np.ndarray, "n 3"]:
+        """Inverse of ``to_camera``: where points of the camera frame are in the rest model, scene units."""
+        labels = nearest_labels(self.solids, points) if labels is None else labels
+        guess = following(self._moved_anchors, points, labels)(self.model.rest_points)
+        result = guess.copy()
+        for label in np.unique(labels):
+            rows = np.flatnonzero(labels == label)
+            motion = SegmentMotion(self.model.rest_anchors[label - 1], self.material)
+            found, converged = newton(motion, points[rows], guess[rows])
+            result[rows[converged]] = found[converged]
+        return result
+
+    def query(self, points: Float[np.ndarray, "n 3"]) -> Located:
+        """Segment, signed distance, direction and rest position of points of the camera frame."""
+        labels = self.solids.label(points)
+        distance, direction = signed_distance_and_direction(self.solids, points, labels)
+        nearest = np.where(labels > 0, labels, nearest_labels(self.solids, points)).astype(np.uint8)
+        return Located(labels, distance, direction, self.to_rest(points, nearest))
+
+    def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
+        """The same in another frame."""
+        return replace(self, material=self.material @ T_new_camera[:3, :3].T + T_new_camera[:3, 3])
+
+    @cached_property
+    def _moved_anchors(self) -> tuple[Anchors, ...]:
+        return tuple(Anchors(index, self.material[index]) for index in self.model.anchors)
+
+
+def nearest_labels(solids: Solids, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    """The segment that holds each point, or else the nearest."""
+    labels = solids.label(points)
+    outside = np.flatnonzero(labels == 0)
+    if len(outside):
+        labels[outside] = solids.nearest(points[outside]).owner + 1
+    return labels
