@@ -7,7 +7,7 @@ deviation, so the prior of the coefficients ``z`` is N(0, 1) each. Lengths are s
 Notation: m material points (first the vertices of ``rest.merged()``, then the nodes), k modes, n states.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -39,6 +39,10 @@ SPARSE = 200
 
 WITNESSES = 1500
 """Vertices that are compared with what a frame rules out."""
+
+OF_REST = ("faces", "vertex_counts", "labels", "rest_points", "half", "rest_center", "anchors", "rest_anchors")
+OF_REST += ("witnesses", "sparse")
+"""Derived values that depend on the rest pose alone."""
 
 MOST_MODES = 160
 PROJECTIONS = 5
@@ -135,9 +139,17 @@ class StatisticalModel:
         motion = self.library @ self.modes[self.sparse].reshape(-1, self.count).T
         return self.mean[self.sparse].astype(np.float32) + motion.reshape(len(self.library), -1, 3)
 
+    def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> "StatisticalModel":
+        """Another linear model of the same object, without kept distances; what depends on rest alone is shared."""
+        none = PairDistances(*(np.empty(0, dtype=np.int64),) * 2, *(np.empty(0),) * 2)
+        library = np.zeros((0, modes.shape[2]), dtype=np.float32)
+        other = replace(self, mean=mean, modes=modes, library=library, pairs=none)
+        vars(other).update({name: getattr(self, name) for name in OF_REST})
+        return other
+
     def material(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "m 3"]:
         """Positions of all material points, unposed."""
-        return self.mean + (self.modes.reshape(-1, self.count) @ z.astype(np.float32)).reshape(-1, 3)
+        return self.mean + (self.modes.reshape(3 * len(self.modes), self.count) @ z.astype(np.float32)).reshape(-1, 3)
 
     @cached_property
     def motion(self) -> Float[np.ndarray, " k"]:
