@@ -9,18 +9,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
+from scipy.sparse import csr_array
+from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.hypotheses import ALIKE, robust_poses
-from mereo.fitting.modes_fit import fit_cloud
+from mereo.fitting.modes_fit import fit_cloud, fit_network
 from mereo.fitting.playback import Drawn, DrawnStates, anchors_moved, material_moved
 from mereo.fitting.priors import Prior
 from mereo.fitting.problem import Problem
-from mereo.fitting.residuals import NetworkTerm
+from mereo.fitting.residuals import NetworkTerm, robust_square
 from mereo.scenes.scene import Scene
-from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.statistical_model import StatisticalModel, following
 
 MOST_DRAWS = 120
 """Scenes with more free numbers are left to the modes."""
@@ -41,6 +43,8 @@ class DrawsConfig:
         kept: how many of them are followed to the end.
         first_rounds, last_rounds: linearizations of all and of those that are kept.
         steps: of the linear fit in each.
+        approaches: linearizations towards the fit of the modes, first of all.
+        jumps: how often one draw may jump, where there are at most ``jumping``, to one of ``places`` places.
         trust: standard deviation of a draw's change in one linearization.
         start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
         states, seed: how many random states starts are chosen from.
@@ -51,6 +55,10 @@ class DrawsConfig:
     first_rounds: int = 2
     last_rounds: int = 5
     steps: int = 4
+    approaches: int = 3
+    jumps: int = 2
+    jumping: int = 30
+    places: int = 6
     trust: float = 0.7
     start_sigma: float = 0.03
     states: int = 600
@@ -66,14 +74,14 @@ class DrawsProblem:
         states: random states of the scene.
         found: correspondences, scene units.
         weights: how their rest positions follow the material points.
-        spread: how all material points follow the anchors.
+        spread: how all material points follow the anchors, as a sparse matrix.
     """
 
     base: Problem
     states: DrawnStates
     found: Correspondences
     weights: PointWeights
-    spread: PointWeights
+    spread: csr_array
     config: DrawsConfig
 
     @property
@@ -83,6 +91,15 @@ class DrawsProblem:
     @property
     def scene(self) -> Scene:
         return self.states.scene
+
+    @classmethod
+    def of(cls, base: Problem, states: DrawnStates, found: Correspondences, config: DrawsConfig) -> "DrawsProblem":
+        model = base.model
+        every = following(model.rest_anchors, model.rest_points, model.labels)
+        rows = np.repeat(np.arange(len(every.index)), every.index.shape[1])
+        entries = (every.weight.ravel().astype(np.float32), (rows, every.index.ravel()))
+        spread = csr_array(entries, shape=(len(model.rest_points),) * 2)
+        return cls(base, states, found, model.weights(found.rest, found.labels), spread, config)
 
     def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> Problem:
         """The problem in the linear neighbourhood of a state."""
@@ -111,10 +128,61 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     config = problem.config
     starts = [fit for fit in (started(problem, *start) for start in choose_starts(problem, modes)) if fit is not None]
     starts = [fit for fit in starts if int(fit.drawn.smooth.sum()) <= MOST_DRAWS]
+    starts = [approach(problem, fit, modes) for fit in starts]
     for rounds, keep in ((config.first_rounds, config.starts), (config.last_rounds, config.kept)):
         starts = sorted(starts, key=lambda fit: fit.misfit)[:keep]
         starts = [descend(problem, fit, rounds) for fit in starts]
-    return min(starts, key=lambda fit: fit.misfit, default=None)
+    best = min(starts, key=lambda fit: fit.misfit, default=None)
+    return None if best is None else jump(problem, best)
+
+
+def approach(problem: DrawsProblem, fit: DrawsFit, modes: Posed) -> DrawsFit:
+    """Towards the fit of the modes, which is dense and smooth where the frame is neither."""
+    model, config = problem.model, problem.config
+    target = modes.place(model.material(modes.z))[model.sparse]
+    sigma, best, least = problem.base.network_sigma, fit, np.inf
+    for number in range(config.approaches + 1):
+        apart = robust_square(np.linalg.norm(fit.placed()[model.sparse] - target, axis=1), sigma).mean()
+        if apart >= least:
+            break
+        best, least = fit, apart
+        if number == config.approaches:
+            break
+        motion = jacobian(problem, fit)
+        network = NetworkTerm(target, fit.material[model.sparse], motion[model.sparse], np.ones(len(target)))
+        linear = replace(problem.around(fit.material, motion), network=network)
+        start = replace(fit.posed, z=np.zeros(len(fit.z)))
+        found = fit_network(linear, start, draws_prior(fit, motion, config.trust))
+        nearer = played(problem, fit.drawn, fit.z + found.z, found)
+        if nearer is None:
+            break
+        fit = nearer
+    return best
+
+
+def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
+    """One draw anywhere in its range, where that explains the frame better: a wheel by half a turn, a finger's other side.
+
+    Only while the cloud is not explained, and where there are few draws.
+    """
+    config, base = problem.config, problem.base
+    for _ in range(config.jumps):
+        cloud = problem.around(fit.material, np.zeros((len(fit.material), 3, 0), dtype=np.float32)).misfit(fit.posed).cloud
+        if cloud < base.config.explained or len(fit.z) > config.jumping:
+            break
+        others = []
+        for number in np.flatnonzero(fit.drawn.smooth):
+            for value in ndtri((np.arange(config.places) + 0.5) / config.places):
+                z = fit.z.copy()
+                z[number] = value
+                others.append(played(problem, fit.drawn, z, fit.posed, wide=True))
+        likely = sorted((other for other in others if other is not None), key=lambda other: other.misfit)
+        found = [descend(problem, other, config.first_rounds) for other in likely[: config.kept + 1]]
+        best = min(found, key=lambda other: other.misfit, default=fit)
+        if best.misfit >= fit.misfit:
+            break
+        fit = descend(problem, best, config.first_rounds)
+    return fit
 
 
 def choose_starts(problem: DrawsProblem, modes: Posed) -> list[tuple[int, Posed]]:
@@ -144,33 +212,52 @@ def started(problem: DrawsProblem, seed: int, posed: Posed) -> DrawsFit | None:
     return played(problem, drawn, drawn.z, posed)
 
 
-def played(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed) -> DrawsFit | None:
-    """The state of these draws and how badly it explains the frame; None where the scene refuses it."""
+def played(
+    problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed, wide: bool = False
+) -> DrawsFit | None:
+    """The state of these draws and how badly it explains the frame; None where the scene refuses it.
+
+    ``wide`` takes the cloud's first sigma, which tells how far off a state is that is not yet right.
+    """
     deformations = drawn.deformations(problem.scene, z)
     if deformations is None:
         return None
     material = material_moved(problem.scene, problem.model, deformations)
     fixed = problem.around(material, np.zeros((len(material), 3, 0), dtype=np.float32))
     rigid = replace(posed, z=np.empty(0))
-    misfit = fixed.misfit(rigid).total + float(z @ z)
+    sigma = problem.config.start_sigma * problem.model.half if wide else None
+    misfit = fixed.misfit(rigid, sigma).total + float(z @ z)
     return DrawsFit(drawn, z, rigid, material, misfit)
 
 
 def descend(problem: DrawsProblem, fit: DrawsFit, rounds: int) -> DrawsFit:
-    """Linearize, fit, play; a step that does not lower the misfit is halved, then given up."""
+    """Linearize, fit, play; a step that does not lower the misfit is halved, then given up.
+
+    Half of the rounds judge by the wide misfit: far from the answer the narrow one is flat.
+    """
     trust, sigma = problem.config.trust, problem.config.start_sigma
-    for _ in range(rounds):
+    for number in range(rounds):
+        wide = 2 * number < rounds
+        before = played(problem, fit.drawn, fit.z, fit.posed, wide)
+        assert before is not None
+        fit = before
         step, posed = linear_step(problem, fit, trust, sigma)
-        for share in (1.0, 0.5, 0.25):
-            # the pose belongs to the whole step; a part of it is posed by its own next linearization
-            tried = played(problem, fit.drawn, fit.z + share * step, posed if share == 1.0 else between(fit.posed, posed))
+        for share, place in ((1.0, posed), (0.5, between(fit.posed, posed))):
+            tried = played(problem, fit.drawn, fit.z + share * step, place, wide)
             if tried is not None and tried.misfit < fit.misfit:
                 fit = tried
                 break
         else:
             trust *= 0.3
         sigma *= 0.6
-    return fit
+    return played(problem, fit.drawn, fit.z, fit.posed) or fit
+
+
+def draws_prior(fit: DrawsFit, motion: Float32[np.ndarray, "m 3 d"], trust: float) -> Prior:
+    """Of a change of the draws: N(0, 1) of the draws themselves, near where they are; those that move nothing stay."""
+    moving = np.abs(motion).max(axis=(0, 1)) > 1e-9
+    precision = 1.0 + 1.0 / trust**2
+    return Prior(np.where(moving, -fit.z / precision, 0.0), np.diag(np.where(moving, precision, HELD)))
 
 
 def between(one: Posed, other: Posed) -> Posed:
@@ -190,11 +277,8 @@ def linear_step(
 ) -> tuple[Float[np.ndarray, " d"], Posed]:
     """Change of the draws, and the pose, that explain the frame best in the linear neighbourhood."""
     modes = jacobian(problem, fit)
-    moving = np.abs(modes).max(axis=(0, 1)) > 1e-9
-    precision = 1.0 + 1.0 / trust**2
-    center = np.where(moving, -fit.z / precision, 0.0)
-    prior = Prior(center, np.diag(np.where(moving, precision, HELD)))
     linear = problem.around(fit.material, modes)
+    prior = draws_prior(fit, modes, trust)
     start = replace(fit.posed, z=np.zeros(len(fit.z)))
     found = fit_cloud(linear, start, prior, sigma, problem.config.steps, 0.0)
     return found.z, found
@@ -203,17 +287,14 @@ def linear_step(
 def jacobian(problem: DrawsProblem, fit: DrawsFit) -> Float32[np.ndarray, "m 3 d"]:
     """Motion of all material points for a standard deviation of each draw: at the anchors, which the others follow."""
     model, drawn = problem.model, fit.drawn
-    result = np.zeros((len(model.rest_points), 3, len(fit.z)), dtype=np.float32)
     order = np.concatenate(model.anchors)
+    change = np.zeros((len(model.rest_points), 3, len(fit.z)), dtype=np.float32)
     for number in np.flatnonzero(drawn.smooth):
         step = DIFFERENCE * (-1.0 if fit.z[number] > 0 else 1.0)
         z = fit.z.copy()
         z[number] += step
         moved = drawn.deformations(problem.scene, z)
-        if moved is None:
-            continue
-        change = (anchors_moved(model, moved) - fit.material[order]) / step
-        everywhere = np.zeros((len(model.rest_points), 3))
-        everywhere[order] = change
-        result[:, :, number] = problem.spread(everywhere)
-    return result
+        if moved is not None:
+            change[order, :, number] = (anchors_moved(model, moved) - fit.material[order]) / step
+    spread: np.ndarray = problem.spread @ change.reshape(len(change), -1)
+    return spread.reshape(change.shape)
