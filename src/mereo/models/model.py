@@ -24,6 +24,7 @@ from mereo.models.config import Precision
 from mereo.models.decoder import Code, Prediction
 from mereo.models.device import pick_precision
 from mereo.models.network import Network
+from mereo.scenes.statistical_model import StatisticalModel
 
 SURE_LOGIT = 20.0
 """Lead of empty space where there can be nothing; trained networks reach about this in plainly empty space."""
@@ -85,6 +86,7 @@ class Model:
         nested: pairs of names (inner, outer), see ``SegmentedMesh``.
         precision: of the products; float32 is exact, bfloat16 faster on GPUs and some CPUs (`mereo bench` says what it
             costs), auto takes bfloat16 there.
+        statistical_model: of the object's states, which a registration fits; older weights have none.
     """
 
     network: Network
@@ -95,6 +97,7 @@ class Model:
     domain: Box | None = None
     nested: tuple[tuple[str, str], ...] = ()
     precision: Precision = "float32"
+    statistical_model: StatisticalModel | None = None
 
     @property
     def segmented(self) -> bool:

@@ -16,9 +16,13 @@ from mereo.models.device import find_device
 from mereo.models.encoders.autodecoder import CODES
 from mereo.models.model import Model
 from mereo.models.network import Network, config_from_dict
+from mereo.scenes.statistical_model_file import pack_model, unpack_model
 
-FORMAT_VERSION = 2
-"""Version 2 may hold the template in bytes; the rest is as in version 1, which is read too."""
+FORMAT_VERSION = 3
+"""Version 2 may hold the template in bytes, version 3 holds a statistical model too; all are read."""
+
+STATES = "states."
+"""Tensors of the statistical model begin with this."""
 
 PACKED = "decoder.lookup.distance"
 """The template's signed distances: with ten segments more than half of a float16 file."""
@@ -34,8 +38,15 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
 
     An autodecoder's codes of training examples are left out: using a network needs their mean only.
     """
+    with atomic_file(path) as partial:
+        partial.write_bytes(weights_bytes(model, dtype))
+
+
+def weights_bytes(model: Model, dtype: torch.dtype = torch.float32) -> bytes:
+    """Content of the file that ``save_model`` writes."""
+    states, facts = ({}, None) if model.statistical_model is None else pack_model(model.statistical_model)
     header = {
-        "version": FORMAT_VERSION,
+        "version": 2 if facts is None else FORMAT_VERSION,
         "network": asdict(model.network.config),
         "names": model.names,
         "colors": model.colors,
@@ -44,14 +55,15 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
         "domain": model.domain,
         "nested": model.nested,
         "provenance": model.provenance,
+        **({} if facts is None else {"states": facts}),
     }
     tensors = {
         name: _stored(name, value, dtype).contiguous()
         for name, value in model.network.state_dict().items()
         if name != CODES
     }
-    with atomic_file(path) as partial:
-        partial.write_bytes(save(tensors, metadata={"mereo": json.dumps(header)}))
+    tensors |= {STATES + name: torch.from_numpy(value) for name, value in states.items()}
+    return save(tensors, metadata={"mereo": json.dumps(header)})
 
 
 def _stored(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
@@ -117,11 +129,12 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
     if "mereo" not in metadata:
         raise ValueError(f"{path} holds tensors but no mereo header; give the weights.safetensors of a mereo run")
     header = json.loads(metadata["mereo"])
-    if header.get("version") not in (1, FORMAT_VERSION):
+    if header.get("version") not in range(1, FORMAT_VERSION + 1):
         raise ValueError(
             f"{path} has weights format {header.get('version')}; this mereo reads formats up to {FORMAT_VERSION}: "
             "train again, or install the matching version"
         )
+    states = {key.removeprefix(STATES): tensors.pop(key).numpy() for key in list(tensors) if key.startswith(STATES)}
     network = Network(config_from_dict(header["network"]), len(header["names"]))
     try:
         network.load_state_dict({name: _restored(name, value) for name, value in tensors.items()})
@@ -135,4 +148,5 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
         provenance=header["provenance"],
         domain=None if header["domain"] is None else (tuple(header["domain"][0]), tuple(header["domain"][1])),
         nested=tuple((inner, outer) for inner, outer in header.get("nested", ())),  # older weights have none
+        statistical_model=unpack_model(states, header["states"]) if states else None,
     )

@@ -4,15 +4,18 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.scenes.statistical_model import StatisticalModel, build_model, material_points
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.scenes.scene import Scene, State
 from mereo.geometry.solids import Solids
+from mereo.scenes.scene import Scene, State
 from mereo.scenes.seeds import example_rng
+from mereo.scenes.statistical_model import StatisticalModel, build_model, material_points
 
 STATES = 1500
 STATES_SEED = 500_000
 """A training seed: no test view shares its states."""
+
+LEAST_STATES = 100
+"""A small dataset is a trial, which should not wait for 1,500 states."""
 
 NODES = 600
 """Interior material points of all segments together."""
@@ -53,6 +56,11 @@ def sample_states(
     return np.stack(
         [state_points(scene.sample_state(example_rng(seed, i)), nodes, labels).astype(np.float32) for i in range(count)]
     )
+
+
+def states_for(examples: int) -> int:
+    """How many states the model of a dataset is built from: as many as it has examples, within limits."""
+    return min(max(examples, LEAST_STATES), STATES)
 
 
 def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED) -> StatisticalModel:

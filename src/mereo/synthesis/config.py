@@ -94,6 +94,9 @@ SENSORS: dict[Sensor, SensorConfig] = {
 TEMPLATE = "template.safetensors"
 """A dataset's file with the segments at rest (``rest_pose``)."""
 
+STATISTICAL_MODEL = "statistical_model.safetensors"
+"""A dataset's file with the object's statistical model (``statistical_model_file``)."""
+
 
 Sampler = Literal["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"]
 

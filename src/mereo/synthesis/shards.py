@@ -6,7 +6,8 @@ again, and ``shard-00000.safetensors`` and so on, whose tensors are (e examples,
     cloud f32 [e, p, 3], cloud_count i32 [e], center f64 [e, 3], scale f64 [e],
     positions f32 [e, q, 3], labels u8 [e, q], distances f32 [e, q], directions f16 [e, q, 3], rest f16 [e, q, 3]
 
-and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``rest_pose``).
+and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``rest_pose``), and
+``statistical_model.safetensors``, the modes of the object's random states (``statistical_model_file``).
 
 Workers only compute; this process alone writes. So one place meets a full disk, and whatever kills a worker leaves
 nothing half-written.
@@ -28,11 +29,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from mereo.io.atomic_files import atomic_file, write_json
+from mereo.scenes.random_states import scene_model, states_for
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.rest_pose import rest_distances
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.synthesis.config import TEMPLATE, GenerateConfig
+from mereo.scenes.statistical_model_file import save_statistical_model
+from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
 from mereo.synthesis.depth_sensor import check_sensor
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.progress import progress
@@ -121,6 +124,8 @@ def generate(
     if not (output / TEMPLATE).exists():
         with atomic_file(output / TEMPLATE) as temporary:
             temporary.write_bytes(save({"distance": rest_distances(loaded.rest)}))
+    if not (output / STATISTICAL_MODEL).exists():
+        save_statistical_model(scene_model(loaded, states_for(examples)), output / STATISTICAL_MODEL)
     missing = [item for item in shards if not item.is_complete()]
     total = sum(item.end - item.first for item in missing)
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile

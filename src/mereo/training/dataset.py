@@ -15,7 +15,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from mereo.geometry.conventions import MIN_POINTS
-from mereo.synthesis.config import TEMPLATE
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.statistical_model_file import load_statistical_model
+from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE
 from mereo.training.config import AugmentConfig
 
 
@@ -46,6 +48,7 @@ class Dataset:
         viewpoint: the camera's position in normalized coordinates.
         manifest: how the dataset was made.
         template: signed distances to the segments at rest (``rest_pose.rest_distances``); None in older datasets.
+        statistical_model: of the object's states, which goes into the weights; None in older datasets.
         visible_m: least and greatest longest side of the visible part's box in metres; None where the unit is unknown.
     """
 
@@ -60,6 +63,7 @@ class Dataset:
     manifest: dict[str, Any]
     template: Float[Tensor, "s n n n"] | None = None
     visible_m: tuple[float, float] | None = None
+    statistical_model: StatisticalModel | None = None
 
     def __len__(self) -> int:
         return len(self.cloud)
@@ -89,6 +93,7 @@ class Dataset:
             manifest=manifest,
             template=_read_template(directory),
             visible_m=_visible_m(joined["scale"], manifest.get("unit_m")),
+            statistical_model=_read_statistical_model(directory),
         )
 
     @property
@@ -166,6 +171,11 @@ def _read_shard(path: Path) -> dict[str, Tensor]:
 def _visible_m(scale: Float[Tensor, " e"], unit_m: float | None) -> tuple[float, float] | None:
     """From the normalizers' scales, which are one over half the longest side."""
     return None if unit_m is None else (2 * unit_m / float(scale.max()), 2 * unit_m / float(scale.min()))
+
+
+def _read_statistical_model(directory: Path) -> StatisticalModel | None:
+    path = directory / STATISTICAL_MODEL
+    return load_statistical_model(path) if path.exists() else None
 
 
 def _read_template(directory: Path) -> Tensor | None:

@@ -16,8 +16,17 @@ import torch
 from mereo.io.atomic_files import new_directory
 from mereo.models.model import Model
 from mereo.models.network import config_from_dict
-from mereo.models.weights import load_model, save_model
+from mereo.models.weights import load_model, save_model, weights_bytes
+from mereo.scenes.random_states import scene_model
+from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.statistical_model_file import modes_within, with_fewer_modes
 from mereo.training.config import PRESETS
+
+MOST_BYTES = 8_000_000
+"""Of a released file; modes that do not fit are left out."""
+
+HEADER_BYTES = 4_000
+"""What names and shapes of the statistical model take."""
 
 PLAIN_CHARACTERS = "abcdefghijklmnopqrstuvwxyz0123456789-_"
 
@@ -41,7 +50,7 @@ def release(
         raise ValueError(
             f"the name is {name!r}; weights are named by lower case letters, digits, - and _: choose others"
         )
-    model = _without_places(load_model(weights))
+    model = _with_statistical_model(_without_places(load_model(weights)))
     found = [_metrics(folder, model) for folder in tests]
     with new_directory(output, force) as directory:
         path = directory / f"{name}.safetensors"
@@ -158,6 +167,22 @@ def _metrics(folder: Path, model: Model) -> dict[str, Any]:
             "give tests of these weights"
         )
     return found
+
+
+def _with_statistical_model(model: Model) -> Model:
+    """The weights with as many modes of the object's states as fit into ``MOST_BYTES`` beside the network.
+
+    Older weights hold none: they get those of the built-in scene that they were trained on.
+    """
+    found, scene = model.statistical_model, str(model.provenance.get("scene"))
+    if found is None and scene in SCENES:
+        found = scene_model(load_scene(scene))
+    if found is None or found.rest.names != model.names:
+        return replace(model, statistical_model=None)
+    size = len(weights_bytes(replace(model, statistical_model=None), torch.float16))
+    return replace(
+        model, statistical_model=with_fewer_modes(found, modes_within(found, MOST_BYTES - size - HEADER_BYTES))
+    )
 
 
 def _without_places(model: Model) -> Model:

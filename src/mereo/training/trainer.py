@@ -259,6 +259,7 @@ class Trainer:
             provenance=provenance,
             domain=self.data.domain(),
             nested=tuple((inner, outer) for inner, outer in manifest.get("nested", ())),
+            statistical_model=self.data.statistical_model,
         )
 
     def resume(self) -> bool:

@@ -1,0 +1,150 @@
+"""Statistical models as tensors, small enough to travel with datasets and weights.
+
+Modes and the library of states are bytes: each mode in 254 steps of its largest motion, the first few, which move most,
+in 65,534, and each coefficient in steps of a 32nd of a standard deviation. A hundred modes of 6,000 material points are
+2 MB, and rounding moves points by about a hundredth of a scene unit, a tenth of the paper's noise. Rest pose and mean
+keep float32.
+
+Notation: v vertices, m material points, k modes, n states, q pairs.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.io.atomic_files import atomic_file
+from mereo.scenes.pair_distances import PairDistances
+from mereo.scenes.statistical_model import StatisticalModel
+
+LIBRARY_STEP = 1 / 32
+"""Of a coefficient; bytes reach to 4 standard deviations, which one normal number in 16,000 exceeds."""
+
+WIDE_MODES = 12
+"""The first ones, in two bytes: they move most, and so would be rounded most."""
+
+HEADER = "mereo"
+
+Tensors = Mapping[str, np.ndarray]
+
+
+def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors of a statistical model, and the facts about it that are none: names, colours, sizes, residue."""
+    wide, wide_scale = _integers(model.modes[..., :WIDE_MODES], np.int16)
+    narrow, narrow_scale = _integers(model.modes[..., WIDE_MODES:], np.int8)
+    library = np.clip(np.rint(model.library / LIBRARY_STEP), -127, 127).astype(np.int8)
+    vertices, faces, _ = model.rest.merged()
+    tensors = {
+        "vertices": vertices.astype(np.float32),
+        "faces": _narrow(faces),
+        "nodes": model.nodes.astype(np.float32),
+        "node_labels": model.node_labels,
+        "mean": model.mean.astype(np.float32),
+        "wide_modes": wide,
+        "modes": narrow,
+        "mode_scale": np.concatenate([wide_scale, narrow_scale]),
+        "library": library,
+        "pair_index": _narrow(np.stack([model.pairs.first, model.pairs.second])),
+        "pair_distance": np.stack([model.pairs.mean, model.pairs.std]).astype(np.float32),
+    }
+    segments = model.rest.segments
+    facts = {
+        "names": list(model.rest.names),
+        "colors": [list(color) for color in model.rest.colors],
+        "nested": [list(pair) for pair in model.rest.nested],
+        "solid": [segment.solid for segment in segments],
+        "vertices": [len(segment.vertices) for segment in segments],
+        "faces": [len(segment.faces) for segment in segments],
+        "residue": model.residue,
+    }
+    return {name: np.ascontiguousarray(value) for name, value in tensors.items()}, facts
+
+
+def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel:
+    """Inverse of ``pack_model`` up to rounding."""
+    index, (mean, std) = tensors["pair_index"].astype(np.int64), tensors["pair_distance"].astype(np.float64)
+    return StatisticalModel(
+        rest=_rest(tensors, facts),
+        nodes=tensors["nodes"].astype(np.float64),
+        node_labels=tensors["node_labels"],
+        mean=tensors["mean"].astype(np.float64),
+        modes=np.concatenate([tensors["wide_modes"], tensors["modes"]], axis=2, dtype=np.float32)
+        * tensors["mode_scale"],
+        library=tensors["library"].astype(np.float32) * np.float32(LIBRARY_STEP),
+        residue=float(facts["residue"]),
+        pairs=PairDistances(index[0], index[1], mean, std),
+    )
+
+
+def save_statistical_model(model: StatisticalModel, path: Path) -> None:
+    """Write a statistical model as one safetensors file, whole or not at all."""
+    tensors, facts = pack_model(model)
+    with atomic_file(path) as partial:
+        partial.write_bytes(save(tensors, metadata={HEADER: json.dumps(facts)}))
+
+
+def load_statistical_model(path: Path) -> StatisticalModel:
+    """Read what ``save_statistical_model`` wrote; ``ValueError`` for another file."""
+    try:
+        with safe_open(path, framework="numpy") as file:
+            facts = json.loads((file.metadata() or {})[HEADER])
+            return unpack_model({key: file.get_tensor(key) for key in file.keys()}, facts)  # noqa: SIM118
+    except (SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
+        raise ValueError(
+            f"{path} is no statistical model of mereo ({error}); delete it and run `mereo generate ... --resume`"
+        ) from None
+
+
+def with_fewer_modes(model: StatisticalModel, most: int) -> StatisticalModel:
+    """The model with its ``most`` largest modes; what the others move counts as residue."""
+    if most >= model.count:
+        return model
+    lost = float((model.motion[most:] ** 2).sum())
+    return replace(
+        model,
+        modes=np.ascontiguousarray(model.modes[..., :most]),
+        library=np.ascontiguousarray(model.library[:, :most]),
+        residue=float(np.sqrt(model.residue**2 + lost)),
+    )
+
+
+def modes_within(model: StatisticalModel, size: int) -> int:
+    """How many modes fit into ``size`` bytes; 0 where not even the rest of the model does."""
+    tensors, _ = pack_model(model)
+    each = 3 * len(model.mean) + len(model.library) + 4
+    fixed = sum(value.nbytes for value in tensors.values()) - each * model.count
+    return min(model.count, max(0, (size - fixed) // each))
+
+
+def _integers(
+    modes: Float32[np.ndarray, "m 3 k"], dtype: type[np.signedinteger]
+) -> tuple[Int[np.ndarray, "m 3 k"], Float32[np.ndarray, " k"]]:
+    """Modes in steps of their largest motion, and the motion that one step of each stands for."""
+    largest = np.abs(modes).max(axis=(0, 1), initial=1e-12)
+    scale = (largest / np.iinfo(dtype).max).astype(np.float32)
+    return np.rint(modes / scale).astype(dtype), scale
+
+
+def _narrow(index: np.ndarray) -> np.ndarray:
+    """Indices in two bytes where they fit."""
+    return index.astype(np.uint16 if index.size == 0 or index.max() < 2**16 else np.uint32)
+
+
+def _rest(tensors: Tensors, facts: Mapping[str, Any]) -> SegmentedMesh:
+    """The segments at rest."""
+    vertices, faces = tensors["vertices"].astype(np.float64), tensors["faces"].astype(np.int64)
+    first, start, segments = 0, 0, []
+    for name, color, solid, points, triangles in zip(
+        *(facts[key] for key in ("names", "colors", "solid", "vertices", "faces")), strict=True
+    ):
+        own = faces[start : start + triangles] - first
+        segments.append(Segment(name, tuple(color), vertices[first : first + points], own, solid))
+        first, start = first + points, start + triangles
+    return SegmentedMesh(tuple(segments), tuple((inner, outer) for inner, outer in facts["nested"]))
