@@ -70,13 +70,13 @@ def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], dict[str
 def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel:
     """Inverse of ``pack_model`` up to rounding."""
     index, (mean, std) = tensors["pair_index"].astype(np.int64), tensors["pair_distance"].astype(np.float64)
+    steps = np.concatenate([tensors["wide_modes"], tensors["modes"]], axis=2, dtype=np.float32)
     return StatisticalModel(
         rest=_rest(tensors, facts),
         nodes=tensors["nodes"].astype(np.float64),
         node_labels=tensors["node_labels"],
         mean=tensors["mean"].astype(np.float64),
-        modes=np.concatenate([tensors["wide_modes"], tensors["modes"]], axis=2, dtype=np.float32)
-        * tensors["mode_scale"],
+        modes=steps * tensors["mode_scale"],
         library=tensors["library"].astype(np.float32) * np.float32(LIBRARY_STEP),
         residue=float(facts["residue"]),
         pairs=PairDistances(index[0], index[1], mean, std),

@@ -179,10 +179,8 @@ def _with_statistical_model(model: Model) -> Model:
         found = scene_model(load_scene(scene))
     if found is None or found.rest.names != model.names:
         return replace(model, statistical_model=None)
-    size = len(weights_bytes(replace(model, statistical_model=None), torch.float16))
-    return replace(
-        model, statistical_model=with_fewer_modes(found, modes_within(found, MOST_BYTES - size - HEADER_BYTES))
-    )
+    left = MOST_BYTES - HEADER_BYTES - len(weights_bytes(replace(model, statistical_model=None), torch.float16))
+    return replace(model, statistical_model=with_fewer_modes(found, modes_within(found, left)))
 
 
 def _without_places(model: Model) -> Model:
