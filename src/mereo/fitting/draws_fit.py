@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import PointWeights
+from mereo.fitting.config import DrawsConfig
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.hypotheses import ALIKE, robust_poses
@@ -21,6 +22,7 @@ from mereo.fitting.playback import Drawn, DrawnStates, anchors_moved, material_m
 from mereo.fitting.priors import Prior
 from mereo.fitting.problem import Problem
 from mereo.fitting.residuals import NetworkTerm, robust_square
+from mereo.geometry.procrustes import fit_rigid
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel, following
 
@@ -32,37 +34,6 @@ DIFFERENCE = 0.02
 
 HELD = 1e6
 """Precision of draws that move nothing here: they stay."""
-
-
-@dataclass(frozen=True)
-class DrawsConfig:
-    """Constants of the fit of draws.
-
-    Attributes:
-        starts: random states that are tried, half of them like the fit of the modes, half like the network's answer.
-        kept: how many of them are followed to the end.
-        first_rounds, last_rounds: linearizations of all and of those that are kept.
-        steps: of the linear fit in each.
-        approaches: linearizations towards the fit of the modes, first of all.
-        jumps: how often one draw may jump, where there are at most ``jumping``, to one of ``places`` places.
-        trust: standard deviation of a draw's change in one linearization.
-        start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
-        states, seed: how many random states starts are chosen from.
-    """
-
-    starts: int = 6
-    kept: int = 2
-    first_rounds: int = 2
-    last_rounds: int = 5
-    steps: int = 4
-    approaches: int = 3
-    jumps: int = 2
-    jumping: int = 30
-    places: int = 6
-    trust: float = 0.7
-    start_sigma: float = 0.03
-    states: int = 600
-    seed: int = 400_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +99,30 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     config = problem.config
     starts = [fit for fit in (started(problem, *start) for start in choose_starts(problem, modes)) if fit is not None]
     starts = [fit for fit in starts if int(fit.drawn.smooth.sum()) <= MOST_DRAWS]
-    starts = [approach(problem, fit, modes) for fit in starts]
+    guess = problem.states.guess(modes.z, problem.model.motion, config.near)
+    guessed = played(problem, guess, guess.z, pose_on(problem, guess, modes))
+    starts = [approach(problem, fit, modes) for fit in [*starts, *([] if guessed is None else [guessed])]]
     for rounds, keep in ((config.first_rounds, config.starts), (config.last_rounds, config.kept)):
-        starts = sorted(starts, key=lambda fit: fit.misfit)[:keep]
+        starts = sorted(starts, key=lambda fit: wide_misfit(problem, fit))[:keep]
         starts = [descend(problem, fit, rounds) for fit in starts]
     best = min(starts, key=lambda fit: fit.misfit, default=None)
     return None if best is None else jump(problem, best)
+
+
+def pose_on(problem: DrawsProblem, drawn: Drawn, modes: Posed) -> Posed:
+    """The rigid pose of a state on the fit of the modes."""
+    deformations = drawn.deformations(problem.scene, drawn.z)
+    if deformations is None:
+        return modes
+    model = problem.model
+    T = fit_rigid(material_moved(problem.scene, model, deformations), modes.place(model.material(modes.z)))
+    return Posed(T[:3, :3], T[:3, 3], modes.z)
+
+
+def wide_misfit(problem: DrawsProblem, fit: DrawsFit) -> float:
+    """By the cloud's first sigma."""
+    seen = played(problem, fit.drawn, fit.z, fit.posed, wide=True)
+    return np.inf if seen is None else seen.misfit
 
 
 def approach(problem: DrawsProblem, fit: DrawsFit, modes: Posed) -> DrawsFit:
@@ -163,12 +152,12 @@ def approach(problem: DrawsProblem, fit: DrawsFit, modes: Posed) -> DrawsFit:
 def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """One draw anywhere in its range, where that explains the frame better: a wheel by half a turn, a finger's other side.
 
-    Only while the cloud is not explained, and where there are few draws.
+    Only while the cloud is not explained.
     """
     config, base = problem.config, problem.base
     for _ in range(config.jumps):
         cloud = problem.around(fit.material, np.zeros((len(fit.material), 3, 0), dtype=np.float32)).misfit(fit.posed).cloud
-        if cloud < base.config.explained or len(fit.z) > config.jumping:
+        if cloud < base.config.explained:
             break
         others = []
         for number in np.flatnonzero(fit.drawn.smooth):
