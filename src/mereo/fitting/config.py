@@ -71,7 +71,6 @@ class DrawsConfig:
         near: how many states count as near where draws are guessed from the modes.
         trust: standard deviation of a draw's change in one linearization.
         start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
-        states, seed: how many random states starts are chosen from.
     """
 
     starts: int = 6
@@ -86,8 +85,6 @@ class DrawsConfig:
     near: int = 100
     trust: float = 0.7
     start_sigma: float = 0.03
-    states: int = 600
-    seed: int = 400_000
 
 
 MANY_DRAWS = DrawsConfig(starts=2, kept=1, approaches=2, first_rounds=1, last_rounds=4, jumps=0)

@@ -21,6 +21,9 @@ from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
+STATES_SEED = 400_000
+"""A training seed."""
+
 SMOOTH = ("uniform", "normal", "triangular")
 """Kinds of draws that move the state continuously; the others stay as they are."""
 
@@ -40,7 +43,7 @@ LARGEST = 4.0
 class Playback(Recorder):
     """A generator whose draws are given in the order of the calls; more or other ones raise ``OutOfDraws``."""
 
-    def __init__(self, seed: int, shares: Sequence[Shares]) -> None:
+    def __init__(self, seed: int, shares: Sequence[np.ndarray]) -> None:
         super().__init__(seed, {})
         self._shares, self._next = shares, 0
 
@@ -103,7 +106,9 @@ class DrawnStates:
     modes: Float[np.ndarray, "n k"]
 
     @classmethod
-    def of(cls, scene: Scene, model: StatisticalModel, count: int, first_seed: int) -> "DrawnStates":
+    def of(
+        cls, scene: Scene, model: StatisticalModel, count: int = 600, first_seed: int = STATES_SEED
+    ) -> "DrawnStates":
         """States of ``count`` seeds from ``first_seed`` on."""
         seeds = tuple(range(first_seed, first_seed + count))
         material, draws = [], []
@@ -150,9 +155,7 @@ def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]
     return z
 
 
-def anchors_moved(
-    model: StatisticalModel, deformations: tuple[Deformation, ...]
-) -> Float[np.ndarray, "a 3"]:
+def anchors_moved(model: StatisticalModel, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "a 3"]:
     """Where the anchors of all segments go, one segment after the other."""
     pairs = zip(deformations, model.anchors, strict=True)
     return np.concatenate([deformation(model.rest_points[index]) for deformation, index in pairs])

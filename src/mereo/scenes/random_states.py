@@ -4,11 +4,11 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.scenes.statistical_model import StatisticalModel, build_model, material_points
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.scenes.scene import Scene, State
 from mereo.geometry.solids import Solids
+from mereo.scenes.scene import Scene, State
 from mereo.scenes.seeds import example_rng
+from mereo.scenes.statistical_model import StatisticalModel, build_model, material_points
 
 STATES = 1500
 STATES_SEED = 500_000
@@ -23,7 +23,8 @@ CANDIDATES = 40_000
 def interior_nodes(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "j 3"], UInt8[np.ndarray, " j"]]:
     """Points inside the segments, evenly spread, as many for each segment, and their labels."""
     rng = np.random.default_rng(0)
-    points = rng.uniform(*rest.bounds, size=(CANDIDATES, 3))
+    low, high = rest.bounds
+    points = rng.uniform(low, high, size=(CANDIDATES, 3))
     labels = Solids(rest).label(points)
     each = NODES // len(rest.segments)
     rows = []
