@@ -108,7 +108,8 @@ def row(
     for parts in (np.concatenate(seen), np.concatenate(hidden)):
         ends.append("{:.2f} / {:.2f}".format(*np.quantile(parts, [0.5, 0.95])) if len(parts) else "-")
     scores = " | ".join(f"{mean[i]:.3f} / {mean[i + 1]:.3f}" for i in (0, 2, 4))
-    return f"| {name} | {scores} | {middle[6]:.2f} / {middle[7]:.2f} | {mean[8]:.2f} | {mean[9]:.2f} | {' | '.join(ends)} |"
+    rates = f"{middle[6]:.2f} / {middle[7]:.2f} | {mean[8]:.2f} | {mean[9]:.2f}"
+    return f"| {name} | {scores} | {rates} | {' | '.join(ends)} |"
 
 
 def main() -> None:
