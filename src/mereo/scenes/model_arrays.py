@@ -62,9 +62,7 @@ def _arrays(model: StatisticalModel, count: int) -> Arrays:
     index = np.uint16 if max(model.vertex_counts) < 2**16 else np.int32
     return {
         "vertices": np.concatenate([s.vertices for s in model.rest.segments]).astype(np.float32),
-        "faces": np.concatenate([s.faces for s in model.rest.segments]).astype(
-            np.uint16 if _short(model) else np.int32
-        ),
+        "faces": np.concatenate([s.faces for s in model.rest.segments]).astype(index),
         "nodes": model.nodes.astype(np.float32),
         "node_labels": model.node_labels,
         "mean": model.mean.astype(np.float32),
