@@ -1,9 +1,9 @@
 """Motion of any point of an object, from the motion of its material points (surface vertices and interior nodes).
 
-A point ``p`` follows ``sum_i w_i x_i`` over material points ``x_i`` of its own segment, with weights from rest positions
-alone: ``sum_i w_i = 1`` and ``sum_i w_i x_i = p``, so that every affine motion, hence every rigid part, is followed
-exactly (moving least squares; Levin, Math. Comp. 1998). The motion is linear in the material points, so a linear model
-of these is one of every point.
+A point ``p`` follows ``sum_i w_i x_i`` over material points ``x_i`` of its own segment, with weights from rest
+positions alone: ``sum_i w_i = 1`` and ``sum_i w_i x_i = p``, so that every affine motion, hence every rigid part, is
+followed exactly (moving least squares; Levin, Math. Comp. 1998). The motion is linear in the material points, so a
+linear model of these is one of every point.
 
 Notation: n points, k material points that each of them follows, m material points.
 """

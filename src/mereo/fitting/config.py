@@ -54,3 +54,38 @@ class FitConfig:
     scale_std: float = 0.1
     accepted: float = 0.95
     tolerance: float = 0.45
+
+
+@dataclass(frozen=True)
+class DrawsConfig:
+    """Constants of the fit of draws.
+
+    Attributes:
+        starts: random states that are tried, half of them like the fit of the modes, half like the network's answer.
+        kept: how many of them are followed to the end.
+        approaches: linearizations towards the fit of the modes, first of all.
+        first_rounds, last_rounds: linearizations of all and of those that are kept.
+        steps: of the linear fit in each.
+        jumps: how often one draw may jump to one of ``places`` places.
+        few: scenes with more draws than this get ``MANY_DRAWS`` instead: every linearization plays each draw once.
+        near: how many states count as near where draws are guessed from the modes.
+        trust: standard deviation of a draw's change in one linearization.
+        start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
+    """
+
+    starts: int = 6
+    kept: int = 2
+    approaches: int = 3
+    first_rounds: int = 2
+    last_rounds: int = 5
+    steps: int = 4
+    jumps: int = 2
+    places: int = 6
+    few: int = 30
+    near: int = 100
+    trust: float = 0.7
+    start_sigma: float = 0.03
+
+
+MANY_DRAWS = DrawsConfig(starts=2, kept=1, approaches=2, first_rounds=1, last_rounds=4, jumps=0)
+"""For scenes with many draws."""

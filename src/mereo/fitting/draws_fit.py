@@ -1,126 +1,31 @@
 """A scene's own draws that explain a frame: Gauss and Newton's method on states that the scene really has.
 
-Around a state the material points are linear in the draws, so its neighbourhood is a linear model like that of the
-modes, fitted by the same code; then the scene is played with the draws that were found, and so on.
+Around a state the scene is linear in its draws (``draws_problem``); it is played with the draws that fit best there,
+and so on, from several starts.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Float32
-from scipy.spatial.transform import Rotation
-from scipy.sparse import csr_array
 from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import PointWeights
-from mereo.fitting.correspondences import Correspondences
+from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, between, draws_prior, jacobian, linear_step, played
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.hypotheses import ALIKE, robust_poses
-from mereo.fitting.modes_fit import fit_cloud, fit_network
-from mereo.fitting.playback import Drawn, DrawnStates, anchors_moved, material_moved
-from mereo.fitting.priors import Prior
-from mereo.fitting.problem import Problem
+from mereo.fitting.modes_fit import fit_network
+from mereo.fitting.playback import Drawn, material_moved
 from mereo.fitting.residuals import NetworkTerm, robust_square
-from mereo.scenes.scene import Scene
-from mereo.scenes.statistical_model import StatisticalModel, following
+from mereo.geometry.procrustes import fit_rigid
 
 MOST_DRAWS = 120
 """Scenes with more free numbers are left to the modes."""
 
-DIFFERENCE = 0.02
-"""Step of finite differences, in standard deviations of a draw."""
+TOWARDS_MIDDLE = (1.0, 0.8, 0.6, 0.4)
+"""Shares of guessed draws that are tried, until the scene takes them."""
 
-HELD = 1e6
-"""Precision of draws that move nothing here: they stay."""
-
-
-@dataclass(frozen=True)
-class DrawsConfig:
-    """Constants of the fit of draws.
-
-    Attributes:
-        starts: random states that are tried, half of them like the fit of the modes, half like the network's answer.
-        kept: how many of them are followed to the end.
-        first_rounds, last_rounds: linearizations of all and of those that are kept.
-        steps: of the linear fit in each.
-        approaches: linearizations towards the fit of the modes, first of all.
-        jumps: how often one draw may jump, where there are at most ``jumping``, to one of ``places`` places.
-        trust: standard deviation of a draw's change in one linearization.
-        start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
-        states, seed: how many random states starts are chosen from.
-    """
-
-    starts: int = 6
-    kept: int = 2
-    first_rounds: int = 2
-    last_rounds: int = 5
-    steps: int = 4
-    approaches: int = 3
-    jumps: int = 2
-    jumping: int = 30
-    places: int = 6
-    trust: float = 0.7
-    start_sigma: float = 0.03
-    states: int = 600
-    seed: int = 400_000
-
-
-@dataclass(frozen=True, eq=False)
-class DrawsProblem:
-    """A frame to be explained by the states of a scene.
-
-    Attributes:
-        base: the same frame, explained by modes.
-        states: random states of the scene.
-        found: correspondences, scene units.
-        weights: how their rest positions follow the material points.
-        spread: how all material points follow the anchors, as a sparse matrix.
-    """
-
-    base: Problem
-    states: DrawnStates
-    found: Correspondences
-    weights: PointWeights
-    spread: csr_array
-    config: DrawsConfig
-
-    @property
-    def model(self) -> StatisticalModel:
-        return self.base.model
-
-    @property
-    def scene(self) -> Scene:
-        return self.states.scene
-
-    @classmethod
-    def of(cls, base: Problem, states: DrawnStates, found: Correspondences, config: DrawsConfig) -> "DrawsProblem":
-        model = base.model
-        every = following(model.rest_anchors, model.rest_points, model.labels)
-        rows = np.repeat(np.arange(len(every.index)), every.index.shape[1])
-        entries = (every.weight.ravel().astype(np.float32), (rows, every.index.ravel()))
-        spread = csr_array(entries, shape=(len(model.rest_points),) * 2)
-        return cls(base, states, found, model.weights(found.rest, found.labels), spread, config)
-
-    def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> Problem:
-        """The problem in the linear neighbourhood of a state."""
-        model = self.model.around(mean, modes)
-        network = NetworkTerm(self.found.points, self.weights(mean), self.weights(modes), self.found.confidence)
-        return Problem(model, network, self.base.evidence, self.base.scale_std, self.base.config)
-
-
-@dataclass(frozen=True, eq=False)
-class DrawsFit:
-    """A played state, posed: draws, rigid pose (its ``z`` is empty), material points unposed, misfit with its prior."""
-
-    drawn: Drawn
-    z: Float[np.ndarray, " d"]
-    posed: Posed
-    material: Float[np.ndarray, "m 3"]
-    misfit: float
-
-    def placed(self) -> Float[np.ndarray, "m 3"]:
-        """Material points in the camera frame."""
-        return self.posed.place(self.material)
+SHARES = (1.0, 0.5, 0.2)
+"""Of a step that are tried until the scene takes one."""
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
@@ -128,12 +33,31 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     config = problem.config
     starts = [fit for fit in (started(problem, *start) for start in choose_starts(problem, modes)) if fit is not None]
     starts = [fit for fit in starts if int(fit.drawn.smooth.sum()) <= MOST_DRAWS]
-    starts = [approach(problem, fit, modes) for fit in starts]
+    guess = guessed(problem, modes)
+    starts = [approach(problem, fit, modes) for fit in [*starts, *([] if guess is None else [guess])]]
     for rounds, keep in ((config.first_rounds, config.starts), (config.last_rounds, config.kept)):
-        starts = sorted(starts, key=lambda fit: fit.misfit)[:keep]
+        starts = sorted(starts, key=lambda fit: wide_misfit(problem, fit))[:keep]
         starts = [descend(problem, fit, rounds) for fit in starts]
     best = min(starts, key=lambda fit: fit.misfit, default=None)
     return None if best is None else jump(problem, best)
+
+
+def guessed(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
+    """The state whose draws the fit of the modes suggests, or one towards the middle where the scene refuses it."""
+    model, drawn = problem.model, problem.states.guess(modes.z, problem.model.motion, problem.config.near)
+    for share in TOWARDS_MIDDLE:
+        z = np.where(drawn.smooth, share * drawn.z, drawn.z)
+        deformations = drawn.deformations(problem.scene, z)
+        if deformations is not None:
+            T = fit_rigid(material_moved(problem.scene, model, deformations), modes.place(model.material(modes.z)))
+            return played(problem, drawn, z, Posed(T[:3, :3], T[:3, 3], np.empty(0)))
+    return None
+
+
+def wide_misfit(problem: DrawsProblem, fit: DrawsFit) -> float:
+    """By the cloud's first sigma."""
+    seen = played(problem, fit.drawn, fit.z, fit.posed, wide=True)
+    return np.inf if seen is None else seen.misfit
 
 
 def approach(problem: DrawsProblem, fit: DrawsFit, modes: Posed) -> DrawsFit:
@@ -153,22 +77,24 @@ def approach(problem: DrawsProblem, fit: DrawsFit, modes: Posed) -> DrawsFit:
         linear = replace(problem.around(fit.material, motion), network=network)
         start = replace(fit.posed, z=np.zeros(len(fit.z)))
         found = fit_network(linear, start, draws_prior(fit, motion, config.trust))
-        nearer = played(problem, fit.drawn, fit.z + found.z, found)
-        if nearer is None:
-            break
-        fit = nearer
+        tried = (
+            played(problem, fit.drawn, fit.z + share * found.z, between(fit.posed, found, share)) for share in SHARES
+        )
+        fit = next((nearer for nearer in tried if nearer is not None), fit)
     return best
 
 
 def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """One draw anywhere in its range, where that explains the frame better: a wheel by half a turn, a finger's other side.
+    """One draw anywhere in its range, where that explains the frame better: a wheel by half a turn.
 
-    Only while the cloud is not explained, and where there are few draws.
+    Only while the cloud is not explained.
     """
     config, base = problem.config, problem.base
     for _ in range(config.jumps):
-        cloud = problem.around(fit.material, np.zeros((len(fit.material), 3, 0), dtype=np.float32)).misfit(fit.posed).cloud
-        if cloud < base.config.explained or len(fit.z) > config.jumping:
+        cloud = (
+            problem.around(fit.material, np.zeros((len(fit.material), 3, 0), dtype=np.float32)).misfit(fit.posed).cloud
+        )
+        if cloud < base.config.explained:
             break
         others = []
         for number in np.flatnonzero(fit.drawn.smooth):
@@ -212,24 +138,6 @@ def started(problem: DrawsProblem, seed: int, posed: Posed) -> DrawsFit | None:
     return played(problem, drawn, drawn.z, posed)
 
 
-def played(
-    problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed, wide: bool = False
-) -> DrawsFit | None:
-    """The state of these draws and how badly it explains the frame; None where the scene refuses it.
-
-    ``wide`` takes the cloud's first sigma, which tells how far off a state is that is not yet right.
-    """
-    deformations = drawn.deformations(problem.scene, z)
-    if deformations is None:
-        return None
-    material = material_moved(problem.scene, problem.model, deformations)
-    fixed = problem.around(material, np.zeros((len(material), 3, 0), dtype=np.float32))
-    rigid = replace(posed, z=np.empty(0))
-    sigma = problem.config.start_sigma * problem.model.half if wide else None
-    misfit = fixed.misfit(rigid, sigma).total + float(z @ z)
-    return DrawsFit(drawn, z, rigid, material, misfit)
-
-
 def descend(problem: DrawsProblem, fit: DrawsFit, rounds: int) -> DrawsFit:
     """Linearize, fit, play; a step that does not lower the misfit is halved, then given up.
 
@@ -242,8 +150,8 @@ def descend(problem: DrawsProblem, fit: DrawsFit, rounds: int) -> DrawsFit:
         assert before is not None
         fit = before
         step, posed = linear_step(problem, fit, trust, sigma)
-        for share, place in ((1.0, posed), (0.5, between(fit.posed, posed))):
-            tried = played(problem, fit.drawn, fit.z + share * step, place, wide)
+        for share in SHARES:
+            tried = played(problem, fit.drawn, fit.z + share * step, between(fit.posed, posed, share), wide)
             if tried is not None and tried.misfit < fit.misfit:
                 fit = tried
                 break
@@ -251,50 +159,3 @@ def descend(problem: DrawsProblem, fit: DrawsFit, rounds: int) -> DrawsFit:
             trust *= 0.3
         sigma *= 0.6
     return played(problem, fit.drawn, fit.z, fit.posed) or fit
-
-
-def draws_prior(fit: DrawsFit, motion: Float32[np.ndarray, "m 3 d"], trust: float) -> Prior:
-    """Of a change of the draws: N(0, 1) of the draws themselves, near where they are; those that move nothing stay."""
-    moving = np.abs(motion).max(axis=(0, 1)) > 1e-9
-    precision = 1.0 + 1.0 / trust**2
-    return Prior(np.where(moving, -fit.z / precision, 0.0), np.diag(np.where(moving, precision, HELD)))
-
-
-def between(one: Posed, other: Posed) -> Posed:
-    """Half of the way, for half of a step."""
-    turn = Rotation.from_matrix(other.rotation @ one.rotation.T)
-    half = Rotation.from_rotvec(turn.as_rotvec() / 2).as_matrix()
-    return Posed(
-        half @ one.rotation,
-        (one.translation + other.translation) / 2,
-        one.z,
-        (one.log_scale + other.log_scale) / 2,
-    )
-
-
-def linear_step(
-    problem: DrawsProblem, fit: DrawsFit, trust: float, sigma: float
-) -> tuple[Float[np.ndarray, " d"], Posed]:
-    """Change of the draws, and the pose, that explain the frame best in the linear neighbourhood."""
-    modes = jacobian(problem, fit)
-    linear = problem.around(fit.material, modes)
-    prior = draws_prior(fit, modes, trust)
-    start = replace(fit.posed, z=np.zeros(len(fit.z)))
-    found = fit_cloud(linear, start, prior, sigma, problem.config.steps, 0.0)
-    return found.z, found
-
-
-def jacobian(problem: DrawsProblem, fit: DrawsFit) -> Float32[np.ndarray, "m 3 d"]:
-    """Motion of all material points for a standard deviation of each draw: at the anchors, which the others follow."""
-    model, drawn = problem.model, fit.drawn
-    order = np.concatenate(model.anchors)
-    change = np.zeros((len(model.rest_points), 3, len(fit.z)), dtype=np.float32)
-    for number in np.flatnonzero(drawn.smooth):
-        step = DIFFERENCE * (-1.0 if fit.z[number] > 0 else 1.0)
-        z = fit.z.copy()
-        z[number] += step
-        moved = drawn.deformations(problem.scene, z)
-        if moved is not None:
-            change[order, :, number] = (anchors_moved(model, moved) - fit.material[order]) / step
-    spread: np.ndarray = problem.spread @ change.reshape(len(change), -1)
-    return spread.reshape(change.shape)

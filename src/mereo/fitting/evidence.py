@@ -1,8 +1,9 @@
 """What a frame shows, and what it rules out: observed points, the silhouette, and the free space in front of them.
 
-A frame is a cloud seen from one place. A vertex of a fitted model may lie neither beside all lines of sight that met the
-object (outside the silhouette) nor in front of the observed points around its own line of sight (free space). Lines of
-sight are compared by their angles, so a depth image and a cloud without one are the same, and so is any axis or unit.
+A frame is a cloud seen from one place. A vertex of a fitted model may lie neither beside all lines of sight that met
+the object (outside the silhouette) nor in front of the observed points around its own line of sight (free space). Lines
+of sight are compared by their angles, so a depth image and a cloud without one are the same, and so is any axis or
+unit.
 The camera is at the origin.
 """
 
@@ -71,13 +72,16 @@ class Evidence:
         toward = vertices / distance[:, None]
         angle, near = self.sight.query(toward, k=AROUND)
         beside = angle[:, 0] > SILHOUETTE_PITCHES * self.pitch
-        front = np.where(angle <= AROUND_PITCHES * self.pitch, self.ranges[np.minimum(near, len(self.ranges) - 1)], np.inf)
+        front = np.where(
+            angle <= AROUND_PITCHES * self.pitch, self.ranges[np.minimum(near, len(self.ranges) - 1)], np.inf
+        )
         ahead = front.min(axis=1) - slack - distance
         goal = self.sight.data[near[:, 0]] * distance[:, None]
         sideways = goal - vertices
         length = np.linalg.norm(sideways, axis=1)
         out = sideways / np.maximum(length, 1e-12)[:, None]
         direction = np.where(beside[:, None], out, toward)
-        amount = np.where(beside, length - self.pitch * distance, np.where(np.isfinite(ahead), np.maximum(ahead, 0.0), 0.0))
+        amount = np.where(
+            beside, length - self.pitch * distance, np.where(np.isfinite(ahead), np.maximum(ahead, 0.0), 0.0)
+        )
         return direction, np.maximum(amount, 0.0)
-

@@ -1,20 +1,24 @@
 """Registration: the object's own deformation model, fitted to one frame.
 
-    code -correspondences-> pose and state of the model -deform-> SegmentedMesh, and a map rest <-> camera
+code -correspondences-> pose and state of the model -deform-> SegmentedMesh, and a map rest <-> camera
 """
 
 import time
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences, find_correspondences
+from mereo.fitting.draws_fit import fit_draws
+from mereo.fitting.draws_problem import DrawsProblem
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.modes_fit import fit_modes
+from mereo.fitting.playback import DrawnStates
 from mereo.fitting.problem import Problem
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration import Method, Registration
 from mereo.fitting.residuals import Surface
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import EncodedCloud, Model
@@ -30,6 +34,7 @@ def fit(
     network: Model,
     model: StatisticalModel,
     scene_unit: float | None = None,
+    states: DrawnStates | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
     code: EncodedCloud | None = None,
 ) -> Registration:
@@ -40,6 +45,7 @@ def fit(
         network: trained on this object, with rest coordinates.
         model: statistical model of the same object.
         scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
+        states: of the model's scene, whose own draws are then fitted too; the better of modes and draws is returned.
         config: constants.
         code: of the cloud, where it is known already.
 
@@ -56,7 +62,7 @@ def fit(
         raise ValueError(
             "the weights predict no rest coordinates, from which a fit starts; train with a dataset that has a template"
         )
-    return fit_correspondences(cloud.points, found.evenly(), model, scene_unit, config)
+    return fit_correspondences(cloud.points, found.evenly(), model, scene_unit, states, config)
 
 
 def fit_correspondences(
@@ -64,35 +70,52 @@ def fit_correspondences(
     found: Correspondences,
     model: StatisticalModel,
     scene_unit: float | None = None,
+    states: DrawnStates | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
 ) -> Registration:
     """``fit`` from given correspondences; ``points`` are the observed cloud, seen from the origin."""
     started = time.perf_counter()
     unit = estimate_unit(found) if scene_unit is None else scene_unit
     scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD
-    problem = Problem.of(model, found.scaled(1 / unit), Evidence.of(points / unit), scale_std, config)
-    posed = fit_modes(problem)
-    explained = explained_share(problem, posed)
+    found = found.scaled(1 / unit)
+    problem = Problem.of(model, found, Evidence.of(points / unit), scale_std, config)
+    modes = fit_modes(problem)
+    best = Chosen("modes", modes.z, modes, modes.place(model.material(modes.z)))
+    if states is not None:
+        drawn = fit_draws(DrawsProblem.of(problem, states, found), modes)
+        if drawn is not None and drawn.misfit < problem.misfit(modes).total:
+            best = Chosen("draws", drawn.z, drawn.posed, drawn.placed())
+    explained = explained_share(problem, best.material)
     return Registration(
         model=model,
-        material=posed.place(model.material(posed.z)) * unit,
-        method="modes",
-        z=posed.z,
-        scene_unit=unit * float(np.exp(posed.log_scale)),
+        material=best.material * unit,
+        method=best.method,
+        z=best.z,
+        scene_unit=unit * float(np.exp(best.posed.log_scale)),
         explained=explained,
         accepted=explained >= config.accepted,
         seconds=time.perf_counter() - started,
     )
 
 
-def explained_share(problem: Problem, posed: Posed) -> float:
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """The description of the state that explains a frame best; material points in the camera frame, scene units."""
+
+    method: Method
+    z: Float[np.ndarray, " k"]
+    posed: Posed
+    material: Float[np.ndarray, "m 3"]
+
+
+def explained_share(problem: Problem, material: Float[np.ndarray, "m 3"]) -> float:
     """Share of the observed points within the tolerance of the surface that faces the camera."""
-    distance = Surface.of(problem.model, posed).nearest(problem.evidence.partners)[0]
+    distance = Surface.through(problem.model, material).nearest(problem.evidence.partners)[0]
     return float((distance <= problem.config.tolerance).mean())
 
 
 def estimate_unit(found: Correspondences) -> float:
-    """Length of a scene unit in the unit of the correspondences: distances within a segment hardly change by bending."""
+    """Length of a scene unit in the unit of the correspondences: distances within a segment hardly change."""
     rng = np.random.default_rng(0)
     first, second = rng.integers(len(found.labels), size=(2, SCALE_PAIRS))
     rest = np.linalg.norm(found.rest[first] - found.rest[second], axis=1)

@@ -1,6 +1,6 @@
 """Least squares over a pose and the coefficients of a linear model, with analytic Jacobians.
 
-A material point is at ``y = e^s R q + t`` with ``q = mean + modes z``. A step turns about the camera's origin by a small
+A material point is at ``y = e^s R q + t`` with ``q = mean + modes z``. A step turns by a small
 rotation vector, shifts, scales and changes z:
 
     dy = w x (y - t) + dt + (y - t) ds + e^s R modes dz
@@ -58,8 +58,12 @@ class NormalEquations:
 
     @classmethod
     def prior(
-        cls, z: Float[np.ndarray, " k"], center: Float[np.ndarray, " k"], precision: Float[np.ndarray, "k k"],
-        log_scale: float, scale_std: float,
+        cls,
+        z: Float[np.ndarray, " k"],
+        center: Float[np.ndarray, " k"],
+        precision: Float[np.ndarray, "k k"],
+        log_scale: float,
+        scale_std: float,
     ) -> "NormalEquations":
         """Of ``(z - center)^T precision (z - center)`` and of a scale that is known up to ``scale_std``."""
         count = POSE + len(z)
@@ -84,7 +88,10 @@ class NormalEquations:
 
 
 def along(
-    posed: Posed, points: Float[np.ndarray, "n 3"], modes: Float[np.ndarray, "n 3 k"], direction: Float[np.ndarray, "n 3"]
+    posed: Posed,
+    points: Float[np.ndarray, "n 3"],
+    modes: Float[np.ndarray, "n 3 k"],
+    direction: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "n p"]:
     """Derivatives of ``direction . y`` at posed ``points`` whose modes are given."""
     arm = points - posed.translation

@@ -5,7 +5,7 @@ normal. Played back in the order of the calls, the same shares give the same sta
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,28 @@ from jaxtyping import Bool, Float, Float32
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
+from mereo.deformation.moving_least_squares import spread
+from mereo.geometry.procrustes import best_rotations
 from mereo.scenes.draw_recorder import OutOfDraws, Recorder, Shares
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
+STATES_SEED = 400_000
+"""A training seed."""
+
 SMOOTH = ("uniform", "normal", "triangular")
 """Kinds of draws that move the state continuously; the others stay as they are."""
+
+MOST = 2.0
+"""Standard deviations of a draw that is guessed."""
+
+RIDGE = 1e-3
+"""Of the regression of draws on modes, relative to the states' own spread."""
+
+PROJECTED = 400
+"""Material points by which many states are expressed in modes."""
 
 LARGEST = 4.0
 """Standard deviations; farther out a share is 0 or 1."""
@@ -29,7 +43,7 @@ LARGEST = 4.0
 class Playback(Recorder):
     """A generator whose draws are given in the order of the calls; more or other ones raise ``OutOfDraws``."""
 
-    def __init__(self, seed: int, shares: Sequence[Shares]) -> None:
+    def __init__(self, seed: int, shares: Sequence[np.ndarray]) -> None:
         super().__init__(seed, {})
         self._shares, self._next = shares, 0
 
@@ -75,24 +89,73 @@ class Drawn:
 
 @dataclass(frozen=True, eq=False)
 class DrawnStates:
-    """Random states of a scene by seed, with their material points: where a fit of draws may start."""
+    """Random states of a scene by seed: where a fit of draws may start.
+
+    Attributes:
+        scene: what is played.
+        seeds: of the states.
+        material: their material points, scene frame.
+        z: their draws, standard normal; NaN of states with other calls than the first that was not drawn again.
+        modes: their coefficients in the statistical model.
+    """
 
     scene: Scene
     seeds: tuple[int, ...]
     material: Float32[np.ndarray, "n m 3"]
+    z: Float[np.ndarray, "n d"]
+    modes: Float[np.ndarray, "n k"]
 
     @classmethod
-    def of(cls, scene: Scene, model: StatisticalModel, count: int, first_seed: int) -> "DrawnStates":
+    def of(
+        cls, scene: Scene, model: StatisticalModel, count: int = 600, first_seed: int = STATES_SEED
+    ) -> "DrawnStates":
         """States of ``count`` seeds from ``first_seed`` on."""
         seeds = tuple(range(first_seed, first_seed + count))
-        states = (scene.deform(scene.sample_deformations(Recorder(seed, {}))) for seed in seeds)
-        material = [state_points(state, model.nodes, model.node_labels).astype(np.float32) for state in states]
-        return cls(scene, seeds, np.stack(material))
+        material, draws = [], []
+        for seed in seeds:
+            recorder = Recorder(seed, {})
+            state = scene.deform(scene.sample_deformations(recorder))
+            material.append(state_points(state, model.nodes, model.node_labels).astype(np.float32))
+            draws.append(ndtri(np.concatenate([call.shares for call in recorder.calls])))
+        fewest = min(len(z) for z in draws)
+        z = np.stack([z if len(z) == fewest else np.full(fewest, np.nan) for z in draws])
+        return cls(scene, seeds, np.stack(material), z, coefficients(model, np.stack(material)))
+
+    def guess(self, modes: Float[np.ndarray, " k"], motion: Float[np.ndarray, " k"], count: int) -> Drawn:
+        """Draws of a state of these coefficients: ridge regression on states, those near it counting more.
+
+        ``motion`` is how far a standard deviation of each mode moves, ``count`` how many states count as near.
+        """
+        usable = np.flatnonzero(np.isfinite(self.z).all(axis=1))
+        apart = (((self.modes[usable] - modes) * motion) ** 2).sum(axis=1)
+        weight = 1.0 / (1.0 + apart / np.sort(apart)[min(count, len(apart)) - 1])
+        basis = np.concatenate([np.ones((len(usable), 1)), (self.modes[usable] - modes) * motion], axis=1)
+        weighted = basis * weight[:, None]
+        ridge = RIDGE * weight.sum() * float((motion**2).mean()) * np.eye(basis.shape[1])
+        ridge[0, 0] = 0.0
+        answer = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ self.z[usable])[0]
+        like = Drawn.of(self.scene, self.seeds[usable[0]])
+        return replace(like, z=np.where(like.smooth, np.clip(answer, -MOST, MOST), like.z))
 
 
-def anchors_moved(
-    model: StatisticalModel, deformations: tuple[Deformation, ...]
-) -> Float[np.ndarray, "a 3"]:
+def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]) -> Float[np.ndarray, "n k"]:
+    """Of many states at once, by a few rounds of alignment and least squares on a few material points."""
+    few = spread(model.rest_points, PROJECTED)
+    flat = model.modes[few].reshape(-1, model.count).astype(np.float64)
+    normal = flat.T @ flat + 1e-6 * np.trace(flat.T @ flat) / model.count * np.eye(model.count)
+    states = material[:, few].astype(np.float64)
+    states -= states.mean(axis=1, keepdims=True)
+    z = np.zeros((len(states), model.count))
+    for _ in range(4):
+        goal = model.mean[few] + (z @ flat.T).reshape(len(z), -1, 3)
+        center = goal.mean(axis=1, keepdims=True)
+        rotation = best_rotations(np.matmul(states.transpose(0, 2, 1), goal - center))
+        aligned = np.matmul(states, rotation.transpose(0, 2, 1)) + center
+        z = np.linalg.solve(normal, flat.T @ (aligned - model.mean[few]).reshape(len(z), -1).T).T
+    return z
+
+
+def anchors_moved(model: StatisticalModel, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "a 3"]:
     """Where the anchors of all segments go, one segment after the other."""
     pairs = zip(deformations, model.anchors, strict=True)
     return np.concatenate([deformation(model.rest_points[index]) for deformation, index in pairs])

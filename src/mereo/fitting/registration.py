@@ -1,7 +1,8 @@
-"""The model registered to a frame: where every point of the object is, and where every point of the frame was at rest."""
+"""The model registered to a frame: where each point of the object is, and where each of the frame was at rest."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,6 +12,8 @@ from mereo.deformation.moving_least_squares import Anchors
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, signed_distance_and_direction
 from mereo.scenes.statistical_model import StatisticalModel, following
+
+Method = Literal["modes", "draws"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +61,7 @@ class Registration:
 
     model: StatisticalModel
     material: Float[np.ndarray, "m 3"]
-    method: str
+    method: Method
     z: Float[np.ndarray, " k"]
     scene_unit: float
     explained: float
@@ -85,7 +88,8 @@ class Registration:
 
         Args:
             points: rest pose, scene units.
-            labels: of the segments that they move along with, 1 or more; by default those that hold them, or are nearest.
+            labels: of the segments that they move along with, 1 or more; by default those that hold them or come
+                nearest.
         """
         labels = nearest_labels(self.rest_solids, points) if labels is None else labels
         return self.model.weights(points, labels)(self.material)

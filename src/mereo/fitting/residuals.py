@@ -14,8 +14,8 @@ from jaxtyping import Float, Float32, Int
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed, along, geman_mcclure, in_space
-from mereo.scenes.statistical_model import StatisticalModel
 from mereo.geometry.mesh import barycentric
+from mereo.scenes.statistical_model import StatisticalModel
 
 ROBUST = 2.5
 """Residuals beyond this many sigma count for little."""
@@ -24,9 +24,7 @@ MOST_VIOLATIONS = 400
 WITNESS_WEIGHT = 0.2
 
 
-def robust_square(
-    residual: Float[np.ndarray, " r"], sigma: float, robust: float = ROBUST
-) -> Float[np.ndarray, " r"]:
+def robust_square(residual: Float[np.ndarray, " r"], sigma: float, robust: float = ROBUST) -> Float[np.ndarray, " r"]:
     """Geman and McClure's loss, in squared sigmas; ``geman_mcclure`` are its weights."""
     squared = (residual / sigma) ** 2
     return squared / (1.0 + squared / robust**2)
@@ -50,7 +48,11 @@ class Surface:
     @classmethod
     def of(cls, model: StatisticalModel, posed: Posed) -> "Surface":
         """Of a state."""
-        material = posed.place(model.material(posed.z))
+        return cls.through(model, posed.place(model.material(posed.z)))
+
+    @classmethod
+    def through(cls, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> "Surface":
+        """Of posed material points."""
         a, b, c = (material[model.faces[:, i]] for i in range(3))
         normal = np.cross(b - a, c - a)
         facing = np.flatnonzero(np.einsum("fi,fi->f", normal, a) < 0)
@@ -116,7 +118,9 @@ class NetworkTerm:
         distance = np.linalg.norm(self.place(posed) - self.target, axis=1)
         return float(self.confidence / self.confidence.sum() @ robust_square(distance, sigma))
 
-    def add_to(self, normal: NormalEquations, posed: Posed, sigma: float, worth: float, robust: bool) -> NormalEquations:
+    def add_to(
+        self, normal: NormalEquations, posed: Posed, sigma: float, worth: float, robust: bool
+    ) -> NormalEquations:
         """With the squared distances, together worth as many independent points as ``worth``."""
         points = self.place(posed)
         offset = points - self.target
@@ -127,7 +131,11 @@ class NetworkTerm:
 
 
 def add_witnesses(
-    normal: NormalEquations, surface: Surface, posed: Posed, evidence: Evidence, chosen: Int[np.ndarray, " w"],
+    normal: NormalEquations,
+    surface: Surface,
+    posed: Posed,
+    evidence: Evidence,
+    chosen: Int[np.ndarray, " w"],
     sigma: float,
 ) -> NormalEquations:
     """With the chosen vertices that are outside the silhouette or in free space."""

@@ -13,7 +13,7 @@ ROUNDS = 20
 
 
 def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray, "*s 3 3"]:
-    """Rotations R that maximize ``trace(R H)`` for ``H = sum_i x_i y_i^T``, centred: they bring x onto y (Kabsch 1976)."""
+    """Rotations R that maximize ``trace(R H)`` for ``H = sum_i x_i y_i^T``, centred: they bring x onto y (Kabsch)."""
     left, _, right = np.linalg.svd(covariance)
     proper = np.sign(np.linalg.det(left) * np.linalg.det(right))
     left = left.copy()
@@ -49,7 +49,7 @@ def robust_rigid(
 def align_all(
     shapes: Float[np.ndarray, "s n 3"], rounds: int, tolerance: float
 ) -> tuple[Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3"], Float[np.ndarray, "n 3"]]:
-    """Generalized Procrustes alignment without scale (Gower 1975): rotations and centres that bring shapes to their mean.
+    """Rotations and centres that bring shapes to their mean: generalized Procrustes alignment without scale (Gower).
 
     ``(shapes - center) @ R.T`` are the aligned shapes. It must converge (the mean moves by less than ``tolerance``):
     stopped early, the aligned states of a bending object do not lie in few dimensions.

@@ -26,7 +26,8 @@ CANDIDATES = 40_000
 def interior_nodes(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "j 3"], UInt8[np.ndarray, " j"]]:
     """Points inside the segments, evenly spread, as many for each segment, and their labels."""
     rng = np.random.default_rng(0)
-    points = rng.uniform(*rest.bounds, size=(CANDIDATES, 3))
+    low, high = rest.bounds
+    points = rng.uniform(low, high, size=(CANDIDATES, 3))
     labels = Solids(rest).label(points)
     each = NODES // len(rest.segments)
     rows = []

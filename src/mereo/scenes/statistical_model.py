@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.procrustes import align_all, fit_rigid
 from mereo.scenes.pair_distances import PairDistances, kept_distances
-from mereo.geometry.mesh import SegmentedMesh
 
 PROCRUSTES_ROUNDS = 100
 PROCRUSTES_POINTS = 600
@@ -40,8 +40,10 @@ SPARSE = 200
 WITNESSES = 1500
 """Vertices that are compared with what a frame rules out."""
 
-OF_REST = ("faces", "vertex_counts", "labels", "rest_points", "half", "rest_center", "anchors", "rest_anchors")
-OF_REST += ("witnesses", "sparse")
+OF_REST: tuple[str, ...] = (
+    *("faces", "vertex_counts", "labels", "rest_points", "half", "rest_center"),
+    *("anchors", "rest_anchors", "witnesses", "sparse"),
+)
 """Derived values that depend on the rest pose alone."""
 
 MOST_MODES = 160
@@ -215,7 +217,9 @@ def build_model(
     Raises ``ValueError`` for fewer than two states.
     """
     if len(states) < 2:
-        raise ValueError(f"a statistical model is asked of {len(states)} states; it needs 2 or more: record more states")
+        raise ValueError(
+            f"a statistical model is asked of {len(states)} states; it needs 2 or more: record more states"
+        )
     held_out = max(1, round(HELD_OUT * len(states)))
     mean, aligned = _aligned(material_points(rest, nodes), states)
     seen, unseen = aligned[:-held_out], aligned[-held_out:]

@@ -1,0 +1,157 @@
+"""States of a scene as explanations of a frame: playing them, judging them, and their linear neighbourhood.
+
+Around a state the material points are linear in the draws, so its neighbourhood is a linear model like that of the
+modes, fitted by the same code.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from mereo.deformation.moving_least_squares import PointWeights
+from mereo.fitting.config import MANY_DRAWS, DrawsConfig
+from mereo.fitting.correspondences import Correspondences
+from mereo.fitting.gauss_newton import Posed
+from mereo.fitting.modes_fit import fit_cloud
+from mereo.fitting.playback import Drawn, DrawnStates, anchors_moved, material_moved
+from mereo.fitting.priors import Prior
+from mereo.fitting.problem import Problem
+from mereo.fitting.residuals import NetworkTerm
+from mereo.scenes.scene import Scene
+from mereo.scenes.statistical_model import StatisticalModel, following
+
+DIFFERENCE = 0.02
+"""Step of finite differences, in standard deviations of a draw."""
+
+HELD = 1e6
+"""Precision of draws that move nothing here: they stay."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawsProblem:
+    """A frame to be explained by the states of a scene.
+
+    Attributes:
+        base: the same frame, explained by modes.
+        states: random states of the scene.
+        found: correspondences, scene units.
+        weights: how their rest positions follow the material points.
+        spread: how all material points follow the anchors, as a sparse matrix.
+    """
+
+    base: Problem
+    states: DrawnStates
+    found: Correspondences
+    weights: PointWeights
+    spread: csr_array
+    config: DrawsConfig
+
+    @property
+    def model(self) -> StatisticalModel:
+        return self.base.model
+
+    @property
+    def scene(self) -> Scene:
+        return self.states.scene
+
+    @classmethod
+    def of(
+        cls, base: Problem, states: DrawnStates, found: Correspondences, config: DrawsConfig | None = None
+    ) -> "DrawsProblem":
+        """With the constants for as many draws as the scene has, where none are given."""
+        model = base.model
+        if config is None:
+            config = DrawsConfig() if states.z.shape[1] <= DrawsConfig().few else MANY_DRAWS
+        every = following(model.rest_anchors, model.rest_points, model.labels)
+        rows = np.repeat(np.arange(len(every.index)), every.index.shape[1])
+        entries = (every.weight.ravel().astype(np.float32), (rows, every.index.ravel()))
+        spread = csr_array(entries, shape=(len(model.rest_points),) * 2)
+        return cls(base, states, found, model.weights(found.rest, found.labels), spread, config)
+
+    def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> Problem:
+        """The problem in the linear neighbourhood of a state."""
+        model = self.model.around(mean, modes)
+        network = NetworkTerm(self.found.points, self.weights(mean), self.weights(modes), self.found.confidence)
+        return Problem(model, network, self.base.evidence, self.base.scale_std, self.base.config)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawsFit:
+    """A played state, posed: draws, rigid pose (its ``z`` is empty), material points unposed, misfit with its prior."""
+
+    drawn: Drawn
+    z: Float[np.ndarray, " d"]
+    posed: Posed
+    material: Float[np.ndarray, "m 3"]
+    misfit: float
+
+    def placed(self) -> Float[np.ndarray, "m 3"]:
+        """Material points in the camera frame."""
+        return self.posed.place(self.material)
+
+
+def played(
+    problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed, wide: bool = False
+) -> DrawsFit | None:
+    """The state of these draws and how badly it explains the frame; None where the scene refuses it.
+
+    ``wide`` takes the cloud's first sigma, which tells how far off a state is that is not yet right.
+    """
+    deformations = drawn.deformations(problem.scene, z)
+    if deformations is None:
+        return None
+    material = material_moved(problem.scene, problem.model, deformations)
+    fixed = problem.around(material, np.zeros((len(material), 3, 0), dtype=np.float32))
+    rigid = replace(posed, z=np.empty(0))
+    sigma = problem.config.start_sigma * problem.model.half if wide else None
+    misfit = fixed.misfit(rigid, sigma).total + float(z @ z)
+    return DrawsFit(drawn, z, rigid, material, misfit)
+
+
+def draws_prior(fit: DrawsFit, motion: Float32[np.ndarray, "m 3 d"], trust: float) -> Prior:
+    """Of a change of the draws: N(0, 1) of the draws themselves, near where they are; those that move nothing stay."""
+    moving = np.abs(motion).max(axis=(0, 1)) > 1e-9
+    precision = 1.0 + 1.0 / trust**2
+    return Prior(np.where(moving, -fit.z / precision, 0.0), np.diag(np.where(moving, precision, HELD)))
+
+
+def between(one: Posed, other: Posed, share: float) -> Posed:
+    """A share of the way, for a share of a step."""
+    turn = Rotation.from_matrix(other.rotation @ one.rotation.T).as_rotvec()
+    return Posed(
+        Rotation.from_rotvec(share * turn).as_matrix() @ one.rotation,
+        one.translation + share * (other.translation - one.translation),
+        one.z,
+        one.log_scale + share * (other.log_scale - one.log_scale),
+    )
+
+
+def linear_step(
+    problem: DrawsProblem, fit: DrawsFit, trust: float, sigma: float
+) -> tuple[Float[np.ndarray, " d"], Posed]:
+    """Change of the draws, and the pose, that explain the frame best in the linear neighbourhood."""
+    modes = jacobian(problem, fit)
+    linear = problem.around(fit.material, modes)
+    prior = draws_prior(fit, modes, trust)
+    start = replace(fit.posed, z=np.zeros(len(fit.z)))
+    found = fit_cloud(linear, start, prior, sigma, problem.config.steps, 0.0)
+    return found.z, found
+
+
+def jacobian(problem: DrawsProblem, fit: DrawsFit) -> Float32[np.ndarray, "m 3 d"]:
+    """Motion of all material points for a standard deviation of each draw: at the anchors, which the others follow."""
+    model, drawn = problem.model, fit.drawn
+    order = np.concatenate(model.anchors)
+    change = np.zeros((len(model.rest_points), 3, len(fit.z)), dtype=np.float32)
+    for number in np.flatnonzero(drawn.smooth):
+        step = DIFFERENCE * (-1.0 if fit.z[number] > 0 else 1.0)
+        z = fit.z.copy()
+        z[number] += step
+        moved = drawn.deformations(problem.scene, z)
+        if moved is not None:
+            change[order, :, number] = (anchors_moved(model, moved) - fit.material[order]) / step
+    spread: np.ndarray = problem.spread @ change.reshape(len(change), -1)
+    return spread.reshape(change.shape)

@@ -1,0 +1,124 @@
+"""The statistical model of a scene's states, and the motion of any point with its material points."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from toy_scene import sample_deformations, toy_scene
+
+from mereo.deformation.moving_least_squares import Anchors
+from mereo.geometry.procrustes import fit_rigid, robust_rigid
+from mereo.scenes.model_arrays import byte_count, from_arrays, to_arrays
+from mereo.scenes.random_states import interior_nodes, sample_states, scene_model, state_points
+from mereo.scenes.seeds import example_rng
+from mereo.scenes.statistical_model import StatisticalModel, build_model
+
+
+@pytest.fixture(scope="module")
+def model() -> StatisticalModel:
+    return scene_model(toy_scene(), count=200)
+
+
+def test_modes_reproduce_states_they_were_not_built_from(model: StatisticalModel) -> None:
+    scene = toy_scene()
+    for index in range(5):
+        state = state_points(scene.sample_state(example_rng(7, index)), model.nodes, model.node_labels)
+        T, z = model.project(state)
+        found = model.material(z) @ T[:3, :3].T + T[:3, 3]
+        assert np.linalg.norm(found - state, axis=1).max() < 0.15
+        assert np.abs(z).max() < 5
+
+
+def test_the_residue_is_that_of_held_out_states(model: StatisticalModel) -> None:
+    assert 0 < model.residue < 0.01 * model.half
+
+
+def test_coefficients_of_the_library_have_unit_variance(model: StatisticalModel) -> None:
+    np.testing.assert_allclose(model.library.std(axis=0), 1.0, atol=1e-2)
+    np.testing.assert_allclose(model.library.mean(axis=0), 0.0, atol=0.2)
+
+
+def test_the_pose_of_the_states_does_not_matter() -> None:
+    """Each state in a pose of its own gives the same modes."""
+    scene, rng = toy_scene(), np.random.default_rng(0)
+    nodes, labels = interior_nodes(scene.rest)
+    states = sample_states(scene, nodes, labels, 60, 3)
+    turned = np.stack([s @ Rotation.random(rng=rng).as_matrix().T + rng.normal(size=3) * 50 for s in states])
+    plain = build_model(scene.rest, nodes, labels, states)
+    posed = build_model(scene.rest, nodes, labels, turned.astype(np.float32))
+    assert plain.count == posed.count
+    np.testing.assert_allclose(plain.mean, posed.mean, atol=0.02)
+    np.testing.assert_allclose(plain.motion, posed.motion, rtol=0.02)
+
+
+def test_one_state_is_no_model() -> None:
+    scene = toy_scene()
+    nodes, labels = interior_nodes(scene.rest)
+    with pytest.raises(ValueError, match="asked of 1 states; it needs 2 or more: record more states"):
+        build_model(scene.rest, nodes, labels, sample_states(scene, nodes, labels, 1, 3))
+
+
+def test_points_follow_affine_motions_exactly() -> None:
+    rng = np.random.default_rng(0)
+    rest = rng.normal(size=(100, 3)) * 10
+    matrix, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
+    points = rng.normal(size=(50, 3)) * 8
+    follow = Anchors(np.arange(100), rest).weights(points)
+    np.testing.assert_allclose(follow(rest @ matrix.T + shift), points @ matrix.T + shift, atol=0.01)
+    np.testing.assert_allclose(follow.weight.sum(axis=1), 1.0)
+
+
+def test_inside_points_follow_the_scene(model: StatisticalModel) -> None:
+    """Against the scene's own map of space, at points that are no material points."""
+    scene = toy_scene()
+    deformations = sample_deformations(example_rng(7, 1))
+    points = np.random.default_rng(1).uniform([-17, -5, -4], [-7, 5, 4], size=(300, 3))
+    labels = np.ones(300, dtype=np.uint8)
+    material = state_points(scene.deform(deformations), model.nodes, model.node_labels)
+    error = np.linalg.norm(model.weights(points, labels)(material) - deformations[0](points), axis=1)
+    assert error.max() < 0.1
+
+
+def test_rigid_fit_is_exact_and_robust() -> None:
+    rng = np.random.default_rng(0)
+    source = rng.normal(size=(100, 3))
+    turn = Rotation.random(rng=rng).as_matrix()
+    target = source @ turn.T + [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(fit_rigid(source, target)[:3, :3], turn, atol=1e-12)
+    target[:30] += rng.normal(size=(30, 3)) * 20
+    found = robust_rigid(source, target, np.ones(100), 0.01)
+    np.testing.assert_allclose(found[:3, :3], turn, atol=1e-2)
+
+
+def test_a_mirror_image_is_not_a_pose() -> None:
+    source = np.random.default_rng(0).normal(size=(20, 3))
+    assert np.linalg.det(fit_rigid(source, source * [1, 1, -1])[:3, :3]) == pytest.approx(1.0)
+
+
+# --- as arrays --------------------------------------------------------------------------------------------------------
+
+
+def test_arrays_hold_the_whole_model(model: StatisticalModel) -> None:
+    arrays, header = to_arrays(model)
+    again = from_arrays(arrays, json.loads(json.dumps(header)))
+    assert again.rest.names == model.rest.names and again.rest.colors == model.rest.colors
+    np.testing.assert_array_equal(again.faces, model.faces)
+    np.testing.assert_allclose(again.library, model.library, atol=0.021)
+    for z in model.library[:20].astype(np.float64):
+        np.testing.assert_allclose(again.material(z), model.material(z), atol=2e-3 * model.half)
+
+
+def test_a_limit_leaves_out_the_smallest_modes(model: StatisticalModel) -> None:
+    whole, _ = to_arrays(model)
+    limit = byte_count(whole) - 5000
+    arrays, header = to_arrays(model, limit)
+    assert byte_count(arrays) <= limit
+    fewer = from_arrays(arrays, header)
+    assert 0 < fewer.count < model.count
+    np.testing.assert_allclose(fewer.modes, model.modes[:, :, : fewer.count], atol=1e-3 * model.half)
+
+
+def test_too_small_a_limit_is_refused(model: StatisticalModel) -> None:
+    with pytest.raises(ValueError, match="does not fit into 1000 bytes with a single mode; it needs more"):
+        to_arrays(model, 1000)
