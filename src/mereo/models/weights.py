@@ -88,7 +88,7 @@ def find_weights(name: str | Path) -> Path:
     """A shipped name or a path to an existing file."""
     path = Path(name)
     shipped = SHIPPED / f"{name}.safetensors"
-    if path.suffix == "" and not path.exists() and shipped.is_file():
+    if path.suffix == "" and not path.is_file() and shipped.is_file():
         return shipped
     if not path.is_file():
         raise FileNotFoundError(
