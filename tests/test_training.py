@@ -65,7 +65,7 @@ def test_a_run_of_an_older_mereo_is_continued(dataset: Path, tmp_path: Path) -> 
 
 def test_a_directory_with_other_things_is_not_a_run(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(FileExistsError, match="exists and is not a training run"):
+    with pytest.raises(FileExistsError, match=r"is not empty and holds no config\.json"):
         trainer.train(dataset, tmp_path, SMALL)
     assert os.listdir(tmp_path) == ["thesis.tex"]
 
@@ -220,10 +220,10 @@ def test_only_the_first_process_claims_the_directory(
     monkeypatch.setattr(torch.distributed, "barrier", lambda: waited.append(True))
     run = tmp_path / "run"
     run.mkdir()
-    (run / ".config.json.partial").touch()  # what the first one is writing
+    (run / "metrics.csv").touch()  # of a directory without settings, as it is while the first one writes them
     claim_run(run, SMALL, data, trainer.Process(1, 2))
     assert waited and not (run / "config.json").exists()
-    with pytest.raises(FileExistsError, match="is not a training run"):
+    with pytest.raises(FileExistsError, match=r"holds no config\.json"):
         claim_run(run, SMALL, data, trainer.Process(0, 2))
 
 

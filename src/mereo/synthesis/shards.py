@@ -27,7 +27,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from mereo.io.atomic_files import atomic_file, write_json
+from mereo.io.atomic_files import atomic_file, claim_directory
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.rest_pose import rest_distances
 from mereo.scenes.scene import Scene
@@ -117,7 +117,7 @@ def generate(
         _Shard(output / f"shard-{n:05d}.safetensors", n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
         for n in range(shard[0], -(-examples // SHARD_SIZE), shard[1])
     ]
-    _claim_directory(output, manifest, shards, resume, alone=shard[1] == 1)
+    _claim(output, manifest, shards, resume, alone=shard[1] == 1)
     if not (output / TEMPLATE).exists():
         with atomic_file(output / TEMPLATE) as temporary:
             temporary.write_bytes(save({"distance": rest_distances(loaded.rest)}))
@@ -189,40 +189,28 @@ def example_bytes(settings: GenerateConfig, segments: int) -> int:
     return per_point * settings.points + per_query * settings.sampling.total(segments) + once
 
 
-def _claim_directory(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> None:
+def _claim(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> None:
     """Create the directory with its manifest, or check that it is this very dataset; other machines' shards may come.
 
     What a killed run was writing is removed, of this part's shards only.
     """
-    path = output / MANIFEST
-    if output.exists() and not output.is_dir():
-        raise FileExistsError(f"{output} is a file; a dataset is a directory: choose another --output")
-    if path.is_file():
+    before = claim_directory(output, MANIFEST, manifest, "a dataset")
+    if before is not None:
         if not resume and (alone or any(item.path.exists() for item in shards)):
             raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
-        _check_same(path, manifest)
-    elif output.is_dir() and any(not file.name.startswith(".") for file in output.iterdir()):
-        raise FileExistsError(f"{output} is not empty and holds no {MANIFEST}; choose another --output")
-    else:
-        write_json(path, manifest)
+        _check_same(output, before, manifest)
     for item in shards:
         for leftover in output.glob(f".{item.path.stem}.*.partial*"):
             leftover.unlink(missing_ok=True)
 
 
-def _check_same(path: Path, manifest: dict[str, Any]) -> None:
-    try:
-        before = json.loads(path.read_text("utf-8"))
-    except ValueError:
-        before = None
-    if not isinstance(before, dict):
-        raise ValueError(f"{path} is not a manifest; it cannot be resumed: choose another --output")
+def _check_same(output: Path, before: dict[str, Any], manifest: dict[str, Any]) -> None:
     # a manifest of an older version may not state everything; settings it lacks were as their defaults are
     before = _flat({"settings": asdict(GenerateConfig())}) | _flat(before)
     for key, now in _flat(manifest).items():
         if before.get(key, now) != now:
             raise ValueError(
-                f"{path.parent} was made with {key} = {before[key]!r}, not {now!r}; resuming needs equal settings: "
+                f"{output} was made with {key} = {before[key]!r}, not {now!r}; resuming needs equal settings: "
                 "use them, or choose another --output"
             )
 

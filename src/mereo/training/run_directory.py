@@ -10,7 +10,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from mereo.io.atomic_files import write_json
+from mereo.io.atomic_files import claim_directory
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
@@ -138,26 +138,19 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
         )
     if process.is_main:
         dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
-        _claim_directory(run_dir, json.loads(json.dumps({"dataset": dataset, "train": asdict(config)})))
+        _claim(run_dir, json.loads(json.dumps({"dataset": dataset, "train": asdict(config)})))
     if process.world > 1:
         dist.barrier()
 
 
-def _claim_directory(run_dir: Path, settings: dict[str, Any]) -> None:
-    path = run_dir / "config.json"
-    if path.is_file():
-        before = _with_defaults(json.loads(path.read_text()))
-        if before != settings:
-            odd = _first_difference(before, settings)
-            raise ValueError(
-                f"{run_dir} holds a run with another {odd}; continuing needs equal settings: "
-                "use them, or another --output"
-            )
-    elif run_dir.exists() and any(run_dir.iterdir()):
-        raise FileExistsError(f"{run_dir} exists and is not a training run; choose another --output")
-    else:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        write_json(path, settings)
+def _claim(run_dir: Path, settings: dict[str, Any]) -> None:
+    found = claim_directory(run_dir, "config.json", settings, "a training run")
+    before = settings if found is None else _with_defaults(found)
+    if before != settings:
+        odd = _first_difference(before, settings)
+        raise ValueError(
+            f"{run_dir} holds a run with another {odd}; continuing needs equal settings: use them, or another --output"
+        )
 
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
