@@ -53,7 +53,7 @@ def _fold_conditioned(mlp: ConditionedMLP) -> None:
         assert norm.running_mean is not None and norm.running_var is not None
         scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
         for summand in mlp.summands(number):
-            summand.weight *= scale[:, None]
+            summand.weight = nn.Parameter(summand.weight * scale[:, None], requires_grad=False)
         takes_shift = mlp.latent1 if number == 0 else mlp.hidden[number - 1]
         takes_shift.bias = nn.Parameter(norm.bias - norm.running_mean * scale, requires_grad=False)
     mlp.norms = nn.ModuleList(nn.Identity() for _ in mlp.norms)

@@ -96,14 +96,15 @@ class Surroundings:
     occluders: tuple[Capsule, ...] = ()
     background: Backdrop | None = None
 
-    def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-        """Let what is nearer replace the hits of the object, in place; returns what each ray meets first."""
+    def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
+        """Where rays first meet anything, and what: the object, whose ``hits`` are given, or what is nearer."""
+        first = Hits(hits.distance.copy(), hits.normal.copy())
         source = np.where(np.isfinite(hits.distance), OBJECT, NOTHING).astype(np.uint8)
         if self.background is not None:
-            source[hits.nearer(*self.background.first_hit(directions))] = BACKGROUND
+            source[first.nearer(*self.background.first_hit(directions))] = BACKGROUND
         for capsule in self.occluders:
-            source[hits.nearer(*capsule.first_hit(directions))] = OCCLUDER
-        return source
+            source[first.nearer(*capsule.first_hit(directions))] = OCCLUDER
+        return first, source
 
 
 def sample_surroundings(

@@ -43,7 +43,7 @@ class SimulatedView:
     Attributes:
         whole: everything that was measured.
         mask: the object's pixels, according to the segmentation.
-        source: what each pixel's ray met first, ``surroundings.OBJECT`` and so on.
+        source: what each pixel's ray met first, ``clutter.OBJECT`` and so on.
     """
 
     whole: DepthImage
@@ -121,14 +121,14 @@ def _look(
     seen = directions[visible] * hits.distance[visible, None]
     reach = float(np.linalg.norm(directions[:, :2], axis=1).max())
     around = sample_surroundings(sensor, solids, seen, reach, streams)
-    source = around.join(hits, directions)
-    if sensor.lateral > 0:
-        depth = np.where(np.isfinite(hits.distance), hits.distance, np.median(seen[:, 2]))
-        std = lateral_std(depth * sensor.metres_per_unit, _incidence(hits, directions), sensor.model)
-        directions[:, :2] += sensor.lateral * std[:, None] * streams["lateral"].normal(size=(len(directions), 2))
-        hits = solids.first_hit(directions)
-        source = around.join(hits, directions)
-    return hits, source
+    hits, source = around.join(hits, directions)
+    if sensor.lateral == 0:
+        return hits, source
+    depth = np.where(np.isfinite(hits.distance), hits.distance, np.median(seen[:, 2]))
+    std = lateral_std(depth * sensor.metres_per_unit, _incidence(hits, directions), sensor.model)
+    moved = directions.copy()
+    moved[:, :2] += sensor.lateral * std[:, None] * streams["lateral"].normal(size=(len(directions), 2))
+    return around.join(solids.first_hit(moved), moved)
 
 
 def _incidence(hits: Hits, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
