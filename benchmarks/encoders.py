@@ -36,8 +36,8 @@ def measure(encoder: Encoder) -> None:
     queries, index = torch.randn(BATCH, QUERIES, 3), torch.arange(BATCH)
 
     def step() -> None:
-        outputs = network(cloud, viewpoint.expand(BATCH, 3), queries, index)
-        torch.stack([output.square().mean() for output in outputs if output is not None]).sum().backward()
+        prediction, coarse = network(cloud, viewpoint.expand(BATCH, 3), queries, index)
+        torch.stack([output.square().mean() for output in (*prediction, coarse) if output is not None]).sum().backward()
 
     before = peak()
     training = seconds(step, 3) / BATCH

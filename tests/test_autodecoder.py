@@ -186,8 +186,8 @@ def test_only_the_codes_of_a_batch_move_and_at_their_own_rate(dataset: Path, dat
 def test_gradient_reaches_every_parameter(data: Dataset) -> None:
     network = start_network(SMALL, data).train()
     index = torch.arange(12)
-    outputs = network(data.cloud, data.viewpoint, data.positions, index)
-    sum(output.square().sum() for output in outputs if output is not None).backward()
+    prediction, coarse = network(data.cloud, data.viewpoint, data.positions, index)
+    sum(output.square().sum() for output in (*prediction, coarse) if output is not None).backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 1e-7, name
     assert (network.encoder.codes.grad.abs().amax(dim=1) > 1e-7).all()

@@ -6,11 +6,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mereo.models.config import NetworkConfig
+from mereo.models.config import Loss, NetworkConfig, Supervision
 from mereo.models.decoder import FrequencyEncoding, Prediction
 from mereo.models.encoders.pointnet2 import PointNet2
 from mereo.models.network import Network
-from mereo.training.config import PRESETS, Loss
+from mereo.training.config import PRESETS
 from mereo.training.losses import occupancy_loss
 
 TINY = PRESETS["tiny"].network
@@ -38,11 +38,10 @@ def settled(config: NetworkConfig, segments: int = 3) -> Network:
 def test_every_preset_answers_with_its_shapes(name: str) -> None:
     network = settled(PRESETS[name].network, segments=5)
     with torch.inference_mode():
-        logits, distance, direction, rest, coarse = network(
-            cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3)
-        )
-    assert logits.shape == (2, 11, 6) and distance.shape == (2, 11) and direction.shape == (2, 11, 3)
-    for found in (rest, coarse):
+        prediction, coarse = network(cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3))
+    assert prediction.logits.shape == (2, 11, 6) and prediction.distance.shape == (2, 11)
+    assert prediction.direction.shape == (2, 11, 3)
+    for found in (prediction.rest, coarse):
         assert found is None if name == "paper" else found is not None and found.shape == (2, 11, 3)
 
 
@@ -70,9 +69,9 @@ def test_what_all_clouds_have_in_common_is_not_rounded_to_bfloat16() -> None:
         for reader in (encoder.level2.mlp.layers[0], encoder.pool.layers[0], decoder.latent1, *attentions):
             reader.weight[:, 0] = 100.0
     inputs = cloud_of(network.config, batch=8), viewpoint_of(8), torch.randn(8, 40, 3)
-    exact = network(*inputs)[0]
+    exact = network(*inputs).prediction.logits
     with torch.autocast("cpu", torch.bfloat16):
-        rounded = network(*inputs)[0]
+        rounded = network(*inputs).prediction.logits
     assert (rounded - exact).std() < 0.1 * exact.std()
 
 
@@ -118,7 +117,7 @@ def test_split_latent_layer_equals_concatenation() -> None:
                 hidden = hidden + vector @ skip.T
             hidden = torch.relu(norm(hidden.flatten(0, 1))).view_as(hidden)
         expected = decoder.head(hidden)[..., :4]
-        logits, *_ = network(cloud, viewpoint_of(), points)
+        logits = network(cloud, viewpoint_of(), points).prediction.logits
     assert torch.allclose(logits, expected, atol=1e-4)
 
 
@@ -187,10 +186,10 @@ def example_prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor, torch.
 
 def test_loss_variants_add_up() -> None:
     prediction, labels, distances, directions = example_prediction()
-    full, terms = occupancy_loss(prediction, labels, distances, directions, "ce+l1+cd", 100.0)
+    full, terms = occupancy_loss(prediction, labels, distances, directions, Supervision.of("ce+l1+cd"), 100.0)
     assert torch.isclose(full, terms["ce"] + 100.0 * terms["l1"] + terms["cd"])
     for loss, names in (("ce", {"ce"}), ("l1", {"l1"}), ("ce+l1", {"ce", "l1"})):
-        _, part = occupancy_loss(prediction, labels, distances, directions, loss, 100.0)  # type: ignore[arg-type]
+        _, part = occupancy_loss(prediction, labels, distances, directions, Supervision.of(loss), 100.0)
         assert set(part) == names
         assert all(torch.isclose(part[name], terms[name]) for name in names)
 
@@ -198,14 +197,14 @@ def test_loss_variants_add_up() -> None:
 def test_cosine_term_is_minus_one_for_the_right_direction_of_any_length() -> None:
     prediction, labels, distances, directions = example_prediction()
     right = Prediction(prediction.logits, prediction.distance, 7.0 * directions)
-    _, terms = occupancy_loss(right, labels, distances, directions, "ce+l1+cd", 100.0)
+    _, terms = occupancy_loss(right, labels, distances, directions, Supervision.of("ce+l1+cd"), 100.0)
     assert torch.isclose(terms["cd"], torch.tensor(-1.0))
 
 
 def test_each_term_is_the_papers() -> None:
     """Against the formulas of equation 1, written out."""
     prediction, labels, distances, directions = example_prediction()
-    _, terms = occupancy_loss(prediction, labels, distances, directions, "ce+l1+cd", 100.0)
+    _, terms = occupancy_loss(prediction, labels, distances, directions, Supervision.of("ce+l1+cd"), 100.0)
     probability = prediction.logits.exp() / prediction.logits.exp().sum(dim=-1, keepdim=True)
     assert torch.isclose(terms["ce"], -probability.gather(-1, labels[..., None]).log().mean())
     assert torch.isclose(terms["l1"], (prediction.distance - distances).abs().mean())
@@ -216,7 +215,7 @@ def test_each_term_is_the_papers() -> None:
 @pytest.mark.parametrize("loss, rows", [("ce", [0, 1, 2, 3]), ("l1", [4]), ("ce+l1", [0, 1, 2, 3, 4])])
 def test_a_loss_trains_its_own_heads_only(loss: Loss, rows: list[int]) -> None:
     network = settled(replace(TINY, align_points=0), segments=3).train()
-    logits, distance, direction, _, _ = network(cloud_of(TINY), viewpoint_of(), torch.randn(2, 5, 3))
-    _, labels, distances, directions = example_prediction()
-    occupancy_loss(Prediction(logits, distance, direction), labels, distances, directions, loss, 100.0)[0].backward()
+    prediction, _ = network(cloud_of(TINY), viewpoint_of(), torch.randn(2, 5, 3))
+    _, *truth = example_prediction()
+    occupancy_loss(prediction, *truth, Supervision.of(loss), 100.0)[0].backward()
     assert network.decoder.head.weight.grad.abs().amax(dim=1).nonzero().flatten().tolist() == rows

@@ -15,6 +15,10 @@ Encoder = Literal["pointnet2", "point-transformer", "autodecoder"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
+Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
+"""Terms by which networks are trained, as options and weights name them."""
+
+
 MOST_ORDERED = 16384
 """Points of one cloud that a program of the GPU can keep: 16 in each of 1024 threads."""
 
@@ -35,6 +39,27 @@ class InferenceConfig:
 
 EXACT = InferenceConfig(precision="float32")
 """For measuring a network: the same figures on every machine."""
+
+
+@dataclass(frozen=True)
+class Supervision:
+    """What the terms of a loss teach a network, and so what it can be asked.
+
+    Attributes:
+        labels: by cross-entropy ("ce"); a network trained without it only knows inside from outside.
+        distances: signed ones, by L1 ("l1").
+        directions: to the nearest surface, by their cosine ("cd").
+    """
+
+    labels: bool
+    distances: bool
+    directions: bool
+
+    @classmethod
+    def of(cls, loss: str) -> "Supervision":
+        """What the loss of that name teaches, for example "ce+l1"."""
+        terms = loss.split("+")
+        return cls("ce" in terms, "l1" in terms, "cd" in terms)
 
 
 @dataclass(frozen=True)

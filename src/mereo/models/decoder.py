@@ -8,6 +8,7 @@ Notation: b clouds, q queries, k neighbours, z latent channels, h hidden channel
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -41,11 +42,14 @@ class Code:
     alignment: Alignment | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """Raw outputs at each query: class logits (0 is empty), signed distance, direction (not yet unit length).
+class Prediction(NamedTuple):
+    """Raw outputs of a network at each query.
 
-    ``rest`` are rest coordinates (``rest_pose``), meant inside the object; None where the network predicts none.
+    Attributes:
+        logits: of the classes, of which 0 is empty space.
+        distance: signed, normalized.
+        direction: to the nearest surface, camera frame, not yet of unit length.
+        rest: rest coordinates (``scenes.rest_pose``), meant inside the object; None where the network predicts none.
     """
 
     logits: Float[Tensor, "b q c"]

@@ -21,7 +21,7 @@ from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.geometry.mesh import Color
 from mereo.geometry.normalizer import Normalizer
 from mereo.models.batch_norm_fusion import fold_batch_norm
-from mereo.models.config import Precision
+from mereo.models.config import Precision, Supervision
 from mereo.models.decoder import Code, Prediction
 from mereo.models.device import pick_precision
 from mereo.models.network import Network
@@ -100,7 +100,12 @@ class Model:
     @property
     def segmented(self) -> bool:
         """Whether it tells segments apart; one trained on distances alone only knows inside from outside."""
-        return "ce" in self.loss
+        return self.supervision.labels
+
+    @property
+    def supervision(self) -> Supervision:
+        """What the loss has taught, and so what is answered."""
+        return Supervision.of(self.loss)
 
     @cached_property
     def inference(self) -> Network:
@@ -181,9 +186,9 @@ class Model:
         A head that no term of the loss has trained says nothing: it is NaN.
         """
         distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
-        if "l1" not in self.loss:
+        if not self.supervision.distances:
             distance = torch.full_like(distance, torch.nan)
-        if "cd" not in self.loss:
+        if not self.supervision.directions:
             direction = torch.full_like(direction, torch.nan)
         return self.class_logits(prediction, queries), distance, direction
 

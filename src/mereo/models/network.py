@@ -1,6 +1,7 @@
 """Encoder and decoder together, on normalized batches; ``mereo.models.model`` puts them into the user's frame."""
 
 from dataclasses import fields
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -16,6 +17,19 @@ from mereo.models.rigid_alignment import Alignment
 
 ALIGNED_QUERIES = 128
 """Queries per example that train the alignment: neighbours say much the same about a nearly rigid motion."""
+
+
+class TrainingOutput(NamedTuple):
+    """What a network in training answers.
+
+    Attributes:
+        prediction: at all queries.
+        coarse: rest coordinates from which the alignment is made, at the first ``ALIGNED_QUERIES``; None where the
+            network aligns nothing.
+    """
+
+    prediction: Prediction
+    coarse: Float[Tensor, "b a 3"] | None
 
 
 class Network(nn.Module):
@@ -71,24 +85,15 @@ class Network(nn.Module):
         viewpoint: Float[Tensor, "b 3"],
         points: Float[Tensor, "b q 3"],
         index: Int[Tensor, " b"] | None = None,
-    ) -> tuple[
-        Float[Tensor, "b q c"],
-        Float[Tensor, "b q"],
-        Float[Tensor, "b q 3"],
-        Float[Tensor, "b q 3"] | None,
-        Float[Tensor, "b a 3"] | None,
-    ]:
-        """What training needs: logits, distance, direction, and rest coordinates twice.
+    ) -> TrainingOutput:
+        """Predictions at ``points``, with what else a loss looks at.
 
-        First those of the template lookup, then those that the alignment is made from, at the first
-        ``ALIGNED_QUERIES``; None where the network has no such part. ``index`` says which training examples the clouds
-        are: an autodecoder takes their codes.
+        ``index`` says which training examples the clouds are: an autodecoder takes their codes.
         """
         alignment, coarse = None, None
         if self.aligner is not None:
             alignment, coarse = self.aligner(cloud, points[:, :ALIGNED_QUERIES])
-        prediction = self.query(self._encode(cloud, viewpoint, alignment, index), points)
-        return prediction.logits, prediction.distance, prediction.direction, prediction.rest, coarse
+        return TrainingOutput(self.query(self._encode(cloud, viewpoint, alignment, index), points), coarse)
 
 
 def config_from_dict(values: dict[str, object]) -> NetworkConfig:

@@ -83,7 +83,7 @@ def reconstruct(
     with _timed(timings, "locate"):
         box = locate(field, code.normalizer.invert(SEARCH_BOX))
     with _timed(timings, "extract"):
-        found = extract_whole(field, box, resolution, names, colors, model.nested if "ce" in model.loss else ())
+        found = extract_whole(field, box, resolution, names, colors, model.nested if model.segmented else ())
     with _timed(timings, "measure"):
         segments = measure(found, model, code)
     observed = None

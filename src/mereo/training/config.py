@@ -6,9 +6,7 @@ Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) u
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypedDict
 
-from mereo.models.config import NetworkConfig, Precision
-
-Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
+from mereo.models.config import Loss, NetworkConfig, Precision, Supervision
 
 
 @dataclass(frozen=True)
@@ -78,6 +76,11 @@ class TrainConfig:
     precision: Precision = "auto"
     compile: Literal["auto", "on", "off"] = "auto"
     seed: int = 0
+
+    @property
+    def supervision(self) -> Supervision:
+        """What the loss teaches."""
+        return Supervision.of(self.loss)
 
 
 _MODERN = AugmentConfig(keep_points=(0.5, 1.0), hole_probability=0.4, jitter_std=0.005, roll=True)

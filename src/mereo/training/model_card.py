@@ -78,8 +78,9 @@ def _object(model: Model) -> str:
     sizes = provenance.get("visible_m")
     if isinstance(sizes, list | tuple):
         lines.append(f"- longest side of the visible part in training: {sizes[0]:.3g} to {sizes[1]:.3g} m")
-    answers = {"ce": "labels", "l1": "signed distances", "cd": "directions"}
-    known = [word for term, word in answers.items() if term in model.loss.split("+")]
+    taught = model.supervision
+    answers = {"labels": taught.labels, "signed distances": taught.distances, "directions": taught.directions}
+    known = [answer for answer, is_taught in answers.items() if is_taught]
     return "\n".join([*lines, f"- answers: {', '.join(known)}", ""])
 
 

@@ -45,7 +45,7 @@ def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
 
 
 def _check_autodecoder(config: TrainConfig) -> None:
-    if "l1" not in config.loss:
+    if not config.supervision.distances:
         raise ValueError(
             f"the loss is {config.loss!r}, but an autodecoder finds the code of a cloud by its distances, which only "
             "the L1 term trains; take --loss l1, ce+l1 or ce+l1+cd"

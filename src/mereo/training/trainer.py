@@ -17,7 +17,6 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from mereo.models.decoder import Prediction
 from mereo.models.device import compiling_pays, keep_freed_memory, pick_device, pick_precision
 from mereo.models.encoders.autodecoder import CODES, Autodecoder
 from mereo.models.model import Model
@@ -153,14 +152,13 @@ class Trainer:
 
     def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         with torch.autocast(self.device.type, self.autocast) if self.autocast else nullcontext():
-            *outputs, coarse = self.module(batch.cloud, batch.viewpoint, batch.positions, batch.index)
-        prediction = Prediction(*outputs)
+            prediction, coarse = self.module(batch.cloud, batch.viewpoint, batch.positions, batch.index)
         loss, terms = occupancy_loss(
             prediction,
             batch.labels,
             batch.distances,
             batch.directions,
-            self.config.loss,
+            self.config.supervision,
             self.config.l1_weight,
         )
         if coarse is not None:

@@ -29,7 +29,7 @@ def held_out(data: Dataset, config: TrainConfig) -> range:
 @torch.no_grad()
 def validate(network: Network, data: Dataset, config: TrainConfig) -> Scores:
     """IoU and mIoU on the held-out examples' queries (not the paper's grid metric)."""
-    segmented = "ce" in config.loss
+    segmented = config.supervision.labels
     classes = network.segments + 1 if segmented else 2
     total = torch.zeros(classes, classes, dtype=torch.long)
     for batch, logits, distance in _answers(network, data, config, held_out(data, config)):
@@ -43,7 +43,7 @@ def validate(network: Network, data: Dataset, config: TrainConfig) -> Scores:
 def choose_offsets(network: Network, data: Dataset, config: TrainConfig) -> Float[Tensor, " c"] | None:
     """Class offsets (``calibration``) from the first training examples; None when off."""
     count, uniform = min(config.offset_examples, len(data) - config.holdout), data.uniform_queries
-    if not (count and uniform and "ce" in config.loss):
+    if not (count and uniform and config.supervision.labels):
         return None
     answers = _answers(network, data, config, range(count))
     found = [(logits[:, -uniform:], batch.labels[:, -uniform:]) for batch, logits, _ in answers]

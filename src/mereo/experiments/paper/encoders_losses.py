@@ -5,9 +5,9 @@ from dataclasses import replace
 from mereo.experiments.paper.result import Claim, Result, Row, better, published
 from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
-from mereo.models.config import Encoder
+from mereo.models.config import Encoder, Loss
 from mereo.synthesis.config import GenerateConfig
-from mereo.training.config import PRESETS, Loss, TrainConfig
+from mereo.training.config import PRESETS, TrainConfig
 
 OBJECTS = ("rope", "shapes", "robot", "lizard", "human")
 ENCODERS: tuple[Encoder, ...] = ("pointnet2", "point-transformer", "autodecoder")

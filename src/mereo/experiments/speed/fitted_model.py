@@ -44,7 +44,7 @@ def fitted_model(preset: str, frame: SampleView) -> Model:
         network.aligner.eval()  # one frame teaches no alignment: any that stays the same will do
     for _ in range(STEPS):
         queries, labels = draw()
-        loss = nn.functional.cross_entropy(network(cloud, viewpoint, queries)[0][0], labels)
+        loss = nn.functional.cross_entropy(network(cloud, viewpoint, queries).prediction.logits[0], labels)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
