@@ -1,7 +1,5 @@
 """The network's structure: what it must ignore, what it must share, and its paper sizes."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -53,13 +51,13 @@ def test_paper_preset_has_the_papers_sizes() -> None:
     assert [layer.in_features for layer in network.decoder.hidden] == [512] * 6
     assert len(network.decoder.norms) == 7
     assert network.decoder.latent2.in_features == 1024 and network.decoder.query2.in_features == 60
-    assert not network.decoder.local and config.sight_neighbors == 0 and network.aligner is None
+    assert not network.decoder.local and config.additions.sight_neighbors == 0 and network.aligner is None
 
 
 def test_what_all_clouds_have_in_common_is_not_rounded_to_bfloat16() -> None:
     """Normalization takes a channel's mean away, however large: in bfloat16 it would first erase what differs."""
     torch.manual_seed(0)
-    network = Network(replace(TINY, align_points=0, rest_template=False), 3).train()
+    network = Network(TINY.changed(align_points=0, rest_template=False), 3).train()
     encoder, decoder = network.encoder, network.decoder
     with torch.no_grad():  # the first pooled channel is 4 everywhere, and whoever reads it adds 400
         for shared in (encoder.level1.mlp, encoder.level2.mlp, encoder.pool):
@@ -77,7 +75,7 @@ def test_what_all_clouds_have_in_common_is_not_rounded_to_bfloat16() -> None:
 
 def test_encoder_ignores_the_order_within_its_last_half() -> None:
     """Centres are the first half (a farthest-point sample); the rest is a set, whatever its order."""
-    config = replace(TINY, neighbors=TINY.points)
+    config = TINY.changed(neighbors=TINY.points)
     encoder = settled(config).encoder
     cloud = cloud_of(config)
     half = config.points // 2
@@ -87,8 +85,8 @@ def test_encoder_ignores_the_order_within_its_last_half() -> None:
 
 
 def test_encoder_ignores_repeated_points() -> None:
-    config = replace(TINY, neighbors=TINY.points)
-    encoder = PointNet2(config).eval()
+    config = TINY.changed(neighbors=TINY.points)
+    encoder = PointNet2(config.pointnet2).eval()
     cloud = cloud_of(config)
     doubled = torch.cat([cloud, cloud[:, : config.points // 4]], dim=1)
     doubled = torch.cat([doubled[:, : config.points // 2], doubled[:, config.points // 2 :]], dim=1)
@@ -101,7 +99,7 @@ def test_encoder_ignores_repeated_points() -> None:
 
 def test_split_latent_layer_equals_concatenation() -> None:
     """W [z; x] = W_z z + W_x x: the paper's concatenated query vector, without building it."""
-    network = settled(replace(TINY, local_neighbors=0, sight_neighbors=0, align_points=0))
+    network = settled(TINY.changed(local_neighbors=0, sight_neighbors=0, align_points=0))
     decoder, cloud = network.decoder, cloud_of(TINY)
     points = torch.randn(2, 9, 3)
     with torch.inference_mode():
@@ -149,7 +147,7 @@ def test_negative_exponents_tell_far_points_apart() -> None:
 
 def test_without_encoding_the_query_is_its_three_coordinates() -> None:
     """The paper's ablation: a network of one layer is then piecewise linear in the position."""
-    plain = NetworkConfig(points=64, width=16, depth=1, skip_after=1, mlp_global=(8,), encode_positions=False)
+    plain = NetworkConfig().changed(points=64, width=16, depth=1, skip_after=1, mlp_global=(8,), encode_positions=False)
     network = settled(plain)
     assert network.decoder.query1.in_features == 3
     step = torch.tensor([1e-3, 2e-3, -1e-3])
@@ -162,8 +160,8 @@ def test_without_encoding_the_query_is_its_three_coordinates() -> None:
 
 
 def test_dropout_clears_its_share_and_only_in_training() -> None:
-    plain = NetworkConfig(points=64, width=512, depth=1, skip_after=1, mlp_global=(8,))
-    networks = [settled(replace(plain, dropout=share)) for share in (0.0, 0.2)]
+    plain = NetworkConfig().changed(points=64, width=512, depth=1, skip_after=1, mlp_global=(8,))
+    networks = [settled(plain.changed(dropout=share)) for share in (0.0, 0.2)]
     networks[1].load_state_dict(networks[0].state_dict())
     queries, seen = torch.randn(2, 40, 3), []
     for network in networks:
@@ -214,7 +212,7 @@ def test_each_term_is_the_papers() -> None:
 
 @pytest.mark.parametrize("loss, rows", [("ce", [0, 1, 2, 3]), ("l1", [4]), ("ce+l1", [0, 1, 2, 3, 4])])
 def test_a_loss_trains_its_own_heads_only(loss: Loss, rows: list[int]) -> None:
-    network = settled(replace(TINY, align_points=0), segments=3).train()
+    network = settled(TINY.changed(align_points=0), segments=3).train()
     prediction, _ = network(cloud_of(TINY), viewpoint_of(), torch.randn(2, 5, 3))
     _, *truth = example_prediction()
     occupancy_loss(prediction, *truth, Supervision.of(loss), 100.0)[0].backward()

@@ -1,6 +1,5 @@
 """The template: the grid holds the model at rest, the lookup reads it exactly, and begins as nothing."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +78,7 @@ def test_rest_frame_is_that_of_the_longest_side() -> None:
 
 def test_a_new_lookup_changes_no_answer() -> None:
     torch.manual_seed(0)
-    plain = Network(replace(TINY, rest_template=False), segments=3).eval()
+    plain = Network(TINY.changed(rest_template=False), segments=3).eval()
     added = Network(TINY, segments=3).eval()
     added.load_state_dict(added.state_dict() | plain.state_dict())
     cloud, viewpoint, queries = random_rest(2, TINY.points), torch.tensor([[0.0, 0.0, -8.0]] * 2), random_rest(2, 9)

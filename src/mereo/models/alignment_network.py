@@ -37,18 +37,15 @@ class AlignmentNet(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.points = config.align_points
+        self.points = config.additions.align_points
         small = replace(
             config,
             encoder="pointnet2",  # whatever the network's own is: a small cloud needs no other
-            neighbors=min(config.neighbors, 16),
-            ratio1=0.5,
-            depth=3,
-            skip_after=2,
-            sight_neighbors=0,
-            dropout=0.0,
+            pointnet2=replace(config.pointnet2, neighbors=min(config.pointnet2.neighbors, 16), ratio1=0.5),
+            decoder=replace(config.decoder, depth=3, skip_after=2, dropout=0.0),
+            additions=replace(config.additions, sight_neighbors=0),
         )
-        self.encoder = PointNet2(small)
+        self.encoder = PointNet2(small.pointnet2)
         self.decoder = ConditionedMLP(small, outputs=3)
 
     def forward(self, cloud: Float[Tensor, "b n 3"], queries: Float[Tensor, "b q 3"] | None = None) -> Aligned:

@@ -127,31 +127,33 @@ class ConditionedMLP(nn.Module):
     def __init__(self, config: NetworkConfig, outputs: int, lookup: RestLookup | None = None) -> None:
         super().__init__()
         self.config, self.lookup = config, lookup
-        self.encode = FrequencyEncoding(config.lowest_exponent, config.highest_exponent)
-        query, width = self.encode.channels if config.encode_positions else 3, config.width
+        layers, added = config.decoder, config.additions
+        self.encode = FrequencyEncoding(layers.lowest_exponent, layers.highest_exponent)
+        query, width = self.encode.channels if layers.encode_positions else 3, layers.width
         self.latent1 = nn.Linear(config.latent, width, bias=False)
         self.latent2 = nn.Linear(config.latent, width, bias=False)
         self.query1 = nn.Linear(query, width, bias=False)
         self.query2 = nn.Linear(query, width, bias=False)
-        self.hidden = nn.ModuleList(nn.Linear(width, width, bias=False) for _ in range(config.depth - 1))
-        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for _ in range(config.depth))
+        self.hidden = nn.ModuleList(nn.Linear(width, width, bias=False) for _ in range(layers.depth - 1))
+        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for _ in range(layers.depth))
         self.local = nn.ModuleList()
-        if config.local_neighbors:
+        if added.local_neighbors:
             self.local.extend(
-                LocalAttention(channels, config.local_width, config.local_neighbors) for channels in config.level_widths
+                LocalAttention(channels, added.local_width, added.local_neighbors) for channels in config.level_widths
             )
-            self.local1 = nn.Linear(len(self.local) * config.local_width, width, bias=False)
-        if config.sight_neighbors:
-            self.sight1 = nn.Linear(6 * config.sight_neighbors, width, bias=False)
+            self.local1 = nn.Linear(len(self.local) * added.local_width, width, bias=False)
+        if added.sight_neighbors:
+            self.sight1 = nn.Linear(6 * added.sight_neighbors, width, bias=False)
         self.head = nn.Linear(width, outputs)
 
     def summands(self, number: int) -> list[nn.Linear]:
         """The layers whose sum is normalized in layer ``number``, counted from 0."""
         if number == 0:
-            extra = ("local1",) * bool(self.config.local_neighbors) + ("sight1",) * bool(self.config.sight_neighbors)
+            added = self.config.additions
+            extra = ("local1",) * bool(added.local_neighbors) + ("sight1",) * bool(added.sight_neighbors)
             return [self.latent1, self.query1, *(getattr(self, name) for name in extra)]
         summands: list[nn.Linear] = [self.hidden[number - 1]]  # type: ignore[list-item]
-        if number == self.config.skip_after:
+        if number == self.config.decoder.skip_after:
             summands += [self.latent2, self.query2, *(() if self.lookup is None else (self.lookup.read,))]
         return summands
 
@@ -175,31 +177,32 @@ class ConditionedMLP(nn.Module):
         self, code: Code, queries: Float[Tensor, "b q 3"]
     ) -> tuple[Float[Tensor, "b q f"], Float[Tensor, "b q 3"] | None]:
         """The last layer's outputs, and the rest coordinates of the lookup on the way, if there is one."""
+        layers, added = self.config.decoder, self.config.additions
         placed = queries if code.alignment is None else code.alignment.apply(queries)
-        encoded = self.encode(placed) if self.config.encode_positions else placed
+        encoded = self.encode(placed) if layers.encode_positions else placed
         with exact(queries):  # up to the first normalization
             rows = [encoded]
-            if self.config.local_neighbors:
+            if added.local_neighbors:
                 rows += [layer(level, placed) for layer, level in zip(self.local, code.levels, strict=True)]
-            if self.config.sight_neighbors:
-                rows.append(line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors))
+            if added.sight_neighbors:
+                rows.append(line_of_sight(queries, code.cloud, code.viewpoint, added.sight_neighbors))
             hidden = self._activate(0, joint_linear(self.summands(0)[1:], rows, code.latent1))
         rest = None
         for number in range(1, len(self.norms)):
             rows, latent = [hidden], None
-            if number == self.config.skip_after:
+            if number == layers.skip_after:
                 rows, latent = [hidden, encoded], code.latent2
                 if self.lookup is not None:
                     rest, seen = self.lookup(hidden, placed)
                     rows.append(seen)
-            layers = [layer for layer in self.summands(number) if layer is not self.latent2]
-            hidden = self._activate(number, joint_linear(layers, rows, latent))
+            read = [layer for layer in self.summands(number) if layer is not self.latent2]
+            hidden = self._activate(number, joint_linear(read, rows, latent))
         return self.head(hidden).float(), rest
 
     def _activate(self, number: int, hidden: Float[Tensor, "b q h"]) -> Float[Tensor, "b q h"]:
         """Normalization, ReLU and dropout of layer ``number``, counted from 0."""
         hidden = self.norms[number](hidden.flatten(0, 1)).relu_().unflatten(0, hidden.shape[:2])
-        return nn.functional.dropout(hidden, self.config.dropout, self.training)
+        return nn.functional.dropout(hidden, self.config.decoder.dropout, self.training)
 
 
 def joint_linear(
@@ -224,7 +227,7 @@ class Decoder(ConditionedMLP):
     """Code and query points -> class logits, signed distance, direction."""
 
     def __init__(self, config: NetworkConfig, classes: int) -> None:
-        lookup = RestLookup(config.width, classes - 1) if config.rest_template else None
+        lookup = RestLookup(config.decoder.width, classes - 1) if config.additions.rest_template else None
         super().__init__(config, classes + 4, lookup)
         self.classes = classes
 

@@ -1,6 +1,5 @@
 """Encoder and decoder together, on normalized batches; ``mereo.models.model`` puts them into the user's frame."""
 
-from dataclasses import fields
 from typing import NamedTuple
 
 import torch
@@ -40,7 +39,7 @@ class Network(nn.Module):
         self.config, self.segments = config, segments
         self.encoder = make_encoder(config)
         self.decoder = Decoder(config, segments + 1)
-        self.aligner = AlignmentNet(config) if config.align_points else None
+        self.aligner = AlignmentNet(config) if config.additions.align_points else None
 
     def encode(self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
         """``cloud`` in farthest-point order. An autodecoder searches for its code, in evaluation mode."""
@@ -94,14 +93,3 @@ class Network(nn.Module):
         if self.aligner is not None:
             alignment, coarse = self.aligner(cloud, points[:, :ALIGNED_QUERIES])
         return TrainingOutput(self.query(self._encode(cloud, viewpoint, alignment, index), points), coarse)
-
-
-def config_from_dict(values: dict[str, object]) -> NetworkConfig:
-    """Inverse of ``dataclasses.asdict`` after a trip through JSON; unknown keys raise ``ValueError``.
-
-    Settings that older weights do not state have their defaults: what they switch on did not exist then.
-    """
-    odd = sorted(set(values) - {f.name for f in fields(NetworkConfig)})
-    if odd:
-        raise ValueError(f"the network settings differ in {odd[0]!r} from this version of mereo; train again")
-    return NetworkConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
 """Trained models on disk: one safetensors file whose header holds everything needed to run without the dataset."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -11,11 +11,11 @@ from safetensors.torch import save
 from torch import Tensor
 
 from mereo.io.atomic_files import atomic_file
-from mereo.models.config import InferenceConfig
+from mereo.models.config import InferenceConfig, NetworkConfig
 from mereo.models.device import find_device
 from mereo.models.encoders.autodecoder import CODES
 from mereo.models.model import Model
-from mereo.models.network import Network, config_from_dict
+from mereo.models.network import Network
 
 FORMAT_VERSION = 2
 """Version 2 may hold the template in bytes; the rest is as in version 1, which is read too."""
@@ -36,7 +36,7 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
     """
     header = {
         "version": FORMAT_VERSION,
-        "network": asdict(model.network.config),
+        "network": model.network.config.to_dict(),
         "names": model.names,
         "colors": model.colors,
         "loss": model.loss,
@@ -122,7 +122,7 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
             f"{path} has weights format {header.get('version')}; this mereo reads formats up to {FORMAT_VERSION}: "
             "train again, or install the matching version"
         )
-    network = Network(config_from_dict(header["network"]), len(header["names"]))
+    network = Network(NetworkConfig.from_dict(header["network"]), len(header["names"]))
     try:
         network.load_state_dict({name: _restored(name, value) for name, value in tensors.items()})
     except RuntimeError as error:

@@ -6,7 +6,7 @@ the weights and their tests say themselves.
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from typing import Any
 import torch
 
 from mereo.io.atomic_files import new_directory
+from mereo.models.config import NetworkConfig
 from mereo.models.model import Model
-from mereo.models.network import config_from_dict
 from mereo.models.weights import load_model, save_model
 from mereo.training.config import PRESETS
 
@@ -104,10 +104,10 @@ def _training(provenance: dict[str, object]) -> str:
 def _nearest_preset(recipe: dict[str, Any]) -> str:
     """The preset whose network it is, else of which most settings are."""
 
-    network = config_from_dict(recipe["network"])  # what older recipes do not state is at its default
+    network = NetworkConfig.from_dict(recipe["network"])  # what older recipes do not state is at its default
 
     def agreement(preset: str) -> tuple[bool, int]:
-        known = json.loads(json.dumps(asdict(PRESETS[preset])))
+        known = json.loads(json.dumps(PRESETS[preset].to_dict()))
         return PRESETS[preset].network == network, sum(known[key] == recipe.get(key) for key in known)
 
     return max(PRESETS, key=agreement)

@@ -2,7 +2,7 @@
 
 import json
 import os
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,10 +93,11 @@ COUNTS = ("points", "neighbors", "ratio1", "ratio2", "local_neighbors", "sight_n
 
 def _check_architecture(start: NetworkConfig, config: TrainConfig) -> None:
     """Only the template lookup, which begins as nothing, may be new, and counts differ that both have."""
-    ours = config.network
-    counts = {name: getattr(ours, name) for name in COUNTS if getattr(start, name) and getattr(ours, name)}
-    known = replace(start, rest_template=start.rest_template or ours.rest_template, **counts)
-    odd = [f.name for f in fields(known) if getattr(known, f.name) != getattr(ours, f.name)]
+    given, ours = start.to_dict(), config.network.to_dict()
+    free = {name for name in COUNTS if given[name] and ours[name]}
+    if ours["rest_template"]:
+        free.add("rest_template")
+    odd = [name for name, value in ours.items() if value != given[name] and name not in free]
     if odd:
         raise ValueError(
             f"the weights {config.init} have another network setting {odd[0]}; continuing needs the same "
@@ -138,7 +139,7 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
         )
     if process.is_main:
         dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
-        _claim(run_dir, json.loads(json.dumps({"dataset": dataset, "train": asdict(config)})))
+        _claim(run_dir, json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()})))
     if process.world > 1:
         dist.barrier()
 
@@ -155,7 +156,7 @@ def _claim(run_dir: Path, settings: dict[str, Any]) -> None:
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """A run's settings; those that an older mereo did not have are as they were then, which is their default."""
-    default = json.loads(json.dumps(asdict(TrainConfig())))
+    default = json.loads(json.dumps(TrainConfig().to_dict()))
     train = default | settings.get("train", {})
     return settings | {"train": train | {"network": default["network"] | train["network"]}}
 

@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -247,7 +246,7 @@ class Trainer:
             "mereo": manifest["version"],
             "visible_m": self.data.visible_m,
             "class_offsets": None if offsets is None else offsets.tolist(),
-            "recipe": asdict(self.config),
+            "recipe": self.config.to_dict(),
         }
         return Model(
             network=network,

@@ -25,10 +25,9 @@ def recipe(base: TrainConfig, encoder: Encoder, loss: Loss) -> TrainConfig | Non
     if loss == "ce":
         return None
     own = PRESETS["paper-autodecoder"]
-    network = replace(
-        base.network,
+    network = base.network.changed(
         encoder=encoder,
-        dropout=own.network.dropout,
+        dropout=own.network.decoder.dropout,
         local_neighbors=0,
         sight_neighbors=0,
         align_points=0,

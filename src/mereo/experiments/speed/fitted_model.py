@@ -25,7 +25,7 @@ def fitted_model(preset: str, frame: SampleView) -> Model:
     """
     grid, kept = frame.truth.grid, frame.truth.kept
     torch.manual_seed(0)
-    network = Network(replace(PRESETS[preset].network, dropout=0.0), len(grid.names))
+    network = Network(PRESETS[preset].network.changed(dropout=0.0), len(grid.names))
     model = Model(network, grid.names, tuple(PALETTE[i % len(PALETTE)] for i in range(len(grid.names))))
     cloud, normalizer = model.normalized_cloud(frame.depth.to_points())
     model = replace(model, domain=_domain(grid, normalizer))

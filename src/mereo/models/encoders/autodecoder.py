@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mereo.models.config import NetworkConfig
+from mereo.models.config import AutodecoderConfig
 
 CODES = "encoder.codes"
 """Name of the training examples' codes among a network's parameters."""
@@ -28,13 +28,13 @@ class Autodecoder(nn.Module):
         mean: their mean, from which a search starts.
     """
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: AutodecoderConfig, latent: int) -> None:
         super().__init__()
         self.steps, self.rate, self.penalty = config.search_steps, config.search_rate, config.code_penalty
         self.codes: nn.Parameter | None
         self.register_parameter("codes", None)
         self.mean: Tensor
-        self.register_buffer("mean", torch.zeros(config.latent))
+        self.register_buffer("mean", torch.zeros(latent))
 
     def add_codes(self, examples: int) -> None:
         """Random codes for training, about one away from the mean (which is zero in a new network)."""

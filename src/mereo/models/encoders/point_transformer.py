@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mereo.models.config import NetworkConfig
+from mereo.models.config import PointTransformerConfig
 from mereo.models.encoders.encoding import Encoding, Level, SharedMLP
 from mereo.models.ops.neighbors import distinct_distances, gather
 
@@ -84,14 +84,14 @@ class PointTransformer(nn.Module):
     The points of a level are a prefix of those before, so one matrix of distances serves all levels.
     """
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: PointTransformerConfig, latent: int) -> None:
         super().__init__()
         widths = config.transformer_widths
         self.neighbors = config.transformer_neighbors
         self.enter = SharedMLP((3, widths[0]))
         self.down = nn.ModuleList(TransitionDown(*pair) for pair in pairwise(widths))
         self.blocks = nn.ModuleList(TransformerBlock(width) for width in widths)
-        self.pool = SharedMLP((widths[-1], config.latent))
+        self.pool = SharedMLP((widths[-1], latent))
 
     def forward(self, cloud: Float[Tensor, "b n 3"]) -> Encoding:
         distances = distinct_distances(cloud)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mereo.models.config import NetworkConfig
+from mereo.models.config import PointNet2Config
 from mereo.models.encoders.encoding import Encoding, Level, SharedMLP, share
 from mereo.models.ops.neighbors import ball_query, gather
 
@@ -32,7 +32,7 @@ class SetAbstraction(nn.Module):
 class PointNet2(nn.Module):
     """Cloud in farthest-point order -> latent vector and two levels of local features."""
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: PointNet2Config) -> None:
         super().__init__()
         self.ratio1, self.ratio2 = config.ratio1, config.ratio2
         self.level1 = SetAbstraction(0, config.radius1, config.neighbors, config.mlp1)

@@ -130,7 +130,7 @@ def export_graphs(model: Model) -> Graphs:
         traced = torch.export.export(encoder, (cloud,), dynamic_shapes=({1: Open},), strict=False)
         code = encoder(cloud)
         outputs = tuple(code)
-        if config.sight_neighbors:
+        if config.additions.sight_neighbors:
             code |= {"cloud": cloud, "viewpoint": torch.tensor([[0.1, -0.2, -8.0]])}
         open_sizes = {name: None if name in FIXED_SIZE else {1: Open} for name in code}
         points = _example_points(EXAMPLE_QUERIES)
