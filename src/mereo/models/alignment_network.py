@@ -23,14 +23,14 @@ from mereo.models.rigid_alignment import Alignment, fit_rigid
 
 
 class Aligned(NamedTuple):
-    """The motion, and the rest-pose coordinates predicted at the queries, for the loss."""
+    """Rigid motion of each cloud, and the rest coordinates predicted at the queries, for the loss."""
 
     alignment: Alignment
     rest: Float[Tensor, "b q 3"]
 
 
 class AlignmentNet(nn.Module):
-    """Cloud in farthest-point order -> ``Alignment``, by way of rest-pose coordinates."""
+    """Network from a cloud in farthest-point order to its ``Alignment``, by way of rest coordinates."""
 
     FITTED = 128
     """Observed points whose coordinates are predicted and fitted."""
@@ -49,6 +49,7 @@ class AlignmentNet(nn.Module):
         self.decoder = ConditionedMLP(small, outputs=3)
 
     def forward(self, cloud: Float[Tensor, "b n 3"], queries: Float[Tensor, "b q 3"] | None = None) -> Aligned:
+        """Alignment of each cloud, and rest coordinates at ``queries`` (none where there are none)."""
         seen = cloud[:, : self.FITTED]
         unused = torch.zeros_like(cloud[:, 0])  # the viewpoint: rest coordinates need no lines of sight
         code = self.decoder.prepare(self.encoder(cloud[:, : self.points]), cloud, unused)

@@ -22,7 +22,7 @@ AnyModule = TypeVar("AnyModule", bound=nn.Module)
 @torch.inference_mode(False)  # a search for codes needs gradients, which tensors of inference mode cannot give
 @torch.no_grad()
 def fold_batch_norm(network: AnyModule) -> AnyModule:
-    """A copy for inference whose decoders and shared layers have no normalization left.
+    """Copy of a network for inference whose decoders and shared layers have no normalization left.
 
     Its parameters have other names and meanings: it can be neither trained nor saved. Raises ``ValueError`` for a
     network in training mode, whose normalization depends on the batch.

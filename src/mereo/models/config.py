@@ -1,4 +1,6 @@
-"""Settings of networks and of how exactly they answer; light, so that the command line may import them.
+"""Settings of networks, of what a loss teaches them, and of where and how exactly they answer.
+
+Light, so that the command line may import them.
 
 Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise.
 """
@@ -19,12 +21,12 @@ Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
 """Terms by which networks are trained, as options and weights name them."""
 
 MOST_ORDERED = 16384
-"""Points of one cloud that a program of the GPU can keep: 16 in each of 1024 threads."""
+"""Number of points of one cloud that a program of the GPU can keep: 16 in each of 1024 threads."""
 
 
 @dataclass(frozen=True)
 class InferenceConfig:
-    """Where and how exactly the network computes.
+    """Settings of where and how exactly a network computes.
 
     Attributes:
         device: where the network runs; auto takes a CUDA device where there is one.
@@ -37,12 +39,12 @@ class InferenceConfig:
 
 
 EXACT = InferenceConfig(precision="float32")
-"""For measuring a network: the same figures on every machine."""
+"""Settings for measuring a network: the same figures on every machine."""
 
 
 @dataclass(frozen=True)
 class Supervision:
-    """What the terms of a loss teach a network, and so what it can be asked.
+    """Kinds of truth that a loss has taught a network, and so what it can be asked.
 
     Attributes:
         labels: by cross-entropy ("ce"); a network trained without it only knows inside from outside.
@@ -56,7 +58,7 @@ class Supervision:
 
     @classmethod
     def of(cls, loss: str) -> "Supervision":
-        """What the loss of that name teaches, for example "ce+l1"."""
+        """Supervision by the loss of that name, for example "ce+l1"."""
         terms = loss.split("+")
         return cls("ce" in terms, "l1" in terms, "cd" in terms)
 
@@ -66,13 +68,13 @@ class PointNet2Config:
     """Settings of PointNet++; sizes are those of its reference implementation.
 
     Attributes:
-        neighbors: largest number of neighbours in a ball, the first in farthest-point order.
-        ratio1: first set abstraction: share of points kept as centres.
-        radius1: first set abstraction: radius of the balls.
-        mlp1: first set abstraction: layer widths.
-        ratio2: second set abstraction: share of the first level's centres that are kept.
-        radius2: second set abstraction: radius of the balls.
-        mlp2: second set abstraction: layer widths.
+        neighbors: largest number of neighbours in a ball of PointNet++, the first in farthest-point order.
+        ratio1: share of points kept as centres by PointNet++'s first set abstraction.
+        radius1: radius of its balls.
+        mlp1: its layer widths.
+        ratio2: share of those centres kept by its second set abstraction.
+        radius2: radius of that one's balls.
+        mlp2: that one's layer widths.
         mlp_global: layer widths before the global max pool; the last one is the latent size of every encoder.
     """
 
@@ -91,8 +93,8 @@ class PointTransformerConfig:
     """Settings of the Point Transformer.
 
     Attributes:
-        transformer_widths: one block per width; from one to the next a quarter of the points stay.
-        transformer_neighbors: nearest points that a point attends to; half as many in block one.
+        transformer_widths: one block of the Point Transformer per width; each has a quarter of the last one's points.
+        transformer_neighbors: nearest points that a point of it attends to; half as many in block one.
     """
 
     transformer_widths: tuple[int, ...] = (32, 64, 128, 256, 512)
@@ -104,9 +106,9 @@ class AutodecoderConfig:
     """Settings of the autodecoder.
 
     Attributes:
-        search_steps: steps of the search for a cloud's code.
+        search_steps: steps of the autodecoder's search for a cloud's code.
         search_rate: learning rate of that search.
-        code_penalty: weight of a code's squared length beside the L1 distance.
+        code_penalty: weight of a code's squared length in it, beside the L1 distance.
     """
 
     search_steps: int = 75
@@ -119,13 +121,13 @@ class DecoderConfig:
     """Settings of the decoder, the occupancy predictor.
 
     Attributes:
-        width: channels of each layer.
-        depth: number of layers.
+        width: channels of each of the decoder's layers.
+        depth: number of these layers.
         skip_after: the layer after which the query and the latent vector return.
-        dropout: share of each layer's outputs set to zero in training.
+        dropout: share of each of these layers' outputs set to zero in training.
         encode_positions: frequency encoding of the query position; off means the three coordinates themselves.
-        lowest_exponent: of the frequencies 2^e * pi, included.
-        highest_exponent: of the frequencies 2^e * pi, included.
+        lowest_exponent: least e of the frequencies 2^e * pi.
+        highest_exponent: greatest e of these frequencies.
     """
 
     width: int = 512
@@ -171,7 +173,7 @@ class NetworkConfig:
     """Settings of a network, a part for each encoder, the decoder and what is added to the paper's (section 3.1).
 
     Weights, runs and options name the settings of all parts side by side (``to_dict``), so their names are unique. The
-    parts of encoders other than the chosen one mean nothing, but for PointNet++'s: an alignment is made with them.
+    parts of encoders other than the chosen one mean nothing, but PointNet++'s: alignments have such an encoder too.
 
     Attributes:
         encoder: what makes the latent vector of a cloud (docs/design/0009-encoders.md).
@@ -194,12 +196,12 @@ class NetworkConfig:
 
     @property
     def latent(self) -> int:
-        """Channels of the latent vector."""
+        """Number of channels of the latent vector."""
         return self.pointnet2.mlp_global[-1]
 
     @property
     def level_widths(self) -> tuple[int, ...]:
-        """Channels of the encoder's levels that queries can attend to."""
+        """Numbers of channels of the encoder's levels that queries can attend to."""
         if self.encoder == "autodecoder":
             return ()
         if self.encoder == "point-transformer":
@@ -233,5 +235,5 @@ class NetworkConfig:
         return cls(**(parts | given))
 
     def changed(self, **settings: Any) -> "NetworkConfig":
-        """The same with other values for these settings, whichever parts they belong to."""
+        """Copy with other values for these settings, whichever parts they belong to."""
         return self.from_dict(self.to_dict() | settings)

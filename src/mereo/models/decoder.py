@@ -1,4 +1,4 @@
-"""The occupancy predictor's decoder (paper, section 3.1) with optional local features at the query.
+"""Decoder of the network, the occupancy predictor (paper, section 3.1), with optional local features at the query.
 
 Every layer that reads the latent vector is split, ``W [z; x] = W_z z + W_x x``: the latent half is computed once per
 cloud and broadcast over its queries, which is exact and removes the (queries x 1084) buffers.
@@ -24,7 +24,7 @@ from mereo.models.template_lookup import RestLookup
 
 @dataclass(frozen=True, eq=False)
 class Code:
-    """All that a query needs to know of a cloud; computed once.
+    """Encoded cloud: all that a query needs to know of it, computed once.
 
     Attributes:
         latent1, latent2: the latent half of the first layer and of the layer after the skip connection.
@@ -59,7 +59,7 @@ class Prediction(NamedTuple):
 
 
 class FrequencyEncoding(nn.Module):
-    """``sin(2^e pi x), cos(2^e pi x)`` for every exponent e (paper, equation 2, with negative exponents)."""
+    """Layer ``sin(2^e pi x), cos(2^e pi x)`` for every exponent e (paper, equation 2, with negative exponents)."""
 
     def __init__(self, lowest: int, highest: int) -> None:
         super().__init__()
@@ -69,6 +69,7 @@ class FrequencyEncoding(nn.Module):
         self.channels = 6 * len(frequency)
 
     def forward(self, points: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q e"]:
+        """Sines, then cosines, of each coordinate at each frequency."""
         phase = (points[..., None] * self.frequency).flatten(-2)
         return torch.cat([phase.sin(), phase.cos()], dim=-1)
 
@@ -90,7 +91,7 @@ class LocalAttention(nn.Module):
         self.score = nn.Linear(width, self.HEADS)
 
     def forward(self, level: Level, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q w"]:
-        """``level.features`` are already projected."""
+        """Attended features at each query; ``level.features`` are already projected."""
         index = nearest(queries, level.centers, self.neighbors)
         offset = queries[:, :, None] - gather(level.centers, index)
         offset = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], dim=-1)
@@ -103,7 +104,7 @@ class LocalAttention(nn.Module):
 def line_of_sight(
     queries: Float[Tensor, "b q 3"], cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], count: int
 ) -> Float[Tensor, "b q f"]:
-    """Free-space evidence: lateral offset and depth difference to the observed points nearest in the image.
+    """Evidence of free space: lateral offset and depth difference to the observed points nearest in the image.
 
     A query in front of them is in seen empty space; one behind is hidden; one with none nearby is outside the
     silhouette. Both the plain values and eight times them, clipped to [-1, 1], so that near is resolved finely.
@@ -119,7 +120,7 @@ def line_of_sight(
 
 
 class ConditionedMLP(nn.Module):
-    """Code and query points -> features: the decoder's layers, whatever is asked of them.
+    """Layers of the decoder, from code and query points to features, whatever is asked of them.
 
     Queries are in the camera frame; the levels of the code may be in an aligned one.
     """
@@ -147,7 +148,7 @@ class ConditionedMLP(nn.Module):
         self.head = nn.Linear(width, outputs)
 
     def summands(self, number: int) -> list[nn.Linear]:
-        """The layers whose sum is normalized in layer ``number``, counted from 0."""
+        """Layers whose sum is normalized in layer ``number``, counted from 0."""
         if number == 0:
             added = self.config.additions
             extra = ("local1",) * bool(added.local_neighbors) + ("sight1",) * bool(added.sight_neighbors)
@@ -164,7 +165,7 @@ class ConditionedMLP(nn.Module):
         viewpoint: Float[Tensor, "b 3"],
         alignment: Alignment | None = None,
     ) -> Code:
-        """The part of the work that does not depend on the queries."""
+        """Code of each cloud: the part of the work that does not depend on the queries."""
         with exact(cloud):  # pooled features have much in common, and the rest is what counts
             levels = tuple(
                 Level(level.centers, attention.project(level.features.float()))  # type: ignore[operator]
@@ -176,7 +177,7 @@ class ConditionedMLP(nn.Module):
     def features(
         self, code: Code, queries: Float[Tensor, "b q 3"]
     ) -> tuple[Float[Tensor, "b q f"], Float[Tensor, "b q 3"] | None]:
-        """The last layer's outputs, and the rest coordinates of the lookup on the way, if there is one."""
+        """Outputs of the last layer, and the rest coordinates of the lookup on the way, if there is one."""
         layers, added = self.config.decoder, self.config.additions
         placed = queries if code.alignment is None else code.alignment.apply(queries)
         encoded = self.encode(placed) if layers.encode_positions else placed
@@ -208,7 +209,7 @@ class ConditionedMLP(nn.Module):
 def joint_linear(
     layers: Sequence[nn.Linear], rows: Sequence[Float[Tensor, "b q _"]], latent: Float[Tensor, "b h"] | None
 ) -> Float[Tensor, "b q h"]:
-    """``sum_i W_i x_i`` (+ the cloud's ``latent``) as one product of joined rows: the sum is written once.
+    """Sum ``sum_i W_i x_i`` (+ the cloud's ``latent``) as one product of joined rows: it is written once.
 
     ``rows`` may be fewer, and wider, than ``layers``, as long as the channels match in order.
     """
@@ -224,7 +225,7 @@ def joint_linear(
 
 
 class Decoder(ConditionedMLP):
-    """Code and query points -> class logits, signed distance, direction."""
+    """Decoder from code and query points to class logits, signed distance and direction."""
 
     def __init__(self, config: NetworkConfig, classes: int) -> None:
         lookup = RestLookup(config.decoder.width, classes - 1) if config.additions.rest_template else None
@@ -232,6 +233,7 @@ class Decoder(ConditionedMLP):
         self.classes = classes
 
     def forward(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Prediction:
+        """Prediction at each query, the direction in the camera frame."""
         features, rest = self.features(code, queries)
         logits, distance, direction = features.split([self.classes, 1, 3], dim=-1)
         if code.alignment is not None:

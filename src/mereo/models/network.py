@@ -1,4 +1,4 @@
-"""Encoder and decoder together, on normalized batches; ``mereo.models.model`` puts them into the user's frame."""
+"""Network of encoder and decoder on normalized batches; ``mereo.models.model`` puts it into the user's frame."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ ALIGNED_QUERIES = 128
 
 
 class TrainingOutput(NamedTuple):
-    """What a network in training answers.
+    """Answers of a network in training.
 
     Attributes:
         prediction: at all queries.
@@ -42,7 +42,7 @@ class Network(nn.Module):
         self.aligner = AlignmentNet(config) if config.additions.align_points else None
 
     def encode(self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
-        """``cloud`` in farthest-point order. An autodecoder searches for its code, in evaluation mode."""
+        """Code of each cloud, given in farthest-point order; an autodecoder searches for it, in evaluation mode."""
         if isinstance(self.encoder, Autodecoder):
             # the search needs gradients, which tensors of inference mode cannot give
             with torch.inference_mode(False), torch.no_grad():
@@ -75,6 +75,7 @@ class Network(nn.Module):
         return prepare(encoder.search(lambda latent: self.query(prepare(latent), cloud).distance, len(cloud)))
 
     def query(self, code: Code, points: Float[Tensor, "b q 3"]) -> Prediction:
+        """Prediction at each point."""
         prediction: Prediction = self.decoder(code, points)
         return prediction
 
@@ -85,7 +86,7 @@ class Network(nn.Module):
         points: Float[Tensor, "b q 3"],
         index: Int[Tensor, " b"] | None = None,
     ) -> TrainingOutput:
-        """Predictions at ``points``, with what else a loss looks at.
+        """Predictions at ``points`` for training, with what else a loss looks at.
 
         ``index`` says which training examples the clouds are: an autodecoder takes their codes.
         """

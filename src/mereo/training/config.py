@@ -1,4 +1,6 @@
-"""Settings of training, and the presets; light, so that the command line may import them.
+"""Settings of a training: recipe, augmentation, and the presets as one table.
+
+Light, so that the command line may import them.
 
 Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise.
 """
@@ -11,7 +13,7 @@ from mereo.models.config import Loss, NetworkConfig, Precision, Supervision
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """Changes made to each training cloud as it is read; all off in the paper's recipe.
+    """Settings of the changes made to each training cloud as it is read; all off in the paper's recipe.
 
     Attributes:
         keep_points: each point survives with a probability drawn from this range.
@@ -30,7 +32,7 @@ class AugmentConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """The training recipe; defaults are the paper's.
+    """Settings of a training, its recipe; defaults are the paper's.
 
     Attributes:
         network: the architecture.
@@ -79,11 +81,11 @@ class TrainConfig:
 
     @property
     def supervision(self) -> Supervision:
-        """What the loss teaches."""
+        """Supervision by the loss."""
         return Supervision.of(self.loss)
 
     def to_dict(self) -> dict[str, Any]:
-        """The recipe as files hold it: the network's settings side by side, without its parts."""
+        """All settings as files hold them: the network's side by side, without its parts."""
         return asdict(self) | {"network": self.network.to_dict()}
 
 

@@ -1,4 +1,4 @@
-"""The paper's losses (section 3.1, equation 1) and their ablations."""
+"""Losses of the paper (section 3.1, equation 1) and their ablations."""
 
 import torch
 import torch.nn.functional as F
@@ -17,7 +17,7 @@ def occupancy_loss(
     supervision: Supervision,
     l1_weight: float,
 ) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
-    """``CE + l1_weight * L1 - mean cosine``, or the terms that ``supervision`` asks for; also each term by name.
+    """Loss ``CE + l1_weight * L1 - mean cosine`` of the terms that ``supervision`` asks for; also each term by name.
 
     Distances are signed and normalized, directions unit vectors to the nearest surface in the camera frame.
     """

@@ -1,4 +1,4 @@
-"""``mereo release``: weights to hand on, at half the size, with a card that says what they know and how well.
+"""Released weights, at half the size, with a card that says what they know and how well (``mereo release``).
 
 The card follows Mitchell et al., "Model cards for model reporting" (FAT* 2019), as far as it can be written from what
 the weights and their tests say themselves.
@@ -52,7 +52,7 @@ def release(
 
 
 def card(name: str, model: Model, tests: Sequence[dict[str, Any]], content: bytes) -> str:
-    """The model card as Markdown; ``content`` is the weights' file."""
+    """Model card as Markdown; ``content`` is the weights' file."""
     size, digest = f"{len(content) / 2**20:.1f} MB", sha256(content).hexdigest()
     parts = [
         f"# {name}\n",
@@ -102,8 +102,7 @@ def _training(provenance: dict[str, object]) -> str:
 
 
 def _nearest_preset(recipe: dict[str, Any]) -> str:
-    """The preset whose network it is, else of which most settings are."""
-
+    """Name of the preset whose network it is, else of which most settings are."""
     network = NetworkConfig.from_dict(recipe["network"])  # what older recipes do not state is at its default
 
     def agreement(preset: str) -> tuple[bool, int]:

@@ -1,4 +1,4 @@
-"""A training run's processes, settings and directory."""
+"""Processes, settings and directory of a training run."""
 
 import json
 import os
@@ -22,18 +22,19 @@ from mereo.training.dataset import Dataset
 
 @dataclass(frozen=True)
 class Process:
-    """This process's place among those that train together."""
+    """Place of this process among those that train together."""
 
     rank: int = 0
     world: int = 1
 
     @property
     def is_main(self) -> bool:
+        """Whether this process is the one that writes and prints."""
         return self.rank == 0
 
 
 def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
-    """Settings that the dataset decides: how much can be held out, and whether a roll keeps a view plausible.
+    """Recipe with what the dataset decides: how much can be held out, whether a roll keeps a view plausible.
 
     Raises ``ValueError`` for settings with which an autodecoder cannot be trained.
     """
@@ -58,7 +59,7 @@ def _check_autodecoder(config: TrainConfig) -> None:
 
 
 def start_network(config: TrainConfig, data: Dataset) -> Network:
-    """A network to train: random from the seed, or with the weights that ``config.init`` names.
+    """Network to train: random from the seed, or with the weights that ``config.init`` names.
 
     Weights that know other segments give all that is not about segments (docs/design/0002-learning.md). An
     autodecoder gets a random code for each example that is not held out. Raises ``ValueError`` when the weights are of
@@ -88,11 +89,11 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
 
 
 COUNTS = ("points", "neighbors", "ratio1", "ratio2", "local_neighbors", "sight_neighbors", "align_points")
-"""Network settings that say how many points are looked at: weights trained with one number run with another."""
+"""Settings of a network that say how many points are looked at: weights trained with one number run with another."""
 
 
 def _check_architecture(start: NetworkConfig, config: TrainConfig) -> None:
-    """Only the template lookup, which begins as nothing, may be new, and counts differ that both have."""
+    """Raise ``ValueError`` where weights differ in more than an added template lookup and counts that both have."""
     given, ours = start.to_dict(), config.network.to_dict()
     free = {name for name in COUNTS if given[name] and ours[name]}
     if ours["rest_template"]:
@@ -118,7 +119,7 @@ def _without_segments(given: dict[str, Tensor], network: Network) -> dict[str, T
 
 
 def join_processes() -> Process:
-    """Join the group that torchrun started, if any."""
+    """Join the group that torchrun started, if any; returns this process's place."""
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if world == 1:
         return Process()

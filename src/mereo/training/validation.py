@@ -1,4 +1,4 @@
-"""What a network in training answers on stored examples: its held-out scores, and class offsets when it is finished.
+"""Answers of a network in training on stored examples: held-out scores, and class offsets when it is finished.
 
 Notation: n points, c classes.
 """
@@ -20,7 +20,7 @@ SEARCHED = 16
 
 
 def held_out(data: Dataset, config: TrainConfig) -> range:
-    """The examples of the validation curve, none of which is trained on."""
+    """Examples of the validation curve, none of which is trained on."""
     first = len(data) - config.holdout
     count = min(config.holdout, SEARCHED) if config.network.encoder == "autodecoder" else config.holdout
     return range(first, first + count)
@@ -41,7 +41,7 @@ def validate(network: Network, data: Dataset, config: TrainConfig) -> Scores:
 
 @torch.no_grad()
 def choose_offsets(network: Network, data: Dataset, config: TrainConfig) -> Float[Tensor, " c"] | None:
-    """Class offsets (``calibration``) from the first training examples; None when off."""
+    """Class offsets (``logit_adjustment``) from the first training examples; None when off."""
     count, uniform = min(config.offset_examples, len(data) - config.holdout), data.uniform_queries
     if not (count and uniform and config.supervision.labels):
         return None

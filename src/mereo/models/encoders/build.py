@@ -7,7 +7,7 @@ from mereo.models.encoders.pointnet2 import PointNet2
 
 
 def make_encoder(config: NetworkConfig) -> PointNet2 | PointTransformer | Autodecoder:
-    """The encoder that the settings name; ``ValueError`` where they do not go together or are out of range."""
+    """Encoder that the settings name; ``ValueError`` where they do not go together or are out of range."""
     _check(config)
     if config.encoder == "autodecoder":
         return Autodecoder(config.autodecoder, config.latent)
