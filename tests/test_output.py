@@ -11,7 +11,7 @@ import pytest
 
 from mereo.geometry.camera import Camera
 from mereo.io.atomic_files import atomic_file, new_directory, write_camera, write_json
-from mereo.io.readers import read_camera
+from mereo.io.intrinsics import read_camera
 
 INTERRUPTIONS = [ValueError("no"), KeyboardInterrupt(), SystemExit(1)]
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mereo.geometry.camera import PointCloud as PointCloud
     from mereo.geometry.mesh import Segment as Segment
     from mereo.geometry.mesh import SegmentedMesh as SegmentedMesh
-    from mereo.io.readers import read_camera as read_camera
+    from mereo.io.intrinsics import read_camera as read_camera
     from mereo.io.readers import read_depth_image as read_depth_image
     from mereo.io.readers import read_point_cloud as read_point_cloud
     from mereo.models.model import Model as Model
@@ -33,7 +33,7 @@ _HOME = {
     "evaluate": "evaluation.scoring",
     "load_model": "models.weights",
     "load_scene": "scenes.registry",
-    "read_camera": "io.readers",
+    "read_camera": "io.intrinsics",
     "read_depth_image": "io.readers",
     "read_point_cloud": "io.readers",
     "reconstruct": "reconstruction.pipeline",

@@ -8,12 +8,13 @@ from rich.table import Table
 
 from mereo.io.atomic_files import new_directory
 from mereo.io.config import DEFAULT_FILES, FilesConfig, InputConfig
+from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import STRAY_SHARE, stray_share
-from mereo.reconstruction.observation import SizeWarning, read_observation, size_warning
+from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.visualization.result_files import write_files
 
@@ -33,7 +34,8 @@ def reconstruct_file(
     """``mereo reconstruct``: read one frame of a sensor, reconstruct, write a new directory, print what was found."""
     formats = chosen_formats(files.formats)  # a missing extra is said before the work, not after
     with new_directory(output, force) as directory:
-        seen = read_observation(input, reading, isolation)
+        frame = read_frame(input, reading)
+        seen = find_object(frame, isolation)
         print(seen)
         apart = 0.0 if isolation.largest_cluster else stray_share(seen.cloud)
         if apart > STRAY_SHARE:
@@ -42,11 +44,11 @@ def reconstruct_file(
         warning = size_warning(seen, model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
-        result = reconstruct(seen.cloud, model, resolution, seen.frame, label_points="points" in formats)
-        facts = {"title": seen.source, "weights": str(weights), "resolution": resolution, "points": len(seen.cloud)}
+        result = reconstruct(seen.cloud, model, resolution, frame.axes, label_points="points" in formats)
+        facts = {"title": frame.source, "weights": str(weights), "resolution": resolution, "points": len(seen.cloud)}
         facts |= {"device": model.device.type, "precision": model.working_precision}
-        write_files(directory, result, seen.cloud, seen.frame, files, seen.unit_m, {**facts, **seen.facts()})
-    print_segments(result, f"{seen.source}, {len(seen.cloud)} points")
+        write_files(directory, result, seen.cloud, frame.axes, files, frame.unit_m, {**facts, **seen.facts()})
+    print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result
 

@@ -1,7 +1,7 @@
 """Parsers of depth image formats: PNG, TIFF, EXR and numpy arrays.
 
-Each returns the values as stored, integers or floats, or raises any exception whose text completes "cannot be read as
-a depth image (...)"; ``mereo.io.readers`` turns it into the sentence a user sees. Integers need a depth scale,
+Each parser returns the values as stored, integers or floats, or raises any exception whose text completes "cannot be
+read as a depth image (...)"; ``read_raw_depth`` turns it into the sentence a user sees. Integers need a depth scale,
 floats are metres.
 """
 
@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Real
 from PIL import Image
+
+from mereo.io.errors import readable
 
 MILLIMETRES, METRES = 1000.0, 1.0
 """Depth scales of integers and of floats where nothing else is said."""
@@ -29,8 +31,9 @@ Raw = Real[np.ndarray, "h w"]
 
 
 def read_raw_depth(path: Path) -> Raw:
-    """The values of a file that ``is_depth_image``."""
-    return DEPTH_READERS[path.suffix.lower()](path)
+    """Values of a file that ``is_depth_image``, as stored. Raises ``FileNotFoundError`` or ``ValueError``."""
+    with readable(path, "depth image"):
+        return DEPTH_READERS[path.suffix.lower()](path)
 
 
 def is_depth_image(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Readers: point clouds, depth images, masks, intrinsics and segmented meshes from files.
+"""Readers of point clouds, depth images and masks; ``mereo.io.sensor_frame`` reads whichever a file holds.
 
 Every reader raises ``FileNotFoundError`` or a ``ValueError`` of one sentence (value, rule, cure), whatever the parsing
 library raised. Nothing is repaired silently: missing points are refused unless the caller asks to drop them. Depth
@@ -14,19 +14,7 @@ from PIL import Image
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.depth_formats import DEPTH_READERS, metres, read_raw_depth
 from mereo.io.errors import readable
-from mereo.io.intrinsics import Intrinsics, read_camera, read_intrinsics
-from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.point_cloud_formats import CLOUD_READERS
-
-__all__ = [
-    "Intrinsics",
-    "read_camera",
-    "read_depth_image",
-    "read_intrinsics",
-    "read_mask",
-    "read_point_cloud",
-    "read_segmented_mesh",
-]
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
 
@@ -114,9 +102,7 @@ def read_depth_image(
         raise ValueError(
             f"{path} has the suffix {path.suffix!r}; a depth image is one of {known}: convert or rename it"
         )
-    with readable(path, "depth image"):
-        raw = read_raw_depth(path)
-    return usable_depth(DepthImage(metres(raw, depth_scale), camera), path, mask_path, plausible_m)
+    return usable_depth(DepthImage(metres(read_raw_depth(path), depth_scale), camera), path, mask_path, plausible_m)
 
 
 def usable_depth(

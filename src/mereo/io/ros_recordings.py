@@ -53,6 +53,16 @@ class RecordedFrame:
     stamp_ns: int
     read: Callable[[], Content]
 
+    @property
+    def time_s(self) -> float:
+        """Time of recording in seconds."""
+        return self.stamp_ns / 1e9
+
+    @property
+    def name(self) -> str:
+        """Topic and time, for people."""
+        return f"{self.topic} at {self.time_s:.3f} s"
+
 
 def is_recording(path: Path) -> bool:
     """Whether this is a bag: .bag, .mcap, .db3, or the directory of a ROS 2 bag."""

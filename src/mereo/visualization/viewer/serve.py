@@ -7,10 +7,11 @@ from typing import Any
 from mereo.evaluation.sample_views import load_frame, shipped_frames
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
+from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for, shipped_names
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import read_observation
+from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
 from mereo.visualization.viewer.display import import_viser, start_server, stop_server
 from mereo.visualization.viewer.frame_page import FramePage
@@ -49,8 +50,9 @@ def view_frame(
             f"{', '.join(shipped_names())}"
         )
     else:
-        seen = read_observation(input, reading or InputConfig(), isolation or IsolationConfig())
-        cloud, title, frame, unit = seen.cloud, seen.source, seen.frame, "m" if seen.unit_m == 1.0 else ""
+        read = read_frame(input, reading or InputConfig())
+        cloud = find_object(read, isolation or IsolationConfig()).cloud
+        title, frame, unit = read.source, read.axes, "m" if read.unit_m == 1.0 else ""
     inspection = Inspection.of(cloud, load_for(weights, inference or InferenceConfig()), resolution, frame)
     server = start_server(port, "mereo")
     FramePage(server, inspection, title, f"{len(cloud):,} points · weights {weights}", unit)
