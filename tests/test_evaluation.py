@@ -255,7 +255,7 @@ def test_demo_reconstructs_scores_and_says_what_is_missing(
 
     def case() -> demo.Case:
         truth: TruthGrid = truth_grid(mesh, 20)
-        return demo.Case("cuboids", "two cuboids", "any", cloud(), "camera", cloud(), truth)
+        return demo.Case("cuboids", "two cuboids", "any", cloud(), "camera", truth)
 
     monkeypatch.setattr(demo, "_inputs", lambda: iter([unavailable, case]))
     monkeypatch.setattr(demo, "load_model", lambda _: oracle(mesh))

@@ -19,7 +19,7 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
-from mereo.models.model import Model
+from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.registry import SCENES, load_scene
@@ -102,9 +102,10 @@ class Evaluation:
 # --- one cloud -------------------------------------------------------------------------------------------------------
 
 
-def predict_grid(model: Model, cloud: PointCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
-    """The model's labels on the grid of ``truth``, evaluated coarse to fine."""
-    logits = partial(model.logits, model.encode(cloud))
+def predict_grid(model: Model, seen: PointCloud | EncodedCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
+    """The model's labels on the grid of ``truth``, evaluated coarse to fine; ``seen`` is a cloud, or its code."""
+    code = seen if isinstance(seen, EncodedCloud) else model.encode(seen)
+    logits = partial(model.logits, code)
     grid = truth.grid
     x, y, z = grid.labels.shape
     return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
@@ -116,12 +117,12 @@ def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segm
     return confusion_matrix(labels, predicted[truth.kept], segments + 1)
 
 
-def grid_scores(model: Model, cloud: PointCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
-    """The paper's evaluation of one cloud; ``truth`` is in the cloud's frame and units."""
+def grid_scores(model: Model, seen: PointCloud | EncodedCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
+    """The paper's evaluation of one cloud or its code; ``truth`` is in the cloud's frame and units."""
     check_names(model, truth.names)
     grid = truth_grid(truth, cells)
     segments = len(segment_names(model)[0])
-    return intersection_over_union(grid_confusion(grid, predict_grid(model, cloud, grid), segments), model.segmented)
+    return intersection_over_union(grid_confusion(grid, predict_grid(model, seen, grid), segments), model.segmented)
 
 
 def check_names(model: Model, names: Sequence[str]) -> None:

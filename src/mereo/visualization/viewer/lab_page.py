@@ -267,7 +267,7 @@ class LabPage:
             values, scale = surface_error(surfaces, Solids(view.mesh)), error_scale(view.mesh, "")
         elif mode == "confidence":
             assert self.laboratory.model is not None
-            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.code)), CONFIDENCE
+            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.result.code)), CONFIDENCE
         else:
             values = observed_distance(surfaces, view.depth.to_points().points)
             scale = distance_scale(values, "")

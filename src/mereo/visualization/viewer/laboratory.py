@@ -17,7 +17,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.model import Model
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.scenes.parameters import Played
 from mereo.scenes.scene import Scene
@@ -54,14 +54,12 @@ class Trial:
 
     Attributes:
         result: in the camera frame.
-        code: to ask the model for more.
         scores: against the truth, on ``cells`` ** 3 cells.
         cells: the paper takes 100; fewer are faster and a little off.
         seconds: of the reconstruction.
     """
 
     result: Reconstruction
-    code: EncodedCloud
     scores: Scores
     cells: int
     seconds: float
@@ -131,8 +129,7 @@ class Laboratory:
         start = time.perf_counter()
         result = reconstruct(cloud, self.model, resolution)
         seconds = time.perf_counter() - start
-        scores = grid_scores(self.model, cloud, view.mesh, cells)
-        return Trial(result, self.model.encode(cloud), scores, cells, seconds)
+        return Trial(result, grid_scores(self.model, result.code, view.mesh, cells), cells, seconds)
 
 
 def depth_picture(depth: DepthImage, factor: int = 1) -> UInt8[np.ndarray, "h w 3"]:

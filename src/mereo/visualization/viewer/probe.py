@@ -8,9 +8,8 @@ from jaxtyping import Float
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.models.model import Answer, EncodedCloud, Model
+from mereo.models.model import Answer, Model
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct, segment_names
 
 
@@ -20,23 +19,17 @@ class Inspection:
 
     Attributes:
         cloud, result: in the input's frame.
-        model, code: the model, and what it made of the cloud.
-        T_camera_input: the cloud's axes to the camera's.
+        model: what made the result, and is asked for more.
     """
 
     cloud: PointCloud
     result: Reconstruction
     model: Model
-    code: EncodedCloud
-    T_camera_input: Float[np.ndarray, "4 4"]
 
     @classmethod
     def of(cls, cloud: PointCloud, model: Model, resolution: int = 128, frame: CloudAxes = "camera") -> "Inspection":
         """Reconstruct a cloud. Raises as ``reconstruct`` does."""
-        result = reconstruct(cloud, model, resolution, frame)
-        T_camera_input = into_camera(cloud.points, frame)
-        code = model.encode(PointCloud(transform_points(T_camera_input, cloud.points)))
-        return cls(cloud, result, model, code, T_camera_input)
+        return cls(cloud, reconstruct(cloud, model, resolution, frame), model)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -45,8 +38,9 @@ class Inspection:
 
     def ask(self, points: Float[np.ndarray, "n 3"]) -> Answer:
         """The model's answers at points of the input's frame, in that frame."""
-        answer = self.model.query(self.code, transform_points(self.T_camera_input, points))
-        turn = inverse_rigid(self.T_camera_input)[:3, :3]
+        T_camera_input = self.result.T_camera_input
+        answer = self.model.query(self.result.code, transform_points(T_camera_input, points))
+        turn = inverse_rigid(T_camera_input)[:3, :3]
         return replace(answer, direction=answer.direction @ turn.T)
 
 
