@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from camera_files import write_camera
 from PIL import Image
 
 from mereo import __main__ as command_line
 from mereo.cli import commands
 from mereo.geometry.camera import Camera
-from mereo.io.atomic_files import write_camera
 from mereo.io.config import InputConfig
 from mereo.io.readers import read_point_cloud
 from mereo.io.sensor_frame import read_frame
