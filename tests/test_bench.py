@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mereo.cli import bench_command
+from mereo.cli import tool_commands
 from mereo.evaluation.sample_views import load_frame
 from mereo.experiments.speed import fitted_model
 from mereo.experiments.speed.baseline import Rival, farthest_points
@@ -102,10 +102,10 @@ def test_the_table_names_ratio_and_floor() -> None:
 
 def test_bad_options_are_refused() -> None:
     with pytest.raises(ValueError, match="0 repeats are asked for"):
-        bench_command.BenchCommand(repeats=0).run()
+        tool_commands.BenchCommand(repeats=0).run()
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match="torch sees no CUDA device"):
-            bench_command.BenchCommand(device="cuda").run()
+            tool_commands.BenchCommand(device="cuda").run()
 
 
 @pytest.mark.slow

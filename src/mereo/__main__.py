@@ -12,13 +12,7 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo.cli import commands, scene_commands
-from mereo.cli.align_command import Align
-from mereo.cli.bench_command import BenchCommand
-from mereo.cli.experiment_command import Experiment
-from mereo.cli.release_command import Release
-from mereo.cli.stream_command import StreamCommand
-from mereo.cli.view_command import ViewCommand
+from mereo.cli import commands, scene_commands, tool_commands
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
@@ -31,9 +25,10 @@ USER_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 
 @runtime_checkable
 class Command(Protocol):
-    """What the arguments are read into: one of the classes of ``mereo.cli.commands``."""
+    """What the arguments are read into: a class of ``mereo.cli.commands``, ``scene_commands`` or ``tool_commands``."""
 
-    def run(self) -> None: ...
+    def run(self) -> None:
+        """Do the work, and print what a person wants to know of it."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -60,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def version() -> str:
-    """The installed version."""
+    """Version of the installed package, or that there is none."""
     try:
         return importlib.metadata.version("mereo")
     except importlib.metadata.PackageNotFoundError:
@@ -68,7 +63,7 @@ def version() -> str:
 
 
 def one_line(error: Exception) -> str:
-    """The error's sentence; for an error of the operating system its file and reason."""
+    """Sentence of an error; for one of the operating system its file and reason."""
     if isinstance(error, OSError) and error.strerror:
         reason = error.strerror[0].lower() + error.strerror[1:]
         place = f"{error.filename}: " if error.filename else ""
@@ -87,7 +82,7 @@ def _stop(message: str, code: int) -> int:
 
 
 def parse(arguments: list[str]) -> Command:
-    """The command that these arguments mean; exits with 2 after a message when they mean none."""
+    """Command that these arguments mean; exits with 2 after a message when they mean none."""
     command: Command = tyro.cli(
         _syntax(_chosen(arguments, "--preset", PRESETS, "base"), _chosen(arguments, "--sensor", SENSORS, "paper")),
         args=arguments or ["--help"],
@@ -118,13 +113,13 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
-        | Annotated[Align, subcommand("align")]
-        | Annotated[ViewCommand, subcommand("view")]
-        | Annotated[StreamCommand, subcommand("stream")]
+        | Annotated[tool_commands.Align, subcommand("align")]
+        | Annotated[tool_commands.ViewCommand, subcommand("view")]
+        | Annotated[tool_commands.StreamCommand, subcommand("stream")]
         | Annotated[commands.Export, subcommand("export")]
-        | Annotated[Experiment, subcommand("experiment")]
-        | Annotated[BenchCommand, subcommand("bench")]
-        | Annotated[Release, subcommand("release")]
+        | Annotated[tool_commands.Experiment, subcommand("experiment")]
+        | Annotated[tool_commands.BenchCommand, subcommand("bench")]
+        | Annotated[tool_commands.Release, subcommand("release")]
     )
 
 

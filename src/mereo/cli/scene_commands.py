@@ -12,6 +12,7 @@ class SceneList:
     """Name the built-in scenes."""
 
     def run(self) -> None:
+        """Print the names of the built-in scenes."""
         from mereo.scenes.registry import SCENES
 
         for name in SCENES:
@@ -34,6 +35,7 @@ class SceneNew:
     units: Literal["mm", "cm", "m", "in"] | None = None
 
     def run(self) -> None:
+        """Write the scene file, and print what to do next."""
         from mereo.scenes.files.template import write_scene_file
 
         path = write_scene_file(self.files, self.output, self.units)
@@ -55,6 +57,7 @@ class SceneCheck:
     repair: bool = False
 
     def run(self) -> None:
+        """Print what is found, and write repaired copies where asked to."""
         from mereo.scenes.files.check import check_scene
 
         check_scene(self.scene, self.repair)
@@ -77,6 +80,7 @@ class ScenePreview:
     seed: int = 0
 
     def run(self) -> None:
+        """Write the picture of random states."""
         from mereo.scenes.registry import load_scene
         from mereo.visualization.previews import preview_scene
         from mereo.visualization.scene_previews import preview_all
@@ -104,6 +108,7 @@ class SceneExport:
     output: Path
 
     def run(self) -> None:
+        """Write the mesh file of the segments at rest."""
         import numpy as np
 
         from mereo.io.writers.glb import write_segments_glb
