@@ -40,7 +40,7 @@ _HOME = {
     "synthesize": "synthesis.examples",
     "write_reconstruction": "visualization.result_files",
 }
-"""The module of each public name."""
+"""Module of each public name, below ``mereo``."""
 
 __all__ = [*_HOME, "__version__"]
 

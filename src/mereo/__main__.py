@@ -19,20 +19,22 @@ from mereo.training.config import PRESETS, TrainConfig
 Choice = TypeVar("Choice")
 
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
+"""Environment variable that shows where an error comes from."""
+
 USER_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 """Exit codes; the last two are 128 plus the signal's number, as shells report them."""
 
 
 @runtime_checkable
 class Command(Protocol):
-    """What the arguments are read into: a class of ``mereo.cli.commands``, ``scene_commands`` or ``tool_commands``."""
+    """Command that arguments are read into: a class of ``commands``, ``scene_commands`` or ``tool_commands``."""
 
     def run(self) -> None:
         """Do the work, and print what a person wants to know of it."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code. With MEREO_TRACEBACK=1 errors are raised as they are."""
+    """Run the command line, and return the exit code. With MEREO_TRACEBACK=1 errors are raised as they are."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments in (["--version"], ["-V"]):
         print(f"mereo {version()}")
@@ -124,7 +126,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
 
 
 def _starting(command: type, **defaults: Any) -> type:
-    """The command with other defaults for these options."""
+    """Command with other defaults for these options."""
     changed = [(name, command.__annotations__[name], field(default=value)) for name, value in defaults.items()]
     return make_dataclass(
         command.__name__, changed, bases=(command,), frozen=True, namespace={"__doc__": command.__doc__}
@@ -136,7 +138,7 @@ def _group(members: tuple[tuple[type, str], ...]) -> Any:
 
 
 def _chosen(arguments: list[str], option: str, choices: Mapping[Any, Choice], otherwise: str) -> Choice:
-    """What an option chooses, which must be known before parsing because the other defaults depend on it."""
+    """Choice of an option, which must be known before parsing because the other defaults depend on it."""
     values = [a.partition("=")[2] for a in arguments if a.startswith(f"{option}=")]
     values += [after for before, after in pairwise(arguments) if before == option]
     return choices[values[-1] if values and values[-1] in choices else otherwise]

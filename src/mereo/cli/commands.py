@@ -1,4 +1,4 @@
-"""The command line: one dataclass per command, its fields the options, ``run`` the work.
+"""Commands of the command line: one dataclass for each, its fields the options, ``run`` the work.
 
 ``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
 """
@@ -199,11 +199,11 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Reconstruct:
-    """Reconstruct all segments from one frame: a depth image (PNG, TIFF, EXR, NPY), a point cloud (PLY, PCD, XYZ, NPY,
-    NPZ, ZDF) or a ROS recording (bag, MCAP).
+    """Reconstruct all segments from one frame: a depth image, a point cloud or a ROS recording.
 
     Attributes:
-        input: the file; results are in its frame and units.
+        input: depth image (PNG, TIFF, EXR, NPY), point cloud (PLY, PCD, XYZ, NPY, NPZ, ZDF) or ROS recording (bag,
+            MCAP); results are in its frame and units.
         weights: a shipped name or a file.
         output: folder to create.
         resolution: grid cells along the longest side.
@@ -265,7 +265,7 @@ class Export:
 
 
 def part_of(shard: str) -> tuple[int, int]:
-    """``"1/4"`` is part 1 of 4, counted from 0."""
+    """Part and number of parts of a shard: ``"1/4"`` is part 1 of 4, counted from 0. Raises ``ValueError``."""
     part, _, parts = shard.partition("/")
     if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
         raise ValueError(f"the shard is {shard!r}; it must be i/n with i from 0 to n - 1: give for example --shard 0/4")

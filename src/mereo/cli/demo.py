@@ -42,7 +42,7 @@ OWN_OBJECT = """[bold]On your own data[/bold]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One input of the demo.
+    """Input of the demo with its truth.
 
     Attributes:
         name: of the output folder.
@@ -75,7 +75,7 @@ def main(output: str | Path = Path("out/demo")) -> None:
 
 
 def _inputs() -> Iterator[Callable[[], Case]]:
-    """The real scan first, then frames of other objects."""
+    """Inputs of the demo: the real scan first, then frames of other objects."""
     yield _scan_case
     for name in FRAMES:
         yield partial(_frame_case, name)

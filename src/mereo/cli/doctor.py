@@ -25,7 +25,7 @@ PURPOSES: dict[str, str] = {
     "align": "ground truth from scans",
     "dev": "tests and checks",
 }
-"""What each extra of pyproject.toml is for; which packages it means is read from the installed metadata."""
+"""Purpose of each extra of pyproject.toml; which packages it means is read from the installed metadata."""
 
 
 def diagnose() -> None:
@@ -53,7 +53,7 @@ def _packages() -> Iterator[str]:
 
 
 def requirements(extra: str) -> list[str]:
-    """What pyproject.toml declares for ``extra``, for example ``tensorboard>=2.18``; ``""`` is mereo itself."""
+    """Requirements that pyproject.toml declares for an extra, such as ``tensorboard>=2.18``; ``""`` is mereo itself."""
     try:
         declared = importlib.metadata.requires("mereo") or []
     except importlib.metadata.PackageNotFoundError:
@@ -68,7 +68,7 @@ def requirements(extra: str) -> list[str]:
 
 
 def install_command(missing: list[str]) -> str:
-    """The command line that installs these requirements for the running Python."""
+    """Command line that installs these requirements for the running Python."""
     return shlex.join([sys.executable, "-m", "pip", "install", *missing])
 
 

@@ -31,7 +31,22 @@ def reconstruct_file(
     files: FilesConfig = DEFAULT_FILES,
     force: bool = False,
 ) -> Reconstruction:
-    """``mereo reconstruct``: read one frame of a sensor, reconstruct, write a new directory, print what was found."""
+    """Read one frame of a sensor, reconstruct it, write a new directory, print what was found: ``mereo reconstruct``.
+
+    Args:
+        input: a depth image, a point cloud or a ROS recording.
+        weights: a shipped name or a file.
+        output: folder to create.
+        resolution: cells along the longest side of the object's box.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
+        files: which files are written, and in which unit.
+        force: replace an existing folder.
+
+    Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``read_frame``, ``find_object`` and
+    ``reconstruct`` do.
+    """
     formats = chosen_formats(files.formats)  # a missing extra is said before the work, not after
     with new_directory(output, force) as directory:
         frame = read_frame(input, reading)
@@ -54,7 +69,7 @@ def reconstruct_file(
 
 
 def print_segments(result: Reconstruction, title: str) -> None:
-    """A table of the segments, and a line of the stages' seconds."""
+    """Print a table of the segments, and a line of the stages' seconds."""
     table = Table(title=title, title_justify="left")
     table.add_column("segment")
     for column in ("volume", "confidence", "components", "centroid"):

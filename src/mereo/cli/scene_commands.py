@@ -1,4 +1,7 @@
-"""The commands ``mereo scene ...``: list, write, check, draw and export scenes. See ``commands``."""
+"""The commands ``mereo scene ...``: list, write, check, draw and export scenes.
+
+See ``mereo.cli.commands`` for how commands are written.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path

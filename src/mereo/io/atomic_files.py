@@ -81,7 +81,7 @@ def _swap_directory(partial: Path, path: Path) -> None:
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """A fresh sibling name with the suffix of ``path``; on any exception, Ctrl-C included, what is there is removed."""
+    """Yield a fresh sibling name with the suffix of ``path``; on any exception (Ctrl-C too) remove what is there."""
     partial = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.partial{path.suffix}")
     made: list[Path] = []
     try:
@@ -101,7 +101,7 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 
 def _make_parents(directory: Path) -> list[Path]:
-    """Make ``directory``; returns the directories that were missing, the deepest first."""
+    """Make ``directory``; the directories that were missing are returned, the deepest first."""
     missing = [place for place in (directory, *directory.parents) if not place.exists()]
     directory.mkdir(parents=True, exist_ok=True)
     return missing

@@ -26,6 +26,7 @@ FORMAT_UNITS_M = {".zdf": 0.001}
 """Metres per unit of point clouds whose format says it."""
 
 Kind = Literal["recording", "depth image", "point cloud"]
+"""Kinds of files that hold frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ class SensorFrame:
 
 
 def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> SensorFrame:  # noqa: B008 (frozen)
-    """The one frame that a depth image, point cloud or ROS recording holds, or that ``reading`` picks from it.
+    """Frame that a depth image, point cloud or ROS recording holds, or that ``reading`` picks from it.
 
     Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes.
 
@@ -80,7 +81,7 @@ def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> Sensor
 
 
 def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFrame, Callable[[], SensorFrame]]]:
-    """All messages of a ROS recording's topic in their order, each with what decodes it; raises as ``read_frame``."""
+    """Messages of a ROS recording's topic in their order, each with what decodes it; raises as ``read_frame``."""
     for message in recorded_frames(path, *_recording_options(reading)):
         yield message, partial(_recorded, message, path, reading)
 

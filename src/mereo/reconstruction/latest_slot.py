@@ -10,7 +10,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, eq=False)
 class Taken(Generic[Item]):
-    """An item out of a ``LatestSlot``.
+    """Item out of a ``LatestSlot``.
 
     Attributes:
         item: what was put there.
@@ -24,7 +24,7 @@ class Taken(Generic[Item]):
 
 
 class LatestSlot(Generic[Item]):
-    """One waiting item, which a newer one replaces, so that work is never older than the last of it took.
+    """Room for one item, which a newer one replaces, so that no work is older than the one before it took.
 
     Any thread may call any method.
     """
@@ -50,7 +50,7 @@ class LatestSlot(Generic[Item]):
             return not self._stopped
 
     def take(self, timeout_s: float | None = None) -> Taken[Item] | None:
-        """The waiting item, or the next one that comes within ``timeout_s``; by default it waits as long as it takes.
+        """Waiting item, or the next one that comes within ``timeout_s``; by default it waits as long as it takes.
 
         None where none has come in time, after the last one, and after ``stop``.
         """

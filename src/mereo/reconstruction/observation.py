@@ -17,16 +17,16 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import IsolationStep, isolate
 
 SIZE_FACTOR = 2.0
-"""A visible part this many times smaller or larger than any in training is not the object, or not its unit."""
+"""Times that a visible part may be smaller or larger than any in training; beyond, it is another object or unit."""
 
 
 class SizeWarning(UserWarning):
-    """What is seen is not as large as the object that a model was trained on."""
+    """Warning that what is seen is not as large as the object that a model was trained on."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a frame shows of the object.
+    """Object in a frame of a sensor: its points, and what isolation left out.
 
     Attributes:
         frame: everything that the sensor measured.
@@ -76,7 +76,7 @@ def find_object(
     frame: SensorFrame,
     isolation: IsolationConfig = IsolationConfig(),  # noqa: B008 (frozen)
 ) -> Observation:
-    """The object in a frame: everything that the steps of ``isolation`` keep; all of its lengths are in metres.
+    """Object in a frame: everything that the steps of ``isolation`` keep, whose lengths are all in metres.
 
     Raises ``ValueError`` where too little is left, and for a range of depths in a scanner's axes.
     """
@@ -90,7 +90,7 @@ def find_object(
 
 
 def size_warning(observation: Observation, provenance: Mapping[str, object]) -> str | None:
-    """A sentence where the visible part cannot be the object that a model was trained on; None where it can.
+    """Sentence where the visible part cannot be the object that a model was trained on; None where it can.
 
     ``provenance["visible_m"]`` is the least and greatest longest side of the visible part in training, in metres;
     models of objects whose true size is not known have none.

@@ -28,12 +28,12 @@ from mereo.reconstruction.isosurfaces import extract_whole, locate
 from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
-"""Where segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one lies behind it."""
+"""Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """An object with all its segments, in the input's frame and units.
+    """Object with all its segments, in the input's frame and units.
 
     Attributes:
         surfaces: every segment of the model as a closed mesh; without faces where it was not found. Which lie inside
@@ -66,7 +66,7 @@ def reconstruct(
     frame: CloudAxes = "camera",
     label_points: bool = False,
 ) -> Reconstruction:
-    """All segments of the object that ``cloud`` shows.
+    """All segments of the object that a cloud shows, hidden side included.
 
     Args:
         cloud: points on the object, any unit and density.
@@ -123,7 +123,7 @@ def segment_names(model: Model) -> tuple[tuple[str, ...], tuple[Color, ...]]:
 
 
 def _turned_back(result: Reconstruction) -> Reconstruction:
-    """From the camera frame to the scanner's: half a turn about x reverses the grid along y and z."""
+    """Result in the scanner's frame from that in the camera's: half a turn about x reverses the grid along y and z."""
     T_scanner_camera, grid = inverse_rigid(result.T_camera_input), result.labels
     last = np.asarray(grid.labels.shape) - 1
     corner = grid.origin + grid.spacing * last * np.array([0, 1, 1])

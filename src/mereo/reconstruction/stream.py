@@ -1,4 +1,4 @@
-"""Frames as they come: the latest one is answered, older ones are dropped, a bad one is reported and passed over.
+"""Answers to frames as they come: the latest wins, older ones are dropped, a bad one is reported and passed over.
 
 A reading thread waits for frames; the caller's thread answers. Between them there is room for one frame: a newer one
 takes the place of one that still waits, so that an answer is never older than the last computation and memory never
@@ -21,7 +21,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, eq=False)
 class StreamFrame:
-    """A frame of a sequence.
+    """Frame of a sequence, decoded when it is answered.
 
     Attributes:
         name: for people: a file, a number.
@@ -36,7 +36,7 @@ class StreamFrame:
 
 @dataclass(frozen=True, eq=False)
 class Outcome(Generic[Result]):
-    """What became of a frame.
+    """Outcome of a frame: its answer or error, and the time it took.
 
     Attributes:
         name, time_s: of the frame.
@@ -101,6 +101,7 @@ class _Reading:
         self.failure: Exception | None = None
 
     def run(self) -> None:
+        """Bring every frame to the slot, until it is stopped or the sequence ends."""
         try:
             self._bring()
         except Exception as problem:  # raised in the caller's thread, after the outcomes before it
@@ -119,7 +120,7 @@ class _Reading:
 
 @dataclass(frozen=True)
 class Summary:
-    """A stream in numbers: answers per second, latencies in seconds, and what was not answered."""
+    """Numbers of a stream: answers per second, latencies in seconds, and what was not answered."""
 
     answered: int
     failed: int
@@ -137,7 +138,7 @@ class Summary:
 
 
 class Counter:
-    """Collects a summary while outcomes pass by."""
+    """Counter of outcomes that pass by, for their summary."""
 
     def __init__(self) -> None:
         self.start = time.perf_counter()
@@ -145,6 +146,7 @@ class Counter:
         self.failed = self.dropped = 0
 
     def add(self, outcome: Outcome[Result]) -> None:
+        """Count an outcome."""
         self.dropped += outcome.dropped
         if outcome.error:
             self.failed += 1
@@ -152,7 +154,7 @@ class Counter:
             self.latencies.append(outcome.latency_s)
 
     def summary(self) -> Summary:
-        """Up to now; latencies are NaN where nothing was answered."""
+        """Numbers of the stream up to now; latencies are NaN where nothing was answered."""
         seconds = time.perf_counter() - self.start
         count = len(self.latencies)
         median, worst = np.quantile(self.latencies, [0.5, 0.99]) if count else (np.nan, np.nan)

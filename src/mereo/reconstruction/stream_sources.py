@@ -1,4 +1,4 @@
-"""Where frames of a stream come from: a folder of files, a ROS recording, or file names on standard input."""
+"""Sources of a stream's frames: a folder of files, a ROS recording, or file names on standard input."""
 
 import sys
 import time
@@ -17,12 +17,13 @@ from mereo.reconstruction.observation import find_object
 from mereo.reconstruction.stream import StreamFrame
 
 STANDARD_INPUT = "-"
+"""Source that means names of files on standard input."""
 
 
 def frames_of(
     source: str, reading: InputConfig, isolation: IsolationConfig, rate_hz: float = 30.0
 ) -> Iterator[StreamFrame]:
-    """The frames of a source, in order; each is decoded when it is answered.
+    """Frames of a source, in order; each is decoded when it is answered.
 
     Args:
         source: a folder of depth images or point clouds (in the order of their names), a ROS recording, or ``-`` for

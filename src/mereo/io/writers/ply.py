@@ -14,10 +14,11 @@ from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.segment_table import comment_lines, with_faces
 
 TYPES = {"u1": "uchar", "i4": "int", "f4": "float"}
+"""Name that PLY has for each type of numpy."""
 
 
 def write_segments_ply(path: str | Path, surfaces: SegmentedMesh) -> None:
-    """All surfaces in one mesh; vertices and faces have ``label``, ``red``, ``green``, ``blue`` (uchar).
+    """Write all surfaces as one mesh whose vertices and faces have ``label``, ``red``, ``green``, ``blue`` (uchar).
 
     Segments share no vertices, so each vertex has one label; positions are float32, in the mesh's frame and unit.
     Raises ``ValueError`` where no segment has faces.
@@ -34,7 +35,7 @@ def write_segments_ply(path: str | Path, surfaces: SegmentedMesh) -> None:
 
 
 def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
-    """The observed points with ``label``, its colour, ``confidence`` and ``occupancy``, see ``SegmentedCloud``.
+    """Write the observed points with ``label``, its colour, ``confidence`` and ``occupancy``, see ``SegmentedCloud``.
 
     Positions are float32, in the cloud's frame and unit.
     """
@@ -61,7 +62,7 @@ def _label(labels: Integer[np.ndarray, " n"]) -> Columns:
 
 
 def _records(columns: Columns) -> np.ndarray:
-    """Little-endian records without padding: the bytes of the file."""
+    """Bytes of an element: little-endian records without padding."""
     fields = [(name, f"<{kind}", values.shape[1:]) for name, (kind, values) in columns.items()]
     records = np.zeros(len(next(iter(columns.values()))[1]), np.dtype(fields))
     for name, (_, values) in columns.items():
@@ -80,7 +81,7 @@ def _write(path: str | Path, comments: list[str], elements: dict[str, np.ndarray
 
 
 def _properties(dtype: np.dtype) -> list[str]:
-    """``count`` and ``vertex_indices`` together are what PLY calls a list."""
+    """Header lines of an element; ``count`` and ``vertex_indices`` together are what PLY calls a list."""
     lines = []
     for name in dtype.names or ():
         if name == "vertex_indices":

@@ -1,4 +1,4 @@
-"""Work that always turns to the newest request: what a slider asks for while it is dragged."""
+"""Worker that always turns to the newest request: for what a slider asks while it is dragged."""
 
 import threading
 from collections.abc import Callable
@@ -9,11 +9,11 @@ from mereo.reconstruction.latest_slot import LatestSlot
 Request = TypeVar("Request")
 
 SETTLE_S = 0.35
-"""A request that is the newest for this long is worth the fine work."""
+"""Seconds after which a request that is still the newest is worth the fine work."""
 
 
 class LatestWins(Generic[Request]):
-    """A thread with room for one waiting request, which a newer one replaces.
+    """Thread with room for one waiting request, which a newer one replaces.
 
     Each request that is reached gets the quick work; the last one, when no other has come for ``settle_s``, the fine
     work too. An exception goes to ``failed``, and the thread goes on.

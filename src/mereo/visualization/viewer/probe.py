@@ -15,7 +15,7 @@ from mereo.reconstruction.pipeline import Reconstruction, reconstruct, segment_n
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What was seen, what was made of it, and the model that knows more.
+    """Cloud that was seen, what was made of it, and the model that knows more.
 
     Attributes:
         cloud, result: in the input's frame.
@@ -28,16 +28,16 @@ class Inspection:
 
     @classmethod
     def of(cls, cloud: PointCloud, model: Model, resolution: int = 128, frame: CloudAxes = "camera") -> "Inspection":
-        """Reconstruct a cloud. Raises as ``reconstruct`` does."""
+        """Reconstruction of a cloud, to be asked. Raises as ``reconstruct`` does."""
         return cls(cloud, reconstruct(cloud, model, resolution, frame), model)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of empty space and the segments, by label."""
+        """Names of empty space and the segments, by label."""
         return ("empty space", *segment_names(self.model)[0])
 
     def ask(self, points: Float[np.ndarray, "n 3"]) -> Answer:
-        """The model's answers at points of the input's frame, in that frame."""
+        """Answers of the model at points of the input's frame, in that frame."""
         T_camera_input = self.result.T_camera_input
         answer = self.model.query(self.result.code, transform_points(T_camera_input, points))
         turn = inverse_rigid(T_camera_input)[:3, :3]
@@ -47,7 +47,7 @@ class Inspection:
 def first_hit(
     mesh: SegmentedMesh, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], shown: list[bool]
 ) -> Float[np.ndarray, "3"] | None:
-    """Where a ray first meets the surface of a segment that is shown; None where it meets none.
+    """Place where a ray first meets the surface of a segment that is shown; None where it meets none.
 
     Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
     """

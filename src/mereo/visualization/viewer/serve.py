@@ -20,6 +20,7 @@ from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.probe import Inspection
 
 PORT = 8080
+"""Port of the page where none is chosen."""
 
 
 def view_frame(
@@ -60,7 +61,7 @@ def view_frame(
 
 
 def view_scene(name: str, weights: str | None, *, port: int = PORT, inference: InferenceConfig | None = None) -> None:
-    """The laboratory of a scene; without ``weights`` the shipped ones, where there are any."""
+    """Show the laboratory of a scene; without ``weights`` the shipped ones, where there are any."""
     import_viser()
     scene = load_scene(name)
     known = weights or (scene.name if scene.name in shipped_names() else None)
