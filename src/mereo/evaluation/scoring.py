@@ -6,7 +6,7 @@ IoU and mIoU come from it, and the mean over single examples is reported beside 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -30,6 +30,9 @@ from mereo.synthesis.examples import sample_view
 
 PICTURES = 4
 """The first few examples are drawn with their errors."""
+
+PICTURE_MARGIN = 12
+"""Cells drawn around the truth's box: what a model puts there does not count, but belongs into a picture of it."""
 
 
 CELLS = 100
@@ -200,8 +203,23 @@ def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progr
         total += confusion
         examples[one.name] = intersection_over_union(confusion, model.segmented)
         if len(pictures) < PICTURES:
-            pictures.append(_picture_case(one, predicted, colors))
+            pictures.append(_picture_case(one, model, colors))
     return Evaluation(names, total, examples, tuple(pictures), model.segmented)
+
+
+def _picture_case(one: TestCase, model: Model, colors: Sequence[Color]) -> EvaluatedView:
+    """Truth and prediction on the truth's grid and ``PICTURE_MARGIN`` cells around it."""
+    wide = _widened(one.truth)
+    reference = np.minimum(wide.grid.labels, np.uint8(len(colors)))
+    predicted = predict_grid(model, one.cloud, wide)
+    return EvaluatedView(one.name, one.cloud, reference, predicted, wide.grid.origin, wide.grid.spacing, colors)
+
+
+def _widened(truth: TruthGrid) -> TruthGrid:
+    """The same cells and ``PICTURE_MARGIN`` more on each side, which are empty, since the box holds every segment."""
+    grid = truth.grid
+    labels, kept = (np.pad(values, PICTURE_MARGIN) for values in (grid.labels, truth.kept))
+    return TruthGrid(replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing), kept)
 
 
 def _predictions(
@@ -248,11 +266,3 @@ def markdown_table(evaluation: Evaluation) -> str:
 
 def _rounded(score: float) -> str:
     return "-" if np.isnan(score) else f"{score:.3f}"
-
-
-def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> EvaluatedView:
-    """Only points that count are shown."""
-    grid = one.truth.grid
-    reference = np.minimum(grid.labels, np.uint8(len(colors)))
-    shown = np.where(one.truth.kept, predicted, np.uint8(0))
-    return EvaluatedView(one.name, one.cloud, reference, shown, grid.origin, grid.spacing, colors)
