@@ -9,7 +9,7 @@ from analytic import AnalyticModel, untrained
 
 from mereo.cli import demo
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
+from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union
 from mereo.evaluation.sample_views import DEPTH_STEP, load_frame, make_frame, save_frame
 from mereo.evaluation.scoring import (
     Evaluation,
@@ -72,6 +72,12 @@ def test_scores_of_a_shifted_answer_have_a_closed_form() -> None:
     np.testing.assert_allclose(scores.per_segment, [0.6, 0.75])
     assert scores.miou == pytest.approx(0.675)
     assert scores.iou == pytest.approx(1.75 / 2)
+
+
+@pytest.mark.parametrize("missing", [None, float("nan")])
+def test_scores_have_three_decimals_and_a_mark_where_they_are_missing(missing: float | None) -> None:
+    assert [format_score(score) for score in (0.0, 0.12349, 1.0, missing)] == ["0.000", "0.123", "1.000", "-"]
+    assert format_score(missing, "") == "" and format_score(0.5, "") == "0.500"
 
 
 def test_false_positives_in_free_space_count() -> None:

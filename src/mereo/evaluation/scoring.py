@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.evaluation.metrics import Scores, confusion_matrix, format_score, intersection_over_union
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.models.model import Model
@@ -236,18 +236,14 @@ def markdown_table(evaluation: Evaluation) -> str:
     """The whole set and the mean over its examples; a dash where a score is undefined."""
     scores, (iou, miou) = evaluation.scores, evaluation.example_mean
     names = " | ".join(evaluation.names)
-    values = " | ".join(_rounded(value) for value in scores.per_segment)
+    values = " | ".join(format_score(value) for value in scores.per_segment)
     blank = " | ".join("" for _ in evaluation.names)
     return (
         f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
         f"|---|---|---|{'---|' * len(evaluation.names)}\n"
-        f"| whole set | {_rounded(scores.iou)} | {_rounded(scores.miou)} | {values} |\n"
-        f"| mean over examples | {_rounded(iou)} | {_rounded(miou)} | {blank} |\n"
+        f"| whole set | {format_score(scores.iou)} | {format_score(scores.miou)} | {values} |\n"
+        f"| mean over examples | {format_score(iou)} | {format_score(miou)} | {blank} |\n"
     )
-
-
-def _rounded(score: float) -> str:
-    return "-" if np.isnan(score) else f"{score:.3f}"
 
 
 def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> EvaluatedView:

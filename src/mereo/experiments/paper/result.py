@@ -13,6 +13,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from mereo.evaluation.metrics import format_score
 from mereo.evaluation.scoring import EvaluatedView
 from mereo.experiments.paper.store import Score
 from mereo.io.atomic_files import atomic_file, new_directory, write_json
@@ -128,14 +129,10 @@ def markdown(result: Result) -> str:
         score, paper = row.score, row.paper or {}
         ours = (score.iou, score.miou, score.example_iou, score.example_miou)
         figures = [*ours, paper.get("iou", float("nan")), paper.get("miou", float("nan"))]
-        lines.append(f"| {row.object} | {row.variant} | {' | '.join(_cell(value) for value in figures)} |")
+        lines.append(f"| {row.object} | {row.variant} | {' | '.join(format_score(value, '') for value in figures)} |")
     lines += ["", "IoU and mIoU are over the whole test set, the means over its examples.", ""]
     lines += [f"- {claim.text} {claim.verdict}" for claim in result.claims]
     return "\n".join(lines) + "\n"
-
-
-def _cell(value: float) -> str:
-    return "" if isnan(value) else f"{value:.3f}"
 
 
 def _plain(result: Result) -> dict[str, Any]:
