@@ -12,14 +12,9 @@ from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid
 from mereo.synthesis.examples import View
-from mereo.visualization.error_maps import OVER, UNDER, WRONG, error_grids, voxel_triangles
-from mereo.visualization.previews import (
-    contact_sheet,
-    depth_to_rgb,
-    error_picture,
-    render_cloud_and_segments,
-    scene_preview,
-)
+from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb
+from mereo.visualization.error_maps import OVER, UNDER, WRONG, error_grids, error_picture, voxel_triangles
+from mereo.visualization.previews import preview_states, render_cloud_and_segments
 from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
 
 FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -197,12 +192,12 @@ def test_the_preview_shows_cloud_and_segments_and_turns_with_the_frame(tmp_path:
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "up.png")), picture)
 
 
-def test_the_scene_preview_has_three_pictures_for_each_state(tmp_path: Path) -> None:
+def test_a_preview_of_states_has_three_pictures_for_each_state(tmp_path: Path) -> None:
     camera = Camera.from_fov(24, 24, 0.6)
     mesh = SegmentedMesh((ball((0, 0, 3), 0.5, (255, 0, 0)),))
     depth = DepthImage(np.pad(np.full((8, 8), 2.6), 8), camera)
     views = [View(mesh, depth, rigid(np.eye(3), np.array([0.0, 0.0, -3.0 * i])), ()) for i in (1, 2)]
-    scene_preview(tmp_path / "s.png", views, "two states", size=50)
+    preview_states(tmp_path / "s.png", views, "two states", size=50)
     picture = np.asarray(Image.open(tmp_path / "s.png"))
     thirds = np.array_split(picture[:, 12:], 9, axis=1)
     reds = [int(hue_is(part, (255, 0, 0)).sum()) for part in thirds]
