@@ -47,6 +47,13 @@ def test_an_orthographic_ball_has_its_closed_form_depth_and_area() -> None:
     np.testing.assert_allclose(canvas.depth[seen][inner], -np.sqrt(1 - x**2 - y**2)[inner], atol=6e-3)
 
 
+def test_a_view_along_its_own_up_is_still_a_rotation() -> None:
+    view = Viewpoint.along(np.array([[-1.0, -1, 4], [1, 1, 6]]), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0))
+    rotation = view.T_view_world[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rotation[2], [0, 0, 1])
+
+
 def test_a_pinhole_picture_is_the_camera_depth_image_in_colour() -> None:
     camera = Camera(64, 48, 90.0, 70.0, 30.0, 26.0)
     canvas = Canvas.empty(Viewpoint.through(camera), (64, 48))
