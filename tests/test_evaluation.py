@@ -10,7 +10,7 @@ from analytic import AnalyticModel, untrained
 from mereo.cli import demo
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union
-from mereo.evaluation.sample_views import DEPTH_STEP, load_frame, make_frame, save_frame
+from mereo.evaluation.sample_views import DEPTH_STEP, load_view, make_view, save_view
 from mereo.evaluation.scoring import (
     Evaluation,
     TestCase,
@@ -225,30 +225,30 @@ def test_the_table_agrees_with_the_matrix() -> None:
     assert {len(row) for row in rows} == {5}
 
 
-# --- frames and the demo ---------------------------------------------------------------------------------------------
+# --- sample views and the demo ---------------------------------------------------------------------------------------
 
 
-def test_a_frame_survives_its_file(tmp_path: Path) -> None:
-    frame = make_frame("rope", 1_000_002, cells=24)
-    save_frame(tmp_path / "rope.npz", frame)
-    again = load_frame(tmp_path / "rope.npz")
-    np.testing.assert_allclose(again.depth.depth, frame.depth.depth, atol=1e-9)
-    view = sample_view(load_scene("rope"), GenerateConfig(), example_rng(1_000_002, 0))
-    assert np.abs(again.depth.depth - view.depth.depth).max() <= DEPTH_STEP / 2 + 1e-9
-    np.testing.assert_array_equal(again.truth.grid.labels, frame.truth.grid.labels)
-    np.testing.assert_array_equal(again.truth.kept, frame.truth.kept)
-    assert again.depth.camera == frame.depth.camera and again.truth.grid.names == frame.truth.grid.names
+def test_a_sample_view_survives_its_file(tmp_path: Path) -> None:
+    view = make_view("rope", 1_000_002, cells=24)
+    save_view(tmp_path / "rope.npz", view)
+    again = load_view(tmp_path / "rope.npz")
+    np.testing.assert_allclose(again.depth.depth, view.depth.depth, atol=1e-9)
+    exact = sample_view(load_scene("rope"), GenerateConfig(), example_rng(1_000_002, 0))
+    assert np.abs(again.depth.depth - exact.depth.depth).max() <= DEPTH_STEP / 2 + 1e-9
+    np.testing.assert_array_equal(again.truth.grid.labels, view.truth.grid.labels)
+    np.testing.assert_array_equal(again.truth.kept, view.truth.kept)
+    assert again.depth.camera == view.depth.camera and again.truth.grid.names == view.truth.grid.names
     assert (again.scene, again.seed) == ("rope", 1_000_002)
 
 
-def test_not_a_frame(tmp_path: Path) -> None:
+def test_not_a_sample_view(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04")
     for name in ("other.npz", "broken.npz"):
-        with pytest.raises(ValueError, match="is not a frame of mereo"):
-            load_frame(tmp_path / name)
-    with pytest.raises(FileNotFoundError, match="there is no frame 'teapot'"):
-        load_frame("teapot")
+        with pytest.raises(ValueError, match="is not a sample view of mereo"):
+            load_view(tmp_path / name)
+    with pytest.raises(FileNotFoundError, match="there is no sample view 'teapot'"):
+        load_view("teapot")
 
 
 def test_demo_reconstructs_scores_and_says_what_is_missing(
