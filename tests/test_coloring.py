@@ -11,7 +11,7 @@ from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 from mereo.geometry.solids import Solids
 from mereo.models.model import Answer
 from mereo.visualization.vertex_colors import (
-    Scale,
+    ColorScale,
     confidence,
     distance_scale,
     error_scale,
@@ -21,7 +21,7 @@ from mereo.visualization.vertex_colors import (
 from mereo.visualization.viewer.laboratory import FAR, NEAR, NOTHING, depth_picture
 from mereo.visualization.viewer.probe import first_hit
 
-GREYS = Scale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
+GREYS = ColorScale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
 
 
 def two_balls(radius: float = 2.0) -> SegmentedMesh:

@@ -138,7 +138,7 @@ def test_one_confusion_matrix_over_the_whole_set() -> None:
     assert each[0] == 1.0 and each[1] < 0.8
     assert whole.miou != pytest.approx(np.mean(each), abs=1e-3)
     assert result.example_mean[1] == pytest.approx(np.mean(each))
-    assert [len(result.cases), result.cases[0].name] == [2, "0"]
+    assert [len(result.views), result.views[0].name] == [2, "0"]
 
 
 def test_a_model_of_distances_is_scored_on_the_whole() -> None:

@@ -28,9 +28,8 @@ from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 
-PICTURES = 4
-"""The first few examples are drawn with their errors."""
-
+KEPT_VIEWS = 4
+"""Number of examples, the first ones, that keep their labels and are drawn with their errors."""
 
 CELLS = 100
 """The paper's grid along each axis."""
@@ -76,14 +75,14 @@ class Evaluation:
         names: of the segments.
         confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
         examples: scores of each test case by its name.
-        cases: the first few with their labels, for pictures.
+        views: the first few with their labels, for pictures.
         segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
     """
 
     names: tuple[str, ...]
     confusion: Int[np.ndarray, "c c"]
     examples: dict[str, Scores]
-    cases: tuple[EvaluatedView, ...] = field(default=())
+    views: tuple[EvaluatedView, ...] = field(default=())
     segmented: bool = True
 
     @property
@@ -194,14 +193,14 @@ def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progr
     names, colors = segment_names(model)
     total = np.zeros((len(names) + 1,) * 2, dtype=np.int64)
     examples: dict[str, Scores] = {}
-    pictures: list[EvaluatedView] = []
+    views: list[EvaluatedView] = []
     for one, predicted in _predictions(model, case, count, progress):
         confusion = grid_confusion(one.truth, predicted, len(names))
         total += confusion
         examples[one.name] = intersection_over_union(confusion, model.segmented)
-        if len(pictures) < PICTURES:
-            pictures.append(_picture_case(one, predicted, colors))
-    return Evaluation(names, total, examples, tuple(pictures), model.segmented)
+        if len(views) < KEPT_VIEWS:
+            views.append(_evaluated_view(one, predicted, colors))
+    return Evaluation(names, total, examples, tuple(views), model.segmented)
 
 
 def _predictions(
@@ -246,8 +245,8 @@ def markdown_table(evaluation: Evaluation) -> str:
     )
 
 
-def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> EvaluatedView:
-    """Only points that count are shown."""
+def _evaluated_view(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> EvaluatedView:
+    """The case with the model's labels, of which only those that count are shown."""
     grid = one.truth.grid
     reference = np.minimum(grid.labels, np.uint8(len(colors)))
     shown = np.where(one.truth.kept, predicted, np.uint8(0))

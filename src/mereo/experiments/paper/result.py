@@ -84,7 +84,7 @@ class Result:
         rows: in the table's order.
         claims: of the paper.
         notes: sentences on what differs from the paper's experiment.
-        cases: rows of the paper's figure of reconstructions.
+        views: rows of the paper's figure of reconstructions.
         figures: further pictures by the names of their files.
     """
 
@@ -94,7 +94,7 @@ class Result:
     rows: tuple[Row, ...]
     claims: tuple[Claim, ...]
     notes: tuple[str, ...] = ()
-    cases: tuple[EvaluatedView, ...] = ()
+    views: tuple[EvaluatedView, ...] = ()
     figures: Mapping[str, Figure] = field(default_factory=dict)
 
 
@@ -112,8 +112,8 @@ def write_result(result: Result, directory: Path, force: bool = True) -> None:
             path.write_text(markdown(result), encoding="utf-8")
         write_json(partial / "results.json", _plain(result))
         draw_bars(result, partial / "figure.png")
-        if result.cases:
-            error_picture(partial / "reconstructions.png", result.cases)
+        if result.views:
+            error_picture(partial / "reconstructions.png", result.views)
         for name, figure in result.figures.items():
             _save(figure, partial / name)
 

@@ -79,10 +79,10 @@ class Store:
         return read_score(path / "metrics.json")
 
 
-def example_case(weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
+def example_view(weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
     """The first test view with its labels, for pictures."""
     evaluation = evaluate(load_model(weights), examples=1, cells=cells, settings=settings)
-    return evaluation.cases[0]
+    return evaluation.views[0]
 
 
 def read_score(path: Path) -> Score:

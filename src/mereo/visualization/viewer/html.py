@@ -8,7 +8,7 @@ import numpy as np
 from mereo.evaluation.metrics import Scores, format_score
 from mereo.geometry.mesh import Color
 from mereo.models.model import Answer
-from mereo.visualization.vertex_colors import Scale
+from mereo.visualization.vertex_colors import ColorScale
 
 SOFT = "opacity:.62"
 BOX = "padding:2px 0.9em 6px;font-size:0.82em;line-height:1.5"
@@ -42,7 +42,7 @@ def chips(names: Sequence[str], colors: Sequence[Color]) -> str:
     return f'<div style="{BOX}">{each}</div>'
 
 
-def legend(scale: Scale) -> str:
+def color_bar(scale: ColorScale) -> str:
     """A bar with all colours of a scale, and what its ends mean."""
     stops = ",".join(css(color) for color in scale.stops)
     return (
