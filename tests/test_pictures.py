@@ -12,6 +12,7 @@ from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid
 from mereo.synthesis.examples import View
+from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb
 from mereo.visualization.error_maps import (
     FULL_CELLS,
     OVER,
@@ -19,18 +20,13 @@ from mereo.visualization.error_maps import (
     TOLERANCE_CELLS,
     UNDER,
     WRONG,
+    error_picture,
     offset_colors,
     offset_triangles,
     segmentation_error,
     voxel_triangles,
 )
-from mereo.visualization.previews import (
-    contact_sheet,
-    depth_to_rgb,
-    error_picture,
-    render_cloud_and_segments,
-    scene_preview,
-)
+from mereo.visualization.previews import preview_states, render_cloud_and_segments
 from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
 
 FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -61,6 +57,13 @@ def test_an_orthographic_ball_has_its_closed_form_depth_and_area() -> None:
     inner = x**2 + y**2 < 0.9
     # depth in the view frame, whose origin is the middle of the box
     np.testing.assert_allclose(canvas.depth[seen][inner], -np.sqrt(1 - x**2 - y**2)[inner], atol=6e-3)
+
+
+def test_a_view_along_its_own_up_is_still_a_rotation() -> None:
+    view = Viewpoint.along(np.array([[-1.0, -1, 4], [1, 1, 6]]), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0))
+    rotation = view.T_view_world[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rotation[2], [0, 0, 1])
 
 
 def test_a_pinhole_picture_is_the_camera_depth_image_in_colour() -> None:
@@ -239,12 +242,12 @@ def test_the_preview_shows_cloud_and_segments_and_turns_with_the_frame(tmp_path:
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "up.png")), picture)
 
 
-def test_the_scene_preview_has_three_pictures_for_each_state(tmp_path: Path) -> None:
+def test_a_preview_of_states_has_three_pictures_for_each_state(tmp_path: Path) -> None:
     camera = Camera.from_fov(24, 24, 0.6)
     mesh = SegmentedMesh((ball((0, 0, 3), 0.5, (255, 0, 0)),))
     depth = DepthImage(np.pad(np.full((8, 8), 2.6), 8), camera)
     views = [View(mesh, depth, rigid(np.eye(3), np.array([0.0, 0.0, -3.0 * i])), ()) for i in (1, 2)]
-    scene_preview(tmp_path / "s.png", views, "two states", size=50)
+    preview_states(tmp_path / "s.png", views, "two states", size=50)
     picture = np.asarray(Image.open(tmp_path / "s.png"))
     thirds = np.array_split(picture[:, 12:], 9, axis=1)
     reds = [int(hue_is(part, (255, 0, 0)).sum()) for part in thirds]
