@@ -147,7 +147,7 @@ def test_pictures_show_what_lies_beside_the_box_of_the_truth() -> None:
     truth = truth_grid(mesh, 20)
     shift = 2.0 * truth.grid.spacing[0]
     result = score_cases(oracle(mesh, (shift, 0.0, 0.0)), lambda _: TestCase("0", cloud(), truth), 1, progress=False)
-    shown, inner = result.cases[0], (slice(PICTURE_MARGIN, -PICTURE_MARGIN),) * 3
+    shown, inner = result.views[0], (slice(PICTURE_MARGIN, -PICTURE_MARGIN),) * 3
     np.testing.assert_array_equal(shown.reference[inner], truth.grid.labels)
     assert (shown.reference > 0).sum() == (truth.grid.labels > 0).sum()
     np.testing.assert_allclose(shown.origin + PICTURE_MARGIN * shown.spacing, truth.grid.origin)
