@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mereo.cli import demo
-from mereo.evaluation.sample_views import load_frame
+from mereo.evaluation.sample_views import load_view
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import transform_points
@@ -43,7 +43,7 @@ def test_a_trial_of_the_laboratory(encoded: list[np.ndarray]) -> None:
 
 
 def test_a_page_of_a_frame(encoded: list[np.ndarray], tmp_path: Path) -> None:
-    cloud = load_frame("rope").depth.to_points()
+    cloud = load_view("rope").depth.to_points()
     inspection = Inspection.of(cloud, load_model("rope"), 16)
     inspection.ask(cloud.points[:5])
     confidence(inspection.result.surfaces, inspection.ask)
@@ -54,7 +54,7 @@ def test_a_page_of_a_frame(encoded: list[np.ndarray], tmp_path: Path) -> None:
 def test_a_case_of_the_demo(
     encoded: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    frame = load_frame("rope")
+    frame = load_view("rope")
     case = demo.Case("rope", "a rope", "rope", frame.depth.to_points(), "camera", frame.truth)
     monkeypatch.setattr(demo, "_inputs", lambda: iter([lambda: case]))
     monkeypatch.setattr(demo, "RESOLUTION", 16)
@@ -65,7 +65,7 @@ def test_a_case_of_the_demo(
 
 def test_the_code_answers_in_the_camera_frame() -> None:
     """Of a scan too, whose result is in the scanner's."""
-    model, seen = load_model("rope"), load_frame("rope").depth.to_points().points
+    model, seen = load_model("rope"), load_view("rope").depth.to_points().points
     scan = seen * [1.0, -1.0, -1.0]
     result = reconstruct(scan, model, 16, "scanner")
     np.testing.assert_array_equal(result.T_camera_input, into_camera(scan, "scanner"))

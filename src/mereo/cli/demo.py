@@ -11,7 +11,7 @@ from rich.table import Table
 
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.sample_views import load_frame
+from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import bunny_posed
 from mereo.evaluation.scoring import grid_confusion, predict_grid
 from mereo.geometry.camera import PointCloud
@@ -89,11 +89,11 @@ def _scan_case() -> Case:
 
 
 def _frame_case(name: str) -> Case:
-    frame = load_frame(name)
-    camera = frame.depth.camera
-    cloud = frame.depth.to_points()
+    view = load_view(name)
+    camera = view.depth.camera
+    cloud = view.depth.to_points()
     title = f"{name}: a rendered {camera.width} x {camera.height} depth image with noise, scene units"
-    return Case(name, title, name, cloud, "camera", frame.truth)
+    return Case(name, title, name, cloud, "camera", view.truth)
 
 
 def _show(case: Case, model: Model, folder: Path, console: Console) -> None:

@@ -85,8 +85,7 @@ class ScenePreview:
     def run(self) -> None:
         """Write the picture of random states."""
         from mereo.scenes.registry import load_scene
-        from mereo.visualization.previews import preview_scene
-        from mereo.visualization.scene_previews import preview_all
+        from mereo.visualization.previews import preview_all, preview_scene
 
         if self.all == bool(self.scene):
             given = f"both {self.scene!r} and --all are" if self.all else "neither a scene nor --all is"

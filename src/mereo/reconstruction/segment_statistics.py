@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from scipy.special import expit, logsumexp, softmax
 
+from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color, Segment
 from mereo.models.model import EncodedCloud, Model
@@ -81,9 +82,7 @@ def _measure(
     if len(voxels) == 0:
         nothing = np.full((2, 3), np.nan)
         return FoundSegment(segment.name, label, 0.0, nothing[0], nothing, float("nan"), 0, 0)
-    chosen = voxels
-    if len(voxels) > CONFIDENCE_VOXELS:
-        chosen = voxels[np.random.default_rng(0).choice(len(voxels), CONFIDENCE_VOXELS, replace=False)]
+    chosen = random_subset(voxels, CONFIDENCE_VOXELS)
     probability = model.query(code, grid.positions(chosen)).probability[:, label]
     low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
     part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]

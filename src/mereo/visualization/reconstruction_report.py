@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt16
 
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file, to_json
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, OUTER_OPACITY
@@ -91,10 +92,8 @@ def _page_data(
 
 
 def _thin(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """An evenly spread part of the cloud; a fixed seed, so that the page is the same every time."""
-    if len(points) <= CLOUD_POINTS:
-        return points
-    return points[np.sort(np.random.default_rng(0).choice(len(points), CLOUD_POINTS, replace=False))]
+    """The cloud, or ``CLOUD_POINTS`` of it in their order, the same every time."""
+    return points[np.sort(random_subset(np.arange(len(points)), CLOUD_POINTS))]
 
 
 def _joint_bounds(

@@ -77,8 +77,8 @@ def write_evaluation(directory: Path, evaluation: Evaluation, facts: dict[str, A
     found = metrics(evaluation, facts)
     write_json(directory / "metrics.json", found)
     (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
-    error_picture(directory / "errors.png", evaluation.cases)
-    write_evaluation_report(directory / "report.html", found, evaluation.cases[0].colors, directory / "errors.png")
+    error_picture(directory / "errors.png", evaluation.views)
+    write_evaluation_report(directory / "report.html", found, evaluation.views[0].colors, directory / "errors.png")
 
 
 def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from mereo.evaluation.registration.icp import SEGMENT_LIMITS, WHOLE_LIMITS, Registration, Scan, match, register
 from mereo.evaluation.registration.visible_surface import CONTACT, Poses, diagonal, exposed, facing, moved
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
@@ -209,8 +210,7 @@ def _measured(
     placed_by: Sequence[str],
 ) -> Placement:
     """Residuals at the scan's own points, not at the thinned ones."""
-    if len(points) > MEASURED:
-        points = points[np.random.default_rng(0).choice(len(points), MEASURED, replace=False)]
+    points = random_subset(points, MEASURED)
     matches = match(points, facing(moved(shown, found.poses), scan.viewpoint), found.matches.limit)
     segments = []
     for index, segment in enumerate(rest.segments):

@@ -93,7 +93,7 @@ class FramePage:
             else:
                 values = observed_distance(self.mesh, self.inspection.cloud.points)
                 scale = distance_scale(values, self.unit)
-            self._painted[mode] = [scale.colors(value) for value in values], html.legend(scale)
+            self._painted[mode] = [scale.colors(value) for value in values], html.color_bar(scale)
         return self._painted[mode]
 
     def _turn(self, name: str) -> None:

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
 from mereo.models.model import Answer, Model
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct, segment_names
 
@@ -47,22 +48,11 @@ class Inspection:
 def first_hit(
     mesh: SegmentedMesh, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], shown: list[bool]
 ) -> Float[np.ndarray, "3"] | None:
-    """Place where a ray first meets the surface of a segment that is shown; None where it meets none.
-
-    Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
-    """
-    nearest = np.inf
-    for segment, visible in zip(mesh.segments, shown, strict=True):
-        if not visible or len(segment.faces) == 0:
-            continue
-        a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
-        across = np.cross(direction, c - a)
-        determinant = np.einsum("ij,ij->i", b - a, across)
-        scale = 1.0 / np.where(np.abs(determinant) < 1e-30, np.inf, determinant)
-        u = scale * ((origin - a) * across).sum(axis=1)
-        turned = np.cross(origin - a, b - a)
-        v = scale * (turned @ direction)
-        t = scale * ((c - a) * turned).sum(axis=1)
-        hit = (scale != 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
-        nearest = min(nearest, float(t[hit].min(initial=np.inf)))
-    return origin + nearest * direction if np.isfinite(nearest) else None
+    """Place where a ray first meets the surface of a segment that is shown; None where it meets none."""
+    segments = tuple(s for s, visible in zip(mesh.segments, shown, strict=True) if visible and len(s.faces))
+    if not segments:
+        return None
+    T_mesh_ray = rigid(rotation_along(direction), origin)  # the ray is the z axis
+    seen = Solids(SegmentedMesh(segments).transformed(inverse_rigid(T_mesh_ray)))
+    distance = seen.first_hit(np.array([[0.0, 0.0, 1.0]])).distance[0]
+    return transform_points(T_mesh_ray, np.array([0.0, 0.0, distance])) if np.isfinite(distance) else None

@@ -4,7 +4,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from mereo.evaluation.sample_views import load_frame, shipped_frames
+from mereo.evaluation.sample_views import load_view, shipped_views
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
@@ -37,13 +37,13 @@ def view_frame(
     import_viser()
     frame: CloudAxes
     if input is None:
-        name = weights or shipped_frames()[0]
-        if name not in shipped_frames():
+        name = weights or shipped_views()[0]
+        if name not in shipped_views():
             raise ValueError(
                 f"there is no frame to show and none is shipped for {name!r}; name a depth image or a point cloud, or "
-                f"take the weights of a shipped frame: {', '.join(shipped_frames())}"
+                f"take the weights of a shipped frame: {', '.join(shipped_views())}"
             )
-        cloud, title, weights = load_frame(name).depth.to_points(), f"{name}, shipped frame", name
+        cloud, title, weights = load_view(name).depth.to_points(), f"{name}, shipped frame", name
         frame, unit = "camera", ""
     elif weights is None:
         raise ValueError(
