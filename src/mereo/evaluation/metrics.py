@@ -1,6 +1,7 @@
 """The paper's metrics (appendix B): IoU and mIoU from one confusion matrix over a whole test set."""
 
 from dataclasses import dataclass
+from math import isnan
 
 import numpy as np
 from jaxtyping import Float, Int, Integer
@@ -43,3 +44,8 @@ def intersection_over_union(confusion: Int[np.ndarray, "c c"], segmented: bool =
     present = per_segment[~np.isnan(per_segment)]
     miou = float(present.mean()) if segmented and len(present) else float("nan")
     return Scores(float(iou), miou, per_segment)
+
+
+def format_score(score: float | None, missing: str = "-") -> str:
+    """Score with three decimals as a table shows it, or ``missing`` where it is undefined (NaN, or JSON's null)."""
+    return missing if score is None or isnan(score) else f"{score:.3f}"

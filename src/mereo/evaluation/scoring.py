@@ -6,7 +6,7 @@ IoU and mIoU come from it, and the mean over single examples is reported beside 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.progress import track
 
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.evaluation.metrics import Scores, confusion_matrix, format_score, intersection_over_union
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
-from mereo.models.model import Model
+from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.registry import SCENES, load_scene
@@ -28,8 +28,11 @@ from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 
-PICTURES = 4
-"""The first few examples are drawn with their errors."""
+KEPT_VIEWS = 4
+"""Number of examples, the first ones, that keep their labels and are drawn with their errors."""
+
+PICTURE_MARGIN = 12
+"""Cells drawn around the truth's box: what a model puts there does not count, but belongs into a picture of it."""
 
 
 CELLS = 100
@@ -76,14 +79,14 @@ class Evaluation:
         names: of the segments.
         confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
         examples: scores of each test case by its name.
-        cases: the first few with their labels, for pictures.
+        views: the first few with their labels, for pictures.
         segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
     """
 
     names: tuple[str, ...]
     confusion: Int[np.ndarray, "c c"]
     examples: dict[str, Scores]
-    cases: tuple[EvaluatedView, ...] = field(default=())
+    views: tuple[EvaluatedView, ...] = field(default=())
     segmented: bool = True
 
     @property
@@ -102,9 +105,10 @@ class Evaluation:
 # --- one cloud -------------------------------------------------------------------------------------------------------
 
 
-def predict_grid(model: Model, cloud: PointCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
-    """The model's labels on the grid of ``truth``, evaluated coarse to fine."""
-    logits = partial(model.logits, model.encode(cloud))
+def predict_grid(model: Model, seen: PointCloud | EncodedCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
+    """The model's labels on the grid of ``truth``, evaluated coarse to fine; ``seen`` is a cloud, or its code."""
+    code = seen if isinstance(seen, EncodedCloud) else model.encode(seen)
+    logits = partial(model.logits, code)
     grid = truth.grid
     x, y, z = grid.labels.shape
     return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
@@ -116,12 +120,12 @@ def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segm
     return confusion_matrix(labels, predicted[truth.kept], segments + 1)
 
 
-def grid_scores(model: Model, cloud: PointCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
-    """The paper's evaluation of one cloud; ``truth`` is in the cloud's frame and units."""
+def grid_scores(model: Model, seen: PointCloud | EncodedCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
+    """The paper's evaluation of one cloud or its code; ``truth`` is in the cloud's frame and units."""
     check_names(model, truth.names)
     grid = truth_grid(truth, cells)
     segments = len(segment_names(model)[0])
-    return intersection_over_union(grid_confusion(grid, predict_grid(model, cloud, grid), segments), model.segmented)
+    return intersection_over_union(grid_confusion(grid, predict_grid(model, seen, grid), segments), model.segmented)
 
 
 def check_names(model: Model, names: Sequence[str]) -> None:
@@ -194,14 +198,29 @@ def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progr
     names, colors = segment_names(model)
     total = np.zeros((len(names) + 1,) * 2, dtype=np.int64)
     examples: dict[str, Scores] = {}
-    pictures: list[EvaluatedView] = []
+    views: list[EvaluatedView] = []
     for one, predicted in _predictions(model, case, count, progress):
         confusion = grid_confusion(one.truth, predicted, len(names))
         total += confusion
         examples[one.name] = intersection_over_union(confusion, model.segmented)
-        if len(pictures) < PICTURES:
-            pictures.append(_picture_case(one, predicted, colors))
-    return Evaluation(names, total, examples, tuple(pictures), model.segmented)
+        if len(views) < KEPT_VIEWS:
+            views.append(_evaluated_view(one, model, colors))
+    return Evaluation(names, total, examples, tuple(views), model.segmented)
+
+
+def _evaluated_view(one: TestCase, model: Model, colors: Sequence[Color]) -> EvaluatedView:
+    """Truth and prediction on the truth's grid and ``PICTURE_MARGIN`` cells around it."""
+    wide = _widened(one.truth)
+    reference = np.minimum(wide.grid.labels, np.uint8(len(colors)))
+    predicted = predict_grid(model, one.cloud, wide)
+    return EvaluatedView(one.name, one.cloud, reference, predicted, wide.grid.origin, wide.grid.spacing, colors)
+
+
+def _widened(truth: TruthGrid) -> TruthGrid:
+    """The same cells and ``PICTURE_MARGIN`` more on each side, which are empty, since the box holds every segment."""
+    grid = truth.grid
+    labels, kept = (np.pad(values, PICTURE_MARGIN) for values in (grid.labels, truth.kept))
+    return TruthGrid(replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing), kept)
 
 
 def _predictions(
@@ -236,23 +255,11 @@ def markdown_table(evaluation: Evaluation) -> str:
     """The whole set and the mean over its examples; a dash where a score is undefined."""
     scores, (iou, miou) = evaluation.scores, evaluation.example_mean
     names = " | ".join(evaluation.names)
-    values = " | ".join(_rounded(value) for value in scores.per_segment)
+    values = " | ".join(format_score(value) for value in scores.per_segment)
     blank = " | ".join("" for _ in evaluation.names)
     return (
         f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
         f"|---|---|---|{'---|' * len(evaluation.names)}\n"
-        f"| whole set | {_rounded(scores.iou)} | {_rounded(scores.miou)} | {values} |\n"
-        f"| mean over examples | {_rounded(iou)} | {_rounded(miou)} | {blank} |\n"
+        f"| whole set | {format_score(scores.iou)} | {format_score(scores.miou)} | {values} |\n"
+        f"| mean over examples | {format_score(iou)} | {format_score(miou)} | {blank} |\n"
     )
-
-
-def _rounded(score: float) -> str:
-    return "-" if np.isnan(score) else f"{score:.3f}"
-
-
-def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> EvaluatedView:
-    """Only points that count are shown."""
-    grid = one.truth.grid
-    reference = np.minimum(grid.labels, np.uint8(len(colors)))
-    shown = np.where(one.truth.kept, predicted, np.uint8(0))
-    return EvaluatedView(one.name, one.cloud, reference, shown, grid.origin, grid.spacing, colors)

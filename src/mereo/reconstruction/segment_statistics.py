@@ -14,12 +14,12 @@ from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.isosurfaces import Extraction
 
 CONFIDENCE_VOXELS = 2000
-"""The confidence of a segment is a mean over at most this many of its voxels."""
+"""Most voxels of a segment over which its confidence is a mean."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundSegment:
-    """One segment in numbers, in the input's frame and units.
+    """Segment in numbers, in the input's frame and units.
 
     Attributes:
         name, label: of the segment.
@@ -47,7 +47,14 @@ def segment_points(
     names: tuple[str, ...],
     colors: tuple[Color, ...],
 ) -> SegmentedCloud:
-    """The segments of points from the model's logits there, of empty space first."""
+    """Segment of each point from the model's logits there.
+
+    Args:
+        logits: of empty space and each segment.
+        points: in the input's frame and unit.
+        names: of the segments.
+        colors: of the segments.
+    """
     parts = logits[:, 1:].astype(np.float64)
     return SegmentedCloud(
         points=points,
@@ -60,7 +67,7 @@ def segment_points(
 
 
 def measure(found: Extraction, model: Model, code: EncodedCloud) -> tuple[FoundSegment, ...]:
-    """Every segment in numbers."""
+    """Every segment of an extraction in numbers; ``code`` is what ``model`` made of the cloud."""
     owned = zip(found.surfaces.segments, found.surfaces.owned_volumes, strict=True)
     return tuple(
         _measure(found.grid, label, segment, float(volume), model, code)

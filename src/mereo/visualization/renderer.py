@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Color, SegmentedMesh
-from mereo.geometry.transforms import inverse_rigid, rigid
+from mereo.geometry.transforms import inverse_rigid, look_at, rigid
 
 SUPERSAMPLE = 2
 BACKGROUND = 1.0
@@ -49,10 +49,8 @@ class Viewpoint:
         margin: float = 1.08,
     ) -> "Viewpoint":
         """Orthographic along ``direction``, with ``up`` upwards, showing the whole box ``bounds``."""
-        forward = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
-        right = np.cross(forward, np.asarray(up, dtype=float))
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
+        turned = look_at(np.zeros(3), np.asarray(direction, dtype=float), np.asarray(up, dtype=float))
+        rotation = inverse_rigid(turned)[:3, :3]
         half = np.abs(rotation[:2]) @ (bounds[1] - bounds[0]) / 2
         return cls(rigid(rotation, -rotation @ bounds.mean(axis=0)), margin * max(float(half.max()), 1e-12))
 

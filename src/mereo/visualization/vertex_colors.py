@@ -23,7 +23,7 @@ ERROR_SHARE = 0.05
 
 
 @dataclass(frozen=True)
-class Scale:
+class ColorScale:
     """Colours for numbers from ``low`` to ``high``; what lies beyond has the colour of that end.
 
     Attributes:
@@ -47,7 +47,7 @@ class Scale:
         return np.where(np.isnan(values)[:, None], 128.0, mixed).round().astype(np.uint8)
 
 
-CONFIDENCE = Scale(
+CONFIDENCE = ColorScale(
     "confidence of the surface",
     0.0,
     1.0,
@@ -58,18 +58,20 @@ SEEN: tuple[Color, ...] = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122
 EVEN: Color = (228, 230, 234)
 
 
-def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> Scale:
+def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> ColorScale:
     """For ``observed_distance`` of all segments: up to the largest but for a twentieth of the vertices."""
     joint = np.concatenate([*values, np.zeros(1)])
     high = max(float(np.quantile(joint, 0.95)), 1e-9)
-    return Scale("distance to the nearest observed point", 0.0, high, SEEN, ("0, seen", f"{high:.3g}{unit}, guessed"))
+    return ColorScale(
+        "distance to the nearest observed point", 0.0, high, SEEN, ("0, seen", f"{high:.3g}{unit}, guessed")
+    )
 
 
-def error_scale(truth: SegmentedMesh, unit: str) -> Scale:
+def error_scale(truth: SegmentedMesh, unit: str) -> ColorScale:
     """For ``surface_error``: orange where the reconstruction falls short, blue where it goes too far."""
     high = ERROR_SHARE * float((truth.bounds[1] - truth.bounds[0]).max())
     words = f"−{high:.2g}{unit}, too little", f"+{high:.2g}{unit}, too much"
-    return Scale("distance to the true surface", -high, high, (UNDER, EVEN, OVER), words)
+    return ColorScale("distance to the true surface", -high, high, (UNDER, EVEN, OVER), words)
 
 
 def confidence(surfaces: SegmentedMesh, ask: Ask) -> list[Float[np.ndarray, " _"]]:

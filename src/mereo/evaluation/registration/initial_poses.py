@@ -21,7 +21,7 @@ from mereo.evaluation.registration.visible_surface import diagonal
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.scanner_axes import into_camera
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import fit_rigid, inverse_rigid, rigid, transform_points
 from mereo.io.errors import readable
 from mereo.models.model import Model
 from mereo.scenes.rest_pose import rest_frame
@@ -154,7 +154,7 @@ def pose_of_pairs(
     spread = np.linalg.svd(source, compute_uv=False)
     if not spread[1] > 0.05 * spread[0]:
         raise ValueError(f"the points of the start of {of} lie on a line; they must span a triangle: pick another")
-    rotation = Rotation.align_vectors(target, source)[0].as_matrix()
+    rotation = fit_rigid(source, target)[:3, :3]
     found = float(np.sum(target * (source @ rotation.T)) / np.sum(source**2))
     if scale is None:
         raise ValueError(
@@ -177,9 +177,9 @@ def pose_of_pairs(
 
 
 def misfit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> float:
-    """RMS distance of centred pairs after the best rotation."""
-    rotation = Rotation.align_vectors(target, source)[0].as_matrix()
-    return float(np.sqrt(np.mean(np.sum((target - source @ rotation.T) ** 2, axis=1))))
+    """RMS distance of pairs after the best rigid motion."""
+    moved = transform_points(fit_rigid(source, target), source)
+    return float(np.sqrt(np.mean(np.sum((target - moved) ** 2, axis=1))))
 
 
 def start_from_model(

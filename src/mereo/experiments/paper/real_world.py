@@ -28,4 +28,4 @@ def run(store: Store, scale: ExperimentScale) -> Result:
         "Scores on real scans are considerably lower than on synthetic views (IoU by more than 0.1).",
         {"bunny": real.iou < synthetic.iou - 0.1},
     )
-    return Result("real-world", "Real scans", scale.name, rows, (claim,), NOTES, evaluation.cases)
+    return Result("real-world", "Real scans", scale.name, rows, (claim,), NOTES, evaluation.views)

@@ -13,6 +13,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from mereo.evaluation.metrics import format_score
 from mereo.evaluation.scoring import EvaluatedView
 from mereo.experiments.paper.store import Score
 from mereo.io.atomic_files import atomic_file, new_directory, write_json
@@ -83,7 +84,7 @@ class Result:
         rows: in the table's order.
         claims: of the paper.
         notes: sentences on what differs from the paper's experiment.
-        cases: rows of the paper's figure of reconstructions.
+        views: rows of the paper's figure of reconstructions.
         figures: further pictures by the names of their files.
     """
 
@@ -93,7 +94,7 @@ class Result:
     rows: tuple[Row, ...]
     claims: tuple[Claim, ...]
     notes: tuple[str, ...] = ()
-    cases: tuple[EvaluatedView, ...] = ()
+    views: tuple[EvaluatedView, ...] = ()
     figures: Mapping[str, Figure] = field(default_factory=dict)
 
 
@@ -111,8 +112,8 @@ def write_result(result: Result, directory: Path, force: bool = True) -> None:
             path.write_text(markdown(result), encoding="utf-8")
         write_json(partial / "results.json", _plain(result))
         draw_bars(result, partial / "figure.png")
-        if result.cases:
-            error_picture(partial / "reconstructions.png", result.cases)
+        if result.views:
+            error_picture(partial / "reconstructions.png", result.views)
         for name, figure in result.figures.items():
             _save(figure, partial / name)
 
@@ -128,14 +129,10 @@ def markdown(result: Result) -> str:
         score, paper = row.score, row.paper or {}
         ours = (score.iou, score.miou, score.example_iou, score.example_miou)
         figures = [*ours, paper.get("iou", float("nan")), paper.get("miou", float("nan"))]
-        lines.append(f"| {row.object} | {row.variant} | {' | '.join(_cell(value) for value in figures)} |")
+        lines.append(f"| {row.object} | {row.variant} | {' | '.join(format_score(value, '') for value in figures)} |")
     lines += ["", "IoU and mIoU are over the whole test set, the means over its examples.", ""]
     lines += [f"- {claim.text} {claim.verdict}" for claim in result.claims]
     return "\n".join(lines) + "\n"
-
-
-def _cell(value: float) -> str:
-    return "" if isnan(value) else f"{value:.3f}"
 
 
 def _plain(result: Result) -> dict[str, Any]:

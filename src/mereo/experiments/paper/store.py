@@ -79,24 +79,21 @@ class Store:
         return read_score(path / "metrics.json")
 
 
-def example_case(weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
+def example_view(weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
     """The first test view with its labels, for pictures."""
     evaluation = evaluate(load_model(weights), examples=1, cells=cells, settings=settings)
-    return evaluation.cases[0]
+    return evaluation.views[0]
 
 
 def read_score(path: Path) -> Score:
     """From the ``metrics.json`` of an evaluation, in which null stands for NaN."""
-    metrics = json.loads(path.read_text("utf-8"))
+    metrics = json.loads(path.read_text("utf-8"), object_hook=_with_nan)
     mean = metrics["example_mean"]
-    per_segment = {name: _number(value) for name, value in metrics["per_segment"].items()}
-    values = (_number(value) for value in (metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]))
-    iou, miou, example_iou, example_miou = values
-    return Score(iou, miou, example_iou, example_miou, per_segment)
+    return Score(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"], metrics["per_segment"])
 
 
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
+def _with_nan(read: dict[str, Any]) -> dict[str, Any]:
+    return {key: float("nan") if value is None else value for key, value in read.items()}
 
 
 def content_key(value: Any) -> str:

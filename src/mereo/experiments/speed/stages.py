@@ -45,7 +45,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Bench:
-    """Everything that is timed about one model and frame.
+    """Everything that is timed about one model and view.
 
     Attributes:
         repeats: of each stage; the rival's grids run once.
@@ -53,7 +53,7 @@ class Bench:
     """
 
     model: Model
-    frame: SampleView
+    view: SampleView
     machine: Machine
     repeats: int = 7
     rival: bool = False
@@ -65,11 +65,11 @@ class Bench:
 
     def prepare(self) -> Stage:
         """Depth image to normalized points in farthest-point order."""
-        cloud = self.frame.depth.to_points()
+        cloud = self.view.depth.to_points()
         points, kept = len(cloud), self.model.network.config.points
         # each chosen point is compared with all: differences, squares, sums and the smaller distance
-        work = Work(operations=9.0 * points * min(points, kept), bytes=float(self.frame.depth.depth.nbytes))
-        return self._stage("preprocessing", work, lambda: self.model.normalized_cloud(self.frame.depth.to_points()))
+        work = Work(operations=9.0 * points * min(points, kept), bytes=float(self.view.depth.depth.nbytes))
+        return self._stage("preprocessing", work, lambda: self.model.normalized_cloud(self.view.depth.to_points()))
 
     def encode(self) -> Stage:
         """The network's encoder; preprocessing is not in it."""
@@ -80,7 +80,7 @@ class Bench:
 
     def queries(self, count: int) -> Stage:
         """Class logits at random points of the object's box."""
-        points = random_points(self.frame, count)
+        points = random_points(self.view, count)
         ours = partial(self.model.logits, self._code, points)
         rival = partial(self._rival().logits, points) if self.rival else None
         if rival is not None:
@@ -92,10 +92,10 @@ class Bench:
 
         On CUDA by graphs of fixed shapes, which an autodecoder does not have.
         """
-        coarse, fine = random_points(self.frame, 10_000), random_points(self.frame, 40_000)
+        coarse, fine = random_points(self.view, 10_000), random_points(self.view, 40_000)
 
         def plain() -> None:
-            code = self.model.encode(self.frame.depth.to_points())
+            code = self.model.encode(self.view.depth.to_points())
             self.model.logits(code, coarse)
             self.model.logits(code, fine)
 
@@ -111,7 +111,7 @@ class Bench:
 
     def labels(self) -> Stage:
         """The labels of the evaluation's grid, 100^3 cells."""
-        grid = self.frame.truth.grid
+        grid = self.view.truth.grid
         x, y, z = grid.labels.shape
         field = partial(self.model.logits, self._code)
 
@@ -142,15 +142,15 @@ class Bench:
 
     @cached_property
     def _code(self) -> EncodedCloud:
-        return self.model.encode(self.frame.depth.to_points())
+        return self.model.encode(self.view.depth.to_points())
 
     def _by_graphs(
         self, coarse: Float[np.ndarray, "n 3"], fine: Float[np.ndarray, "m 3"]
     ) -> Callable[[], UInt8[np.ndarray, " m"]]:
-        frames = StaticFrames(self.model, self.frame.depth.camera, (len(coarse), len(fine)))
+        frames = StaticFrames(self.model, self.view.depth.camera, (len(coarse), len(fine)))
 
         def answer() -> UInt8[np.ndarray, " m"]:
-            frames.see(self.frame.depth.depth)
+            frames.see(self.view.depth.depth)
             frames.ask(coarse)
             return frames.ask(fine)[0]
 
@@ -158,10 +158,10 @@ class Bench:
         return answer
 
     def _warm_up(self) -> None:
-        self.model.logits(self._code, random_points(self.frame, 8192))
+        self.model.logits(self._code, random_points(self.view, 8192))
 
     def _input(self) -> tuple[torch.Tensor, Normalizer]:
-        cloud, normalizer = self.model.normalized_cloud(self.frame.depth.to_points())
+        cloud, normalizer = self.model.normalized_cloud(self.view.depth.to_points())
         return cloud.to(self.model.device), normalizer
 
     def _rival(self) -> Rival:
@@ -169,7 +169,7 @@ class Bench:
 
     def _grid_work(self, labels: UInt8[np.ndarray, "x y z"]) -> Work:
         """Asking the corners of every cell that holds a change of label, and nothing else."""
-        points = random_points(self.frame, 4096)
+        points = random_points(self.view, 4096)
         each = count_operations(lambda: self.model.logits(self._code, points)) / len(points)
         return Work(each * int(needed_nodes(labels).sum()), float(labels.nbytes))
 
@@ -217,9 +217,9 @@ class Bench:
             raise RuntimeError(f"{wrong} of {len(ours)} labels differ between the model and the rival; they must agree")
 
 
-def random_points(frame: SampleView, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
-    """Places in the box of the frame's object."""
-    grid = frame.truth.grid
+def random_points(view: SampleView, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+    """Places in the box of the view's object."""
+    grid = view.truth.grid
     return grid.origin + np.random.default_rng(seed).random((count, 3)) * grid.spacing * grid.labels.shape
 
 

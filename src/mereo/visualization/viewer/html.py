@@ -5,10 +5,10 @@ from html import escape
 
 import numpy as np
 
-from mereo.evaluation.metrics import Scores
+from mereo.evaluation.metrics import Scores, format_score
 from mereo.geometry.mesh import Color
 from mereo.models.model import Answer
-from mereo.visualization.vertex_colors import Scale
+from mereo.visualization.vertex_colors import ColorScale
 
 SOFT = "opacity:.62"
 BOX = "padding:2px 0.9em 6px;font-size:0.82em;line-height:1.5"
@@ -42,7 +42,7 @@ def chips(names: Sequence[str], colors: Sequence[Color]) -> str:
     return f'<div style="{BOX}">{each}</div>'
 
 
-def legend(scale: Scale) -> str:
+def color_bar(scale: ColorScale) -> str:
     """A bar with all colours of a scale, and what its ends mean."""
     stops = ",".join(css(color) for color in scale.stops)
     return (
@@ -69,17 +69,13 @@ def bars(rows: Sequence[tuple[str, Color, float]]) -> str:
 def scores(found: Scores, names: Sequence[str], colors: Sequence[Color]) -> str:
     """IoU and mIoU large, each segment below."""
     big = "".join(
-        f'<div><div style="font-size:2.1em;font-weight:650;line-height:1.15">{_score(value)}</div>'
+        f'<div><div style="font-size:2.1em;font-weight:650;line-height:1.15">{format_score(value, "–")}</div>'
         f'<div style="{SOFT}">{label}</div></div>'
         for label, value in (("IoU, whole object", found.iou), ("mIoU, segments", found.miou))
     )
     head = f'<div style="{BOX};display:flex;gap:2em;font-variant-numeric:tabular-nums">{big}</div>'
     rows = [(name, color, float(value)) for name, color, value in zip(names, colors, found.per_segment, strict=True)]
     return head + bars(rows)
-
-
-def _score(value: float) -> str:
-    return "–" if np.isnan(value) else f"{value:.3f}"
 
 
 def answer(found: Answer, names: Sequence[str], colors: Sequence[Color], place: Sequence[float], unit: str) -> str:

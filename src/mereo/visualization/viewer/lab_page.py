@@ -19,7 +19,7 @@ from mereo.scenes.parameters import Parameter, Played, Refused, parameters, rand
 from mereo.synthesis.examples import View
 from mereo.visualization.vertex_colors import (
     CONFIDENCE,
-    Scale,
+    ColorScale,
     confidence,
     distance_scale,
     error_scale,
@@ -262,14 +262,14 @@ class LabPage:
         mode, surfaces = self._coloring.value, trial.result.surfaces
         if mode == "segment":
             return None
-        scale: Scale
+        scale: ColorScale
         if mode == "error":
             values, scale = surface_error(surfaces, Solids(view.mesh)), error_scale(view.mesh, "")
         elif mode == "confidence":
             assert self.laboratory.model is not None
-            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.code)), CONFIDENCE
+            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.result.code)), CONFIDENCE
         else:
             values = observed_distance(surfaces, view.depth.to_points().points)
             scale = distance_scale(values, "")
-        self._legend.content, self._legend.visible = html.legend(scale), True
+        self._legend.content, self._legend.visible = html.color_bar(scale), True
         return [scale.colors(value) for value in values]
