@@ -194,6 +194,11 @@ class Canvas:
         self.rgb[row, column] = colors[inside][visible]
         self.depth[row, column] = z[inside][visible]
 
+    def let_through(self, inner: "Canvas") -> None:
+        """Mix in what another canvas of the same view shows behind what is drawn here."""
+        hidden = np.isfinite(inner.depth) & (inner.depth > self.depth + 1e-6)
+        self.rgb[hidden] = (1 - SEE_THROUGH) * self.rgb[hidden] + SEE_THROUGH * inner.rgb[hidden]
+
     def picture(self) -> UInt8[np.ndarray, "h w 3"]:
         """Averaged down to the asked size."""
         height, width = (side // SUPERSAMPLE for side in self.depth.shape)
@@ -245,6 +250,5 @@ def shade(
         within = Canvas.empty(view, size)
         parts = SegmentedMesh(tuple(mesh.segments[index] for index in inner))
         within.draw_triangles(Triangles.of(parts, [colors[index] for index in inner]))
-        hidden = np.isfinite(within.depth) & (within.depth > canvas.depth + 1e-6)
-        canvas.rgb[hidden] = (1 - SEE_THROUGH) * canvas.rgb[hidden] + SEE_THROUGH * within.rgb[hidden]
+        canvas.let_through(within)
     return canvas.picture()

@@ -221,9 +221,9 @@ def icp(
     if hold:
         curvature = 2 * FLATNESS * result.H / max(result.num_inliers, 1)
         points_to_surface, held = constrained(points_to_surface, curvature)
-    motion = inverse_rigid(points_to_surface)
-    motion[:3, 3] = center - motion[:3, :3] @ center + radius * motion[:3, 3]
-    return motion, held
+    motion = inverse_rigid(points_to_surface)  # about the centre, in radii
+    rotation = motion[:3, :3]
+    return rigid(rotation, center - rotation @ center + radius * motion[:3, 3]), held
 
 
 def constrained(
