@@ -12,6 +12,7 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union
 from mereo.evaluation.sample_views import DEPTH_STEP, load_view, make_view, save_view
 from mereo.evaluation.scoring import (
+    PICTURE_MARGIN,
     Evaluation,
     TestCase,
     evaluate,
@@ -139,6 +140,19 @@ def test_one_confusion_matrix_over_the_whole_set() -> None:
     assert whole.miou != pytest.approx(np.mean(each), abs=1e-3)
     assert result.example_mean[1] == pytest.approx(np.mean(each))
     assert [len(result.views), result.views[0].name] == [2, "0"]
+
+
+def test_pictures_show_what_lies_beside_the_box_of_the_truth() -> None:
+    mesh = two_cuboids()
+    truth = truth_grid(mesh, 20)
+    shift = 2.0 * truth.grid.spacing[0]
+    result = score_cases(oracle(mesh, (shift, 0.0, 0.0)), lambda _: TestCase("0", cloud(), truth), 1, progress=False)
+    shown, inner = result.views[0], (slice(PICTURE_MARGIN, -PICTURE_MARGIN),) * 3
+    np.testing.assert_array_equal(shown.reference[inner], truth.grid.labels)
+    assert (shown.reference > 0).sum() == (truth.grid.labels > 0).sum()
+    np.testing.assert_allclose(shown.origin + PICTURE_MARGIN * shown.spacing, truth.grid.origin)
+    assert (shown.predicted > 0).sum() == (shown.reference > 0).sum()  # all of it, though two cells are outside
+    assert (shown.predicted[inner] > 0).sum() < (shown.reference > 0).sum()
 
 
 def test_a_model_of_distances_is_scored_on_the_whole() -> None:

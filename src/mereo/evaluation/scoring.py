@@ -6,7 +6,7 @@ IoU and mIoU come from it, and the mean over single examples is reported beside 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -30,6 +30,9 @@ from mereo.synthesis.examples import sample_view
 
 KEPT_VIEWS = 4
 """Number of examples, the first ones, that keep their labels and are drawn with their errors."""
+
+PICTURE_MARGIN = 12
+"""Cells drawn around the truth's box: what a model puts there does not count, but belongs into a picture of it."""
 
 CELLS = 100
 """The paper's grid along each axis."""
@@ -199,8 +202,23 @@ def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progr
         total += confusion
         examples[one.name] = intersection_over_union(confusion, model.segmented)
         if len(views) < KEPT_VIEWS:
-            views.append(_evaluated_view(one, predicted, colors))
+            views.append(_evaluated_view(one, model, colors))
     return Evaluation(names, total, examples, tuple(views), model.segmented)
+
+
+def _evaluated_view(one: TestCase, model: Model, colors: Sequence[Color]) -> EvaluatedView:
+    """Truth and prediction on the truth's grid and ``PICTURE_MARGIN`` cells around it."""
+    wide = _widened(one.truth)
+    reference = np.minimum(wide.grid.labels, np.uint8(len(colors)))
+    predicted = predict_grid(model, one.cloud, wide)
+    return EvaluatedView(one.name, one.cloud, reference, predicted, wide.grid.origin, wide.grid.spacing, colors)
+
+
+def _widened(truth: TruthGrid) -> TruthGrid:
+    """The same cells and ``PICTURE_MARGIN`` more on each side, which are empty, since the box holds every segment."""
+    grid = truth.grid
+    labels, kept = (np.pad(values, PICTURE_MARGIN) for values in (grid.labels, truth.kept))
+    return TruthGrid(replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing), kept)
 
 
 def _predictions(
@@ -243,11 +261,3 @@ def markdown_table(evaluation: Evaluation) -> str:
         f"| whole set | {format_score(scores.iou)} | {format_score(scores.miou)} | {values} |\n"
         f"| mean over examples | {format_score(iou)} | {format_score(miou)} | {blank} |\n"
     )
-
-
-def _evaluated_view(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> EvaluatedView:
-    """The case with the model's labels, of which only those that count are shown."""
-    grid = one.truth.grid
-    reference = np.minimum(grid.labels, np.uint8(len(colors)))
-    shown = np.where(one.truth.kept, predicted, np.uint8(0))
-    return EvaluatedView(one.name, one.cloud, reference, shown, grid.origin, grid.spacing, colors)
