@@ -29,7 +29,7 @@ PURPOSES: dict[str, str] = {
 
 
 def diagnose() -> None:
-    """Print versions, device, threads, CPU features and extras, one fact a line."""
+    """Print versions, device, threads, load, CPU features and extras, one fact a line."""
     for line in (*_platform(), *_packages(), *_device(), *_extras()):
         print(line)
 
@@ -92,10 +92,30 @@ def _device() -> Iterator[str]:
     else:
         yield _row("device", "cpu")
     yield _row("threads", f"{torch.get_num_threads()} of {os.cpu_count()} cores")
+    yield _row("wait policy", os.environ.get("OMP_WAIT_POLICY", "not set"))
+    if hasattr(os, "getloadavg"):
+        yield _row("load", describe_load(os.getloadavg()[0], os.cpu_count() or 1, torch.get_num_threads()))
     features = cpu_features()
     for name, present in features.items():
         yield _row(name, {True: "yes", False: "no", None: "unknown"}[present])
     yield _row("bfloat16", _bfloat16())
+
+
+def describe_load(load: float, cores: int, threads: int) -> str:
+    """Sentence on how busy the machine is, and the OMP_NUM_THREADS that would help where it is.
+
+    Args:
+        load: processes that ran or wanted to, mean of the last minute.
+        cores: of the machine.
+        threads: that OpenMP would use.
+    """
+    found = f"{load:.1f} on {cores} cores"
+    free = max(1, round(cores - load))
+    if load < cores / 2 or threads <= free:
+        return found
+    return (
+        f"{found}, which is busy: OMP_NUM_THREADS={free} would help, as all threads wait for the one that shares a core"
+    )
 
 
 def _bfloat16() -> str:
