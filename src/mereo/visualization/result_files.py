@@ -39,7 +39,7 @@ def evaluate_weights(
     settings: GenerateConfig | None = None,
     inference: InferenceConfig = EXACT,
 ) -> Evaluation:
-    """``mereo evaluate``: write metrics.json, table.md, errors.png, report.html; print the table."""
+    """Evaluate weights on synthetic views: write metrics.json, table.md, errors.png, report.html; print the table."""
     with new_directory(output) as directory:
         model = load_for(weights, inference)
         settings = settings or GenerateConfig()
@@ -63,7 +63,7 @@ def evaluate_weights(
 def evaluate_on_scans(
     model: Model, output: str | Path, *, truths: Sequence[str | Path] = (), cells: int = CELLS
 ) -> Evaluation:
-    """``mereo evaluate --scans``: scores on real scans, with the same files as ``evaluate_weights``."""
+    """Evaluate a model on real scans: write the same files as ``evaluate_weights``, print the table."""
     with new_directory(output) as directory:
         evaluation = evaluate_scans(model, truths=truths, cells=cells)
         facts = {"scans": list(evaluation.examples), "truths": [str(path) for path in truths]}
@@ -73,7 +73,7 @@ def evaluate_on_scans(
 
 
 def write_evaluation(directory: Path, evaluation: Evaluation, facts: dict[str, Any]) -> None:
-    """metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON."""
+    """Write metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON."""
     found = metrics(evaluation, facts)
     write_json(directory / "metrics.json", found)
     (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
@@ -82,7 +82,7 @@ def write_evaluation(directory: Path, evaluation: Evaluation, facts: dict[str, A
 
 
 def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:
-    """What ``summary.json`` holds: ``facts``, then each segment and the stages' seconds."""
+    """Content of ``summary.json``: ``facts``, then each segment and the stages' seconds."""
     segments = [
         {
             "name": found.name,

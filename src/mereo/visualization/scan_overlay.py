@@ -26,7 +26,7 @@ TOO_FAR = (0.85, 0.1, 0.1)
 
 
 def overlay(placement: Placement, cloud: PointCloud, scan: ScanFile) -> Picture:
-    """The scan on the placed segments (top), and its distance from them (bottom), as seen by the scanner and others."""
+    """Picture of a scan on the placed segments (top) and of its distance from them (bottom), from several sides."""
     to_camera = camera_axes(scan.frame)
     mesh = placement.mesh.transformed(to_camera)
     chosen = np.random.default_rng(0).permutation(len(cloud))[:SHOWN_POINTS]

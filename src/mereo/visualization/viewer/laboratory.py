@@ -1,4 +1,4 @@
-"""A scene under the hands: any state, seen by any camera of its workspace, reconstructed and compared with the truth.
+"""Laboratory of a scene: any state, seen by any camera of its workspace, reconstructed and compared with the truth.
 
     Played (see ``mereo.scenes.parameters``), CameraPlace -look-> View -rebuild-> Trial (reconstruction, scores)
 
@@ -33,7 +33,7 @@ NOTHING: tuple[int, int, int] = (16, 19, 26)
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """Where the camera stands, in the terms of the scene's ``Workspace``.
+    """Place of the camera, in the terms of the scene's ``Workspace``.
 
     Attributes:
         tilt_rad: away from the workspace's axis, 0 to half its aperture.
@@ -50,7 +50,7 @@ class CameraPlace:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One reconstruction and how good it is.
+    """Trial: one reconstruction of a view, and how good it is.
 
     Attributes:
         result: in the camera frame.
@@ -69,7 +69,7 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Laboratory:
-    """A scene, and the model that is to reconstruct it; without one there is only the view.
+    """Scene, and the model that is to reconstruct it; without one there is only the view.
 
     Raises ``ValueError`` for a model of another object.
     """
@@ -84,18 +84,19 @@ class Laboratory:
 
     @property
     def camera(self) -> Camera:
-        """The virtual depth camera."""
+        """Intrinsics of the virtual depth camera."""
         size = self.settings.image_size
         return Camera.from_fov(size, size, self.scene.workspace.fov_rad)
 
     def first_place(self) -> CameraPlace:
-        """Oblique, in the middle of the allowed distances."""
+        """Place of the camera at first: oblique, in the middle of the allowed distances."""
         near, far = self.scene.workspace.distance
         tilt = min(np.deg2rad(35.0), self.most_tilt_rad)
         return CameraPlace(float(tilt), float(np.deg2rad(40.0)), (near + far) / 2)
 
     @property
     def most_tilt_rad(self) -> float:
+        """Largest angle of the camera from the workspace's axis."""
         return float(min(self.scene.workspace.aperture_rad / 2, np.pi))
 
     def pose(self, target: Float[np.ndarray, "3"], place: CameraPlace) -> Float[np.ndarray, "4 4"]:
@@ -104,7 +105,7 @@ class Laboratory:
         return self.scene.workspace.pose(target, cosine, place.azimuth_rad, place.distance, place.roll_rad)
 
     def look(self, played: Played, place: CameraPlace) -> View:
-        """The state as the camera sees it; its noise is the same every time, so that pictures do not flicker.
+        """View of a state by a camera; its noise is the same every time, so that pictures do not flicker.
 
         Raises ``ValueError`` where fewer than ``MIN_POINTS`` points of the object are seen.
         """
@@ -136,7 +137,7 @@ class Laboratory:
 
 
 def depth_picture(depth: DepthImage, factor: int = 1) -> UInt8[np.ndarray, "h w 3"]:
-    """A depth image for the eye: near is light, far is dark, each pixel ``factor`` pixels wide."""
+    """Picture of a depth image: near is light, far is dark, each pixel ``factor`` pixels wide."""
     valid, values = depth.valid, depth.depth
     shares = np.zeros_like(values)
     if valid.any():
