@@ -126,8 +126,9 @@ def test_doctor_knows_no_load_where_the_system_has_none(
     [
         (0.9, 2, 2, None),  # more than half of the machine is free
         (1.0, 2, 2, 1),
-        (9.0, 2, 2, 1),
-        (9.0, 2, 1, None),  # that many already
+        (2.9, 2, 2, 1),
+        (2.9, 2, 1, None),  # that many already
+        (3.0, 2, 2, None),  # so crowded that fewer threads gain nothing
         (7.9, 16, 16, None),
         (12.0, 16, 16, 4),
         (12.0, 16, 4, None),

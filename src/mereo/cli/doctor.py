@@ -111,6 +111,8 @@ def describe_load(load: float, cores: int, threads: int) -> str:
     """
     found = f"{load:.1f} on {cores} cores"
     free = max(1, round(cores - load))
+    if load >= 1.5 * cores:  # fewer threads then get a smaller share of the cores and gain nothing
+        return f"{found}, which is crowded: everything waits for a core"
     if load < cores / 2 or threads <= free:
         return found
     return (
