@@ -38,7 +38,7 @@ from mereo.scenes.builtin._solids import Vector, segment
 from mereo.scenes.scene import Scene, Workspace
 
 
-class Joint(NamedTuple):
+class ArmJoint(NamedTuple):
     """A revolute joint of the rest pose: a point of its axis, the axis, and limits in degrees."""
 
     name: str
@@ -49,12 +49,12 @@ class Joint(NamedTuple):
 
 
 JOINTS = (
-    Joint("turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
-    Joint("lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
-    Joint("fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
-    Joint("roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
-    Joint("pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
-    Joint("spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+    ArmJoint("turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
+    ArmJoint("lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
+    ArmJoint("fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
+    ArmJoint("roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+    ArmJoint("pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
+    ArmJoint("spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
 )
 OPENING = (0.15, 2.0)
 """Least and largest distance of a finger from the middle."""
