@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from overlapping import check_overlap
 
 from mereo.deformation.maps import jacobian_determinant
 from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh_repair import close_holes, largest_piece
-from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids
 from mereo.scenes.builtin import _liver_parts, skull, tumor
 from mereo.scenes.registry import load_scene

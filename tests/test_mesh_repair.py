@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from overlapping import check_overlap
 from scene_files import write_bar, write_mesh
 from shapes import ball, box, knobbly_torus, segment
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import examine, likely_unit
 from mereo.geometry.mesh_repair import repaired, without_overlaps
-from mereo.geometry.overlap import check_overlap, overlaps
+from mereo.geometry.overlap import overlaps
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.registry import load_scene
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from overlapping import check_overlap
 from scipy.spatial import ConvexHull, cKDTree
 from solid_pairs import crowded
 
@@ -13,7 +14,6 @@ from mereo.deformation.maps import invert, jacobian_determinant
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
 from mereo.scenes.registry import SCENES, load_scene
