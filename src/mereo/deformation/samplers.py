@@ -10,7 +10,7 @@ its axis: the angle is drawn from what that leaves of its range. Lengths are in 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 
 Range = tuple[float, float]
 Vector = Float[np.ndarray, "3"]
@@ -184,17 +184,12 @@ class RandomMotion:
 def _surface(
     rest: SegmentedMesh, chains: Sequence[tuple[Deformation, ...]], members: Sequence[int]
 ) -> tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]:
-    """Vertices of segments after their maps so far, and their normals, weighted by area."""
-    vertices, normals = [], []
+    """Vertices of segments after their maps so far, and their normals."""
+    moved = []
     for index in members:
-        moved, faces = Compose(chains[index])(rest.segments[index].vertices), rest.segments[index].faces
-        a, b, c = (moved[faces[:, k]] for k in range(3))
-        normal = np.zeros_like(moved)
-        for k in range(3):
-            np.add.at(normal, faces[:, k], np.cross(b - a, c - a))
-        vertices.append(moved)
-        normals.append(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30))
-    return np.concatenate(vertices), np.concatenate(normals)
+        segment = rest.segments[index]
+        moved.append(replace(segment, vertices=Compose(chains[index])(segment.vertices)))
+    return np.concatenate([s.vertices for s in moved]), np.concatenate([vertex_normals(s) for s in moved])
 
 
 def distance_from_line(points: Float[np.ndarray, "n 3"], origin: Vector, axis: Vector) -> float:

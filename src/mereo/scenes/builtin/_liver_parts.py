@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid
 from mereo.deformation.warps import Bend, FreeFormLattice, Squash, Twist
 from mereo.geometry.manifold import Faces, Vertices, solid_of
-from mereo.geometry.mesh import PALETTE, Segment
+from mereo.geometry.mesh import PALETTE, Segment, vertex_normals
 from mereo.geometry.mesh_repair import close_holes, largest_piece
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes import assets
@@ -108,7 +108,7 @@ EDGE_SHARE = 0.12
 def _places() -> dict[str, tuple[Vertices, Vertices]]:
     """Where each kind of instrument may be, with outward normals."""
     liver, gallbladder = organs()
-    normals = [_normals(part) for part in (liver, gallbladder)]
+    normals = [vertex_normals(part) for part in (liver, gallbladder)]
     tree = cKDTree(liver.vertices)
     around = tree.query_ball_point(liver.vertices, 25.0 * MM)
     mean = np.stack([liver.vertices[rows].mean(axis=0) for rows in around])
@@ -120,15 +120,6 @@ def _places() -> dict[str, tuple[Vertices, Vertices]]:
         "gallbladder": (gallbladder.vertices, normals[1]),
         "surface": (liver.vertices, normals[0]),
     }
-
-
-def _normals(segment: Segment) -> Vertices:
-    """Unit normals of vertices, weighted by area."""
-    a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
-    normal = np.zeros_like(segment.vertices)
-    for k in range(3):
-        np.add.at(normal, segment.faces[:, k], np.cross(b - a, c - a))
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
 
 
 def sample_field(rng: np.random.Generator) -> Compose:
