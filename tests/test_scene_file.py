@@ -14,7 +14,8 @@ from mereo.deformation.maps import jacobian_determinant
 from mereo.deformation.samplers import RandomMotion
 from mereo.deformation.warps import FreeFormLattice
 from mereo.geometry.mesh import PALETTE
-from mereo.scenes.files.schema import Deformation, SceneFile
+from mereo.scenes.files.deformation_blocks import AnyDeformation
+from mereo.scenes.files.schema import SceneFile
 from mereo.scenes.registry import SCENES, load_scene
 
 EVERYTHING = """
@@ -221,7 +222,7 @@ def test_a_scene_from_a_python_file(tmp_path: Path) -> None:
 def test_every_key_and_every_deformation_is_documented() -> None:
     text = (Path(__file__).parent.parent / "docs" / "own-object.md").read_text("utf-8")
     assert [key for key in SceneFile.model_fields if f"| `{key}` |" not in text] == []
-    for block in get_args(Deformation):
+    for block in get_args(AnyDeformation):
         (kind,) = get_args(block.model_fields["type"].annotation)
         row = next(line for line in text.splitlines() if line.startswith(f"| `{kind}` |"))
         assert [key for key in block.model_fields if key not in ("type", "segments") and f"`{key}`" not in row] == []

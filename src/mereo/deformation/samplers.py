@@ -31,14 +31,14 @@ FOLD_SHARE = 0.9
 
 
 @runtime_checkable
-class Draw(Protocol):
+class DeformationSampler(Protocol):
     """The bounds of one deformation."""
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation: ...
 
 
 @dataclass(frozen=True, eq=False)
-class DrawLattice:
+class LatticeSampler:
     """A free-form lattice over a box; the control points move by at most ``strength`` of what is injective."""
 
     bounds: Float[np.ndarray, "2 3"]
@@ -50,7 +50,7 @@ class DrawLattice:
 
 
 @dataclass(frozen=True)
-class DrawWaves:
+class WavesSampler:
     """A smooth field whose gradient is at most ``strength``, which is uniform up to the bound."""
 
     wavelength: Range
@@ -62,7 +62,7 @@ class DrawWaves:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawBend:
+class BendSampler:
     """A bend about an axis, to a random side where ``toward`` is None."""
 
     origin: Vector
@@ -80,7 +80,7 @@ class DrawBend:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawTwist:
+class TwistSampler:
     """A twist about an axis, any angle of which preserves volume."""
 
     origin: Vector
@@ -93,7 +93,7 @@ class DrawTwist:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawTaper:
+class TaperSampler:
     """Factors are uniform in their logarithm, so that a half is as likely as a double."""
 
     origin: Vector
@@ -106,7 +106,7 @@ class DrawTaper:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawSquash:
+class SquashSampler:
     """Along a random axis where ``axis`` is None; factors are uniform in their logarithm."""
 
     center: Vector
@@ -119,7 +119,7 @@ class DrawSquash:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawJoint:
+class JointSampler:
     """A rigid motion: a turn about an axis, a slide along it, and a shift of at most ``shift`` along x, y, z."""
 
     pivot: Vector
@@ -135,7 +135,7 @@ class DrawJoint:
 
 
 @dataclass(frozen=True)
-class DrawPush:
+class PushSampler:
     """An instrument moves the tissue around a random vertex, within 30 degrees or so of its normal.
 
     The map's Jacobian is at least 1 - 15/8 |distance| / (reach - tip), which the schema keeps above 0.05.
@@ -159,22 +159,22 @@ class RandomMotion:
 
     Attributes:
         rest: the segments at rest.
-        steps: what to draw, and the indices of the segments that it moves.
+        steps: samplers, and the indices of the segments that it moves.
 
     Segments with the same steps share one map and so stay in contact.
     """
 
     rest: SegmentedMesh
-    steps: tuple[tuple[Draw, tuple[int, ...]], ...]
+    steps: tuple[tuple[DeformationSampler, tuple[int, ...]], ...]
 
     def __call__(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
         chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
-        for draw, members in self.steps:
+        for sampler, members in self.steps:
 
             def surface(members: tuple[int, ...] = members) -> tuple[np.ndarray, np.ndarray]:
                 return _surface(self.rest, chains, members)
 
-            drawn = draw(rng, surface)
+            drawn = sampler(rng, surface)
             for index in members:
                 chains[index] = (*chains[index], drawn)
         shared: dict[tuple[int, ...], Compose] = {}
