@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from mereo.geometry.conventions import UNITS_M
-from mereo.scenes.files.deformation_blocks import AnyDeformation
+from mereo.scenes.files.deformation_blocks import Deformations
 from mereo.scenes.files.fields import Block, Byte, Direction, Name, Positive, PositiveRange
 from mereo.scenes.scene import Workspace
 
@@ -98,9 +98,7 @@ class SceneFile(Block):
     cells: Annotated[int, Field(ge=16, le=400)] = 64
     size: Positive = 20.0
     camera: CameraBlock = CameraBlock()
-    deformations: (
-        Annotated[list[Annotated[AnyDeformation, Field(discriminator="type")]], Field(min_length=1)] | None
-    ) = None
+    deformations: Deformations | None = None
     states: str | None = None
     held_out: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.1
 
