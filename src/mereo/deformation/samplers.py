@@ -16,6 +16,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
@@ -58,7 +59,8 @@ class WavesSampler:
     modes: int
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        return SmoothField.sample(rng, rng.uniform(0.0, self.strength), self.wavelength, self.modes)
+        strength = named(rng, "strength").uniform(0.0, self.strength)
+        return SmoothField.sample(rng, strength, self.wavelength, self.modes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +74,10 @@ class BendSampler:
     toward: Vector | None
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        toward = rng.normal(size=3) if self.toward is None else self.toward
+        toward = named(rng, "toward").normal(size=3) if self.toward is None else self.toward
         radius = distance_from_line(surface()[0], self.origin, self.axis)
         most = FOLD_SHARE * self.length / max(radius, 1e-12)
-        angle = rng.uniform(*np.clip(self.angle_rad, -most, most))
+        angle = named(rng, "angle", "rad").uniform(*np.clip(self.angle_rad, -most, most))
         return Bend(self.origin, self.axis, toward, self.length, angle, radius)
 
 
@@ -89,7 +91,7 @@ class TwistSampler:
     angle_rad: Range
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        return Twist(self.origin, self.axis, self.length, rng.uniform(*self.angle_rad))
+        return Twist(self.origin, self.axis, self.length, named(rng, "angle", "rad").uniform(*self.angle_rad))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +104,7 @@ class TaperSampler:
     factor: Range
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        return Taper(self.origin, self.axis, self.length, float(np.exp(rng.uniform(*np.log(self.factor)))))
+        return Taper(self.origin, self.axis, self.length, _factor(rng, self.factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +116,8 @@ class SquashSampler:
     factor: Range
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        axis = rng.normal(size=3) if self.axis is None else self.axis
-        return Squash(self.center, axis, float(np.exp(rng.uniform(*np.log(self.factor)))))
+        axis = named(rng, "axis").normal(size=3) if self.axis is None else self.axis
+        return Squash(self.center, axis, _factor(rng, self.factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +132,9 @@ class JointSampler:
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
         axis = unit(self.axis)
-        rotation = axis * rng.uniform(*self.angle_rad)
-        return Rigid(rotation, axis * rng.uniform(*self.slide) + rng.uniform(-self.shift, self.shift), self.pivot)
+        rotation = axis * named(rng, "angle", "rad").uniform(*self.angle_rad)
+        slide = axis * named(rng, "slide").uniform(*self.slide)
+        return Rigid(rotation, slide + named(rng, "shift").uniform(-self.shift, self.shift), self.pivot)
 
 
 @dataclass(frozen=True)
@@ -147,9 +150,9 @@ class PushSampler:
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
         vertices, normals = surface()
-        index = rng.integers(len(vertices))
-        direction = unit(normals[index] + 0.35 * rng.normal(size=3))
-        pull = Rigid(np.zeros(3), direction * rng.uniform(*self.distance), vertices[index])
+        index = named(rng, "vertex").integers(len(vertices))
+        direction = unit(normals[index] + 0.35 * named(rng, "slant").normal(size=3))
+        pull = Rigid(np.zeros(3), direction * named(rng, "distance").uniform(*self.distance), vertices[index])
         return Localized(pull, vertices[index], self.tip, self.reach)
 
 
@@ -169,16 +172,28 @@ class RandomMotion:
 
     def __call__(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
         chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
-        for sampler, members in self.steps:
+        for number, (sampler, members) in enumerate(self.steps, start=1):
 
             def surface(members: tuple[int, ...] = members) -> tuple[np.ndarray, np.ndarray]:
                 return _surface(self.rest, chains, members)
 
-            drawn = sampler(rng, surface)
+            with part(rng, self._title(number, sampler, members)):
+                drawn = sampler(rng, surface)
             for index in members:
                 chains[index] = (*chains[index], drawn)
         shared: dict[tuple[int, ...], Compose] = {}
         return tuple(shared.setdefault(tuple(id(part) for part in chain), Compose(chain)) for chain in chains)
+
+    def _title(self, number: int, sampler: DeformationSampler, members: tuple[int, ...]) -> str:
+        """A step as people know it from their file, for example "2 joint of hand, arm"."""
+        kind = type(sampler).__name__.removesuffix("Sampler").lower()
+        whole = len(members) == len(self.rest.names)
+        return f"{number} {kind}" + ("" if whole else f" of {', '.join(self.rest.names[i] for i in members)}")
+
+
+def _factor(rng: np.random.Generator, bounds: Range) -> float:
+    """A factor, uniform in its logarithm."""
+    return float(np.exp(named(rng, "factor", "log").uniform(*np.log(bounds))))
 
 
 def _surface(

@@ -110,6 +110,19 @@ def turn_limits() -> Float[np.ndarray, "2 j 3"]:
     return limits
 
 
+@cache
+def turn_names() -> tuple[str, ...]:
+    """Name of each turn, joint by joint in the order of ``turn_limits``; "" where there is none."""
+    about = {"bone": "twist", "hinge": "bend", "x": "about x", "y": "about y", "z": "about z"}
+    names = []
+    for joint in JOINTS:
+        part, _, side = joint.name.replace("_", " ").partition(".")
+        owner = f"{'left ' if side == 'L' else 'right ' if side else ''}{part}"
+        turns = [f"{owner} {about[axis]}" for axis, _, _ in joint.turns]
+        names += [*turns, *("" for _ in range(3 - len(turns)))]
+    return tuple(names)
+
+
 def _axis(joint: BodyJoint, name: str) -> Float[np.ndarray, "3"]:
     right = joint.name.endswith("R")
     if name == "bone":  # a turn about a mirrored bone is mirrored by turning the other way

@@ -26,6 +26,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.geometry.manifold import solid_of
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -128,8 +129,8 @@ def jaw_state(opening: float, forward: float, side: float) -> tuple[float, float
 
 def sample_jaw(rng: np.random.Generator) -> tuple[float, float, float]:
     """A random ``jaw_state``; one mouth in seven is closed."""
-    opening = 0.0 if rng.uniform() < 1 / 7 else rng.uniform()
-    return jaw_state(opening, rng.uniform(), rng.uniform(-1.0, 1.0))
+    opening = 0.0 if named(rng, "closed below 1/7").uniform() < 1 / 7 else named(rng, "opening").uniform()
+    return jaw_state(opening, named(rng, "forward").uniform(), named(rng, "to its left").uniform(-1.0, 1.0))
 
 
 # --- the model --------------------------------------------------------------------------------------------------------
