@@ -53,7 +53,7 @@ class ParameterSliders:
                     parameter.group, expand_by_default=not self._folders
                 )
         with self._folders[parameter.group]:
-            unit = f" ({parameter.unit.strip()})" if parameter.unit else ""
+            unit = f" ({parameter.unit})" if parameter.unit else ""
             handle = self._gui.add_slider(f"{parameter.name}{unit}", *_range(parameter), _on_range(parameter))
         handle.on_update(lambda event: self._told(event, place))
         return handle
