@@ -47,12 +47,12 @@ def measure(queries: int, rounds: int, beside: int) -> None:
     """Print threads, and seconds alone and beside busy processes: what the process of one row does."""
     import torch  # before mereo, so that OpenMP finds the variable as this row has it
 
-    from mereo.bench.stages import random_points
-    from mereo.frames import load_frame
-    from mereo.weights import load_model
+    from mereo.evaluation.sample_views import load_view
+    from mereo.experiments.speed.stages import random_points
+    from mereo.models.weights import load_model
 
-    model, frame = load_model("bunny"), load_frame("bunny")
-    code, points = model.encode(frame.depth.to_points()), random_points(frame, queries, seed=1)
+    model, view = load_model("bunny"), load_view("bunny")
+    code, points = model.encode(view.depth.to_points()), random_points(view, queries, seed=1)
 
     def seconds() -> float:
         start = time.perf_counter()

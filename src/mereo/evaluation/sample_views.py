@@ -22,7 +22,7 @@ SHIPPED = Path(__file__).parents[1] / "frames"
 
 
 DEPTH_STEP = 0.005
-"""Depth is stored as whole multiples of this many scene units, a twentieth of the sensor's noise."""
+"""Step of the stored depth in scene units, a twentieth of the sensor's noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +30,10 @@ class SampleView:
     """One rendered view of a scene with its truth.
 
     Attributes:
-        scene, seed: where it comes from: example 0 of this test seed.
+        scene: name of the scene.
+        seed: test seed of which it is example 0.
         depth: the noisy depth image, scene units.
-        truth: in the camera frame.
+        truth: true labels on a grid, in the camera frame.
     """
 
     scene: str

@@ -1,4 +1,4 @@
-"""Scores on test sets (paper, appendix B), and on synthetic views of a scene; for real scans see ``scan_evaluation``.
+"""Scores on test sets (paper, appendix B), and on synthetic views of a scene; for real scans see ``scan_scoring``.
 
 The joint box of all true segments is divided into 100^3 cells; their centres are labelled by the truth and by the
 model, and those outside every segment's enlarged box are dropped. One confusion matrix is summed over the whole set;
@@ -34,14 +34,19 @@ KEPT_VIEWS = 4
 PICTURE_MARGIN = 12
 """Cells drawn around the truth's box: what a model puts there does not count, but belongs into a picture of it."""
 
-
 CELLS = 100
-"""The paper's grid along each axis."""
+"""Cells of the paper's grid along each axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class TestCase:
-    """One cloud with its truth, both in the same camera frame."""
+    """Cloud to be reconstructed and the truth to score it by, both in the same camera frame.
+
+    Attributes:
+        name: name in tables, different from other cases' of the set.
+        cloud: what the model is given.
+        truth: true labels on a grid.
+    """
 
     __test__ = False  # not a test, whatever pytest thinks of the name
 
@@ -52,14 +57,16 @@ class TestCase:
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedView:
-    """One row of the paper's figure of reconstructions.
+    """View with its true and its predicted labels: a row of the paper's figure of reconstructions.
 
     Attributes:
-        name: the label at the left.
-        cloud: the input.
-        reference, predicted: labels on the same grid; 0 is empty space.
-        origin, spacing: voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the cloud's frame.
-        colors: of the segments; label k has ``colors[k - 1]``.
+        name: label at the left of the row.
+        cloud: what the model was given.
+        reference: true labels; 0 is empty space.
+        predicted: labels by the model, on the same grid.
+        origin: centre of voxel [0, 0, 0] in the cloud's frame; that of [i, j, k] is ``origin + [i, j, k] * spacing``.
+        spacing: distances of the voxels' centres along each axis.
+        colors: colours of the segments; label k has ``colors[k - 1]``.
     """
 
     name: str
@@ -73,10 +80,10 @@ class EvaluatedView:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Scores of a test set.
+    """Result of a test set: its confusion matrix, from which its scores come, and the scores of each example.
 
     Attributes:
-        names: of the segments.
+        names: names of the segments.
         confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
         examples: scores of each test case by its name.
         views: the first few with their labels, for pictures.
@@ -91,12 +98,12 @@ class Evaluation:
 
     @property
     def scores(self) -> Scores:
-        """Over the whole set."""
+        """Scores over the whole set, from its one confusion matrix."""
         return intersection_over_union(self.confusion, self.segmented)
 
     @property
     def example_mean(self) -> tuple[float, float]:
-        """IoU and mIoU averaged over the examples."""
+        """Mean IoU and mean mIoU over the examples; NaN where no example has a mIoU."""
         each = self.examples.values()
         mious = [s.miou for s in each if not np.isnan(s.miou)]
         return float(np.mean([s.iou for s in each])), float(np.mean(mious)) if mious else float("nan")
@@ -106,7 +113,7 @@ class Evaluation:
 
 
 def predict_grid(model: Model, seen: PointCloud | EncodedCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
-    """The model's labels on the grid of ``truth``, evaluated coarse to fine; ``seen`` is a cloud, or its code."""
+    """Labels by the model on the grid of ``truth``, evaluated coarse to fine; ``seen`` is a cloud, or its code."""
     code = seen if isinstance(seen, EncodedCloud) else model.encode(seen)
     logits = partial(model.logits, code)
     grid = truth.grid
@@ -115,13 +122,16 @@ def predict_grid(model: Model, seen: PointCloud | EncodedCloud, truth: TruthGrid
 
 
 def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segments: int) -> Int[np.ndarray, "c c"]:
-    """True against predicted labels of the points that count; all ``segments`` are one where the model knows one."""
+    """Confusion matrix of the points that count; where the model knows one segment, all true ones are taken as one."""
     labels = np.minimum(truth.grid.labels[truth.kept], segments)
     return confusion_matrix(labels, predicted[truth.kept], segments + 1)
 
 
 def grid_scores(model: Model, seen: PointCloud | EncodedCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
-    """The paper's evaluation of one cloud or its code; ``truth`` is in the cloud's frame and units."""
+    """Scores of one cloud, or its code, as in the paper; ``truth`` is in the cloud's frame and units.
+
+    Raises ``ValueError`` where the model knows other segments than the truth has.
+    """
     check_names(model, truth.names)
     grid = truth_grid(truth, cells)
     segments = len(segment_names(model)[0])
@@ -150,15 +160,15 @@ def evaluate(
     progress: bool = False,
     settings: GenerateConfig | None = None,
 ) -> Evaluation:
-    """Scores on synthetic views of a scene, seen as in training: through a noisy depth image.
+    """Scores of a model on synthetic views of a scene, seen as in training: through a noisy depth image.
 
     Args:
         model: the trained model.
         scene: a scene, its name or its file; by default the built-in one that the model was trained on.
-        examples: how many; example i is made from (seed, i) alone.
-        seed: at least ``config.TEST_SEED_START``: smaller ones are for training.
-        cells: of the grid along each axis.
-        progress: show a bar with the time left.
+        examples: number of views; example i is made from (seed, i) alone.
+        seed: at least ``TEST_SEED_START``: smaller ones are for training.
+        cells: cells of the grid along each axis.
+        progress: whether to show a bar with the time left.
         settings: the camera (image size, noise, sensor); by default the paper's.
 
     Raises ``ValueError`` for a training seed, no examples, or another object than the model's.
@@ -176,7 +186,7 @@ def evaluate(
 
 
 def trained_scene(model: Model) -> str:
-    """The built-in scene in the weights' provenance; raises ``ValueError`` where there is none."""
+    """Name of the built-in scene that a model was trained on; raises ``ValueError`` where its provenance says none."""
     scene = model.provenance.get("scene")
     if not isinstance(scene, str):
         raise ValueError("the weights do not say which scene they were trained on; name it with --scene")
@@ -194,7 +204,7 @@ def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, i
 
 
 def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progress: bool) -> Evaluation:
-    """One confusion matrix over ``case(0) ... case(count - 1)``, which are made one at a time."""
+    """Scores of a model on ``case(0) ... case(count - 1)``, which are made one at a time, as they may be large."""
     names, colors = segment_names(model)
     total = np.zeros((len(names) + 1,) * 2, dtype=np.int64)
     examples: dict[str, Scores] = {}
@@ -236,7 +246,7 @@ def _predictions(
 
 
 def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
-    """What ``metrics.json`` holds."""
+    """Content of ``metrics.json``: ``facts`` first, then definition, scores and confusion matrix."""
     scores, (iou, miou) = evaluation.scores, evaluation.example_mean
     return {
         **facts,
@@ -253,7 +263,7 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def markdown_table(evaluation: Evaluation) -> str:
-    """The whole set and the mean over its examples; a dash where a score is undefined."""
+    """Markdown table of the whole set and the mean over its examples; a dash where a score is undefined."""
     scores, (iou, miou) = evaluation.scores, evaluation.example_mean
     names = " | ".join(evaluation.names)
     values = " | ".join(format_score(value) for value in scores.per_segment)

@@ -1,4 +1,4 @@
-"""The paper's error pictures: what lies too far out or in, and wrong segments (figure of section 4.2)."""
+"""Error pictures after the paper's: what lies too far out or in, and wrong segments (figure of section 4.2)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -49,7 +49,8 @@ def error_picture(
     Args:
         path: the .png file.
         cases: the rows.
-        direction, up: how to look, in the cases' frame; the default is the camera's view.
+        direction: where to look, in the cases' frame; the default is the camera's view.
+        up: what is up in the picture, in the same frame.
         size: width and height of each picture in pixels.
     """
     images: list[Picture] = []
@@ -78,14 +79,14 @@ def _error_row(
 
 
 def segmentation_error(case: EvaluatedView) -> UInt8[np.ndarray, "x y z"]:
-    """Where both are occupied: 1 in the same segment, 2 in different ones. 0, elsewhere, is not shown."""
+    """Grid of right and wrong segments: 1 where truth and prediction are the same, 2 where not, 0 if one is empty."""
     both = (case.reference > 0) & (case.predicted > 0)
     wrong: UInt8[np.ndarray, "x y z"] = (both * 1 + (both & (case.reference != case.predicted)) * 1).astype(np.uint8)
     return wrong
 
 
 def offset_triangles(case: EvaluatedView) -> Triangles:
-    """The surface of truth and reconstruction together, coloured by the distance between them (``offset_colors``).
+    """Surface of truth and reconstruction together, coloured by the distance between them (``offset_colors``).
 
     So what was invented is seen, and what is missing as well, each the stronger the farther it is from the truth.
     """
@@ -97,7 +98,7 @@ def offset_triangles(case: EvaluatedView) -> Triangles:
 
 
 def offset_colors(cells: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Pale up to ``TOLERANCE_CELLS``, then more and more blue (above 0: too far out) or orange, in 0..255."""
+    """Colours of distances: pale up to ``TOLERANCE_CELLS``, then blue (above 0: too far out) or orange; 0..255."""
     share = np.clip((np.abs(cells) - TOLERANCE_CELLS) / (FULL_CELLS - TOLERANCE_CELLS), 0.0, 1.0)[:, None]
     full = np.where(cells[:, None] > 0, np.asarray(OVER, dtype=float), np.asarray(UNDER, dtype=float))
     colors: Float[np.ndarray, "n 3"] = (1 - share) * np.asarray(PALE, dtype=float) + share * full
@@ -130,7 +131,7 @@ def voxel_triangles(
     origin: Float[np.ndarray, "3"],
     spacing: Float[np.ndarray, "3"],
 ) -> Triangles:
-    """The faces between occupied voxels and empty space, coloured by value (``colors[value - 1]``, 0..1).
+    """Faces between occupied voxels and empty space, coloured by value (``colors[value - 1]``, 0..1).
 
     Normals are those of the smoothed occupancy, so that a curved body does not look like a staircase.
     """

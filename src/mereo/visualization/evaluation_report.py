@@ -50,12 +50,12 @@ DASH = "–"
 def write_evaluation_report(
     path: str | Path, metrics: Mapping[str, Any], colors: Sequence[Color], picture: str | Path
 ) -> None:
-    """Write the page, under ``BUDGET_BYTES``.
+    """Write the page of an evaluation's scores, under ``BUDGET_BYTES``.
 
     Args:
         path: the .html file.
-        metrics: what ``metrics.json`` holds, see ``evaluation.metrics``; NaN is shown as a dash.
-        colors: of the segments.
+        metrics: what ``metrics.json`` holds, see ``scoring.metrics``; NaN is shown as a dash.
+        colors: colours of the segments.
         picture: a PNG file; it is made smaller where it is too large for the page.
 
     Raises ``ValueError`` where even then the page is too large.

@@ -67,7 +67,7 @@ def render_cloud_and_segments(
     size: int = 420,
     frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
 ) -> None:
-    """Write a preview: the input cloud (top) and the segments (bottom) from the camera, its right and behind.
+    """Write a preview of a reconstruction: input cloud (top), segments (bottom); from the camera, its right and behind.
 
     Args:
         path: the .png file.
@@ -194,7 +194,7 @@ def preview_all(path: str | Path, seed: int = 0) -> None:
 
 
 def scene_row(scene: Scene, seed: int) -> list[Picture]:
-    """The scene at rest and in two random states, from ``SCENE_VIEWS``, and the depth image of the second state."""
+    """Pictures of a scene at rest and in two random states, from ``SCENE_VIEWS``, and the depth image of the second."""
     views = [sample_view(scene, GenerateConfig(), example_rng(seed, index)) for index in (0, 1)]
     meshes = [scene.rest, *(view.mesh.transformed(view.T_world_camera) for view in views)]
     viewpoint = _common_viewpoint(meshes, *SCENE_VIEWS[scene.name])

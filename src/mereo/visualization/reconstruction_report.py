@@ -22,7 +22,11 @@ from mereo.io.atomic_files import atomic_file, to_json
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, OUTER_OPACITY
 
 BUDGET_BYTES = 5_000_000
+"""Most bytes of a page."""
+
 CLOUD_POINTS = 60_000
+"""Most points of the cloud that the page shows."""
+
 DATA_MARKER = "/*DATA*/null"
 TITLE_MARKER = "<!--TITLE-->"
 STEPS = 65535
@@ -35,7 +39,7 @@ def write_report(
     summary: dict[str, Any],
     frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
 ) -> None:
-    """Write the page.
+    """Write the page of a reconstruction.
 
     Args:
         path: the .html file.
@@ -125,7 +129,7 @@ def _fit(surfaces: SegmentedMesh, extent: float, room_bytes: int) -> list[Segmen
 
 
 def cluster(segment: Segment, cell: float) -> Segment:
-    """Vertices in the same cell of a cubic grid become their mean; faces that collapse or repeat are dropped.
+    """Coarser segment: vertices in one cell of a cubic grid become their mean, faces that collapse or repeat go.
 
     J. Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993. Fast and
     dependency-free; the result is for looking at and need not be closed.

@@ -1,4 +1,4 @@
-"""How far a reconstructed surface lies from the true one, finer than the grids on which both are labelled."""
+"""Distance of a reconstructed surface from the true one, finer than the grids on which both are labelled."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -29,7 +29,8 @@ def surface_offset(
     In a part that one grid lacks it is as large as the way to the nearest place that both have.
 
     Args:
-        reference, predicted: which cells are occupied.
+        reference: whether each cell is truly occupied.
+        predicted: whether it is by the prediction.
         spacing: sides of a cell.
         places: in grid coordinates, the centre of cell [0, 0, 0] at the origin.
     """

@@ -1,4 +1,4 @@
-"""Every object, reconstructed and segmented (paper, section 4.2 and appendix A)."""
+"""Reconstruction and segmentation of every object (paper, section 4.2 and appendix A)."""
 
 from mereo.evaluation.scoring import EvaluatedView
 from mereo.experiments.paper.result import Claim, Result, Row, published
@@ -10,7 +10,7 @@ OBJECTS = ("rope", "shapes", "robot", "lizard", "sheet", "bunny", "human", "skul
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
-    """One training per object and recipe; with a rival recipe both are reported on the same data."""
+    """Result of one training per object and recipe; with a rival recipe both are reported on the same data."""
     rows: list[Row] = []
     views: list[EvaluatedView] = []
     ours: dict[str, Score] = {}

@@ -1,4 +1,4 @@
-"""A network of any preset that knows one view: as costly to ask as a trained one, and with surfaces to extract."""
+"""Model of any preset that knows one view: as costly to ask as a trained one, and with surfaces to extract."""
 
 from dataclasses import replace
 
@@ -16,10 +16,11 @@ from mereo.models.network import Network
 from mereo.training.config import PRESETS
 
 STEPS, QUERIES = 200, 2048
+"""Number of training steps, and of queries in each."""
 
 
 def fitted_model(preset: str, view: SampleView) -> Model:
-    """The preset's network, fitted to the labels of one view in ``STEPS`` steps (seconds to a minute on a CPU).
+    """Model with a preset's network, fitted to the labels of one view (in seconds to a minute on a CPU).
 
     It knows nothing else: how long it takes can be measured with it, not how good it is.
     """

@@ -1,4 +1,4 @@
-"""What ``mereo bench`` prints and writes."""
+"""Report of ``mereo bench``: what it prints and writes."""
 
 import os
 import platform
@@ -22,7 +22,7 @@ from mereo.models.weights import load_model
 
 @dataclass(frozen=True)
 class Cost:
-    """What a lower precision changes at 40,000 points of the object's box.
+    """Change of a model's answers by a lower precision, at 40,000 points of the object's box.
 
     Attributes:
         labels: share of points with another label.
@@ -44,8 +44,16 @@ def benchmark(
 ) -> list[Stage]:
     """Time all stages, print the table, and write it as JSON where ``output`` says so.
 
-    Weights are a shipped name or a file with a shipped view of its object; without, the preset's network is fitted to
-    a view first. Raises ``ValueError`` for weights of an object without a shipped view.
+    Args:
+        weights: a shipped name or a file, with a shipped view of its object; None fits the preset's network first.
+        preset: name of the architecture to fit.
+        device: where the network runs.
+        precision: precision of the network's products.
+        repeats: repetitions of each stage.
+        rival: whether to time the straightforward implementation too.
+        output: a JSON file, or None.
+
+    Raises ``ValueError`` for weights of an object without a shipped view.
     """
     model, view = _subject(weights, preset)
     model.network.to(device)
@@ -101,7 +109,7 @@ def _cost(exact: Model, fast: Model, view: SampleView) -> Cost:
 
 
 def table(stages: list[Stage], facts: dict[str, Any], cost: Cost | None = None) -> str:
-    """Markdown; times in milliseconds."""
+    """Markdown table of the stages, times in milliseconds, under a line of facts about model and machine."""
     lines = [
         f"{facts['model']}; {facts['device']}, {facts['threads']} threads of {facts['cores']} cores, AMX "
         f"{'yes' if facts['amx'] else 'no'}, {facts['precision']}; products {facts['gigaflops']:.0f} GFLOP/s, "

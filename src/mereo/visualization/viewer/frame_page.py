@@ -1,4 +1,4 @@
-"""The page of one frame: what was observed, its reconstruction, and a probe."""
+"""Page of one frame: what was observed, its reconstruction, and a probe."""
 
 import threading
 from typing import Any
@@ -17,7 +17,7 @@ EMPTY_COLOR = (150, 156, 168)
 
 
 class FramePage:
-    """Shows an ``Inspection`` on a server; answers clicks, check boxes and sliders until the server stops."""
+    """Page that shows an ``Inspection`` and answers clicks, check boxes and sliders until its server stops."""
 
     def __init__(self, server: Any, inspection: Inspection, title: str, facts: str, unit: str = "") -> None:
         self.server, self.inspection, self.unit = server, inspection, f" {unit}" if unit else ""

@@ -1,4 +1,4 @@
-"""A scene under the hands: any state, seen by any camera of its workspace, reconstructed and compared with the truth.
+"""Laboratory of a scene: any state, seen by any camera of its workspace, reconstructed and compared with the truth.
 
     Played (see ``mereo.scenes.parameters``), CameraPlace -look-> View -rebuild-> Trial (reconstruction, scores)
 
