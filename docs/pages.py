@@ -120,4 +120,5 @@ def _public_names() -> str:
         for alias in node.names
         if alias.asname
     ]
-    return "\n".join(["# mereo", "", ast.get_docstring(tree) or "", "", "| name | defined as |", "|---|---|", *rows, ""])
+    table = "\n".join(["| name | defined as |", "|---|---|", *rows])
+    return f"# mereo\n\n{ast.get_docstring(tree)}\n\n{table}\n"
