@@ -15,9 +15,10 @@ from collections.abc import Callable
 
 import torch
 
-from mereo.config import PRESETS, Encoder, NetworkConfig
-from mereo.encoders.autodecoder import Autodecoder
-from mereo.network import Network
+from mereo.models.config import Encoder, NetworkConfig
+from mereo.models.encoders.autodecoder import Autodecoder
+from mereo.models.network import Network
+from mereo.training.config import PRESETS
 
 BATCH, QUERIES, SEGMENTS = 8, 1472, 5
 ENCODERS: tuple[Encoder, ...] = ("pointnet2", "point-transformer", "autodecoder")

@@ -24,16 +24,18 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mereo.alignment import Alignment, fit_rigid
-from mereo.config import TEST_SEED_START, AugmentConfig, GenerateConfig
-from mereo.dataset import Batch, Dataset, choose_points
-from mereo.evaluation import predict_grid, trained_scene
-from mereo.frames import TruthGrid, truth_grid
-from mereo.metrics import Scores, confusion_matrix, intersection_over_union
-from mereo.model import Model
-from mereo.scene import load_scene
-from mereo.synthesis import example_rng, sample_view
-from mereo.weights import load_model, shipped_names
+from mereo.evaluation.ground_truth import TruthGrid, truth_grid
+from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.evaluation.scoring import predict_grid, trained_scene
+from mereo.models.model import Model
+from mereo.models.rigid_alignment import Alignment, fit_rigid
+from mereo.models.weights import load_model, shipped_names
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
+from mereo.training.config import AugmentConfig
+from mereo.training.dataset import Batch, Dataset, choose_points
 
 NEAR_CELLS = 1.2
 HELD_OUT = 64

@@ -12,12 +12,13 @@ from functools import partial
 
 import numpy as np
 
-from mereo.config import TEST_SEED_START, GenerateConfig
-from mereo.evaluation import trained_scene
-from mereo.extraction import Extraction, extract, extract_dense
-from mereo.scene import load_scene
-from mereo.synthesis import example_rng, sample_view
-from mereo.weights import load_model
+from mereo.evaluation.scoring import trained_scene
+from mereo.models.weights import load_model
+from mereo.reconstruction.isosurfaces import Extraction, extract, extract_dense
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
 
 
 def main(weights: str = "rope", resolution: int = 64, views: int = 2) -> None:

@@ -23,14 +23,17 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
 
-from mereo import query_sampling, synthesis
-from mereo.camera import Camera
-from mereo.config import GenerateConfig
-from mereo.frame import Normalizer, inverse_rigid
-from mereo.mesh import SegmentedMesh
-from mereo.scene import Scene, load_scene
-from mereo.solid import Solids
-from mereo.synthesis import example_rng, synthesize
+from mereo.geometry.camera import Camera
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis import examples, query_sampling
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import synthesize
 
 SETTINGS = GenerateConfig()
 
@@ -122,16 +125,16 @@ def compare(scene: Scene, examples: int) -> None:
 
 
 STAGES: tuple[tuple[Any, str, str], ...] = (
-    (synthesis, "_sample_view", "view"),
+    (examples, "_sample_view", "view"),
     (Scene, "sample_state", "view: state"),
-    (synthesis, "render_depth", "view: depth image"),
-    (synthesis, "sample_queries", "sampling"),
+    (examples, "render_depth", "view: depth image"),
+    (examples, "sample_queries", "sampling"),
     (Solids, "label", "sampling: labels"),
     (query_sampling, "_nearest_rows", "sampling: k nearest"),
     (Solids, "nearest", "distances and directions"),
-    (synthesis, "rest_coordinates", "rest coordinates"),
-    (synthesis, "farthest_point_order", "farthest-point order"),
-    (synthesis, "synthesize", "whole example"),
+    (examples, "rest_coordinates", "rest coordinates"),
+    (examples, "farthest_point_order", "farthest-point order"),
+    (examples, "synthesize", "whole example"),
 )
 
 
@@ -154,7 +157,7 @@ def profile(scene: Scene, examples: int) -> None:
         for owner, attribute, name in STAGES:
             setattr(owner, attribute, timed(getattr(owner, attribute), name))
         for index in range(examples):
-            synthesis.synthesize(scene, SETTINGS, example_rng(1, index))
+            examples.synthesize(scene, SETTINGS, example_rng(1, index))
     finally:
         for owner, attribute, original in originals:
             setattr(owner, attribute, original)

@@ -11,15 +11,16 @@ import time
 
 import numpy as np
 
-from mereo.config import SENSORS, TEST_SEED_START, GenerateConfig
-from mereo.evaluation import grid_confusion, predict_grid, trained_scene
-from mereo.frames import truth_grid
-from mereo.input_config import IsolationConfig
-from mereo.isolation import isolate
-from mereo.metrics import intersection_over_union
-from mereo.scene import load_scene
-from mereo.synthesis import example_rng, sample_view
-from mereo.weights import load_model, shipped_names
+from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.metrics import intersection_over_union
+from mereo.evaluation.scoring import grid_confusion, predict_grid, trained_scene
+from mereo.models.weights import load_model, shipped_names
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.isolation import isolate
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import SENSORS, GenerateConfig
+from mereo.synthesis.examples import sample_view
 
 WAYS = {
     "as it comes": IsolationConfig(),

@@ -14,13 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from mereo.config import SENSORS, GenerateConfig, SensorConfig
-from mereo.scene import load_scene
-from mereo.sensor import observe
-from mereo.sensor_config import SENSOR_TERMS
-from mereo.solid import Solids
-from mereo.surroundings import OBJECT
-from mereo.synthesis import View, example_rng, sample_view, synthesize
+from mereo.geometry.solids import Solids
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.clutter import OBJECT
+from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SensorConfig
+from mereo.synthesis.depth_sensor import observe
+from mereo.synthesis.examples import View, sample_view, synthesize
 
 SENSORS_BY_NAME: dict[str, SensorConfig] = {**SENSORS} | {  # type: ignore[dict-item]
     name: replace(SensorConfig(), **{name: 1.0}) for name in SENSOR_TERMS

@@ -12,15 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from mereo.config import GenerateConfig
-from mereo.deformation import invert, jacobian_determinant
-from mereo.mesh import SegmentedMesh
-from mereo.scene import Scene, load_scene
-from mereo.scenes._liver_parts import MM
-from mereo.simulated import States, SurfaceFrames, load_states
-from mereo.solid import Solids
-from mereo.surface_states import Surface, SurfaceMap
-from mereo.synthesis import example_rng, synthesize
+from mereo.deformation.maps import invert, jacobian_determinant
+from mereo.deformation.surface_driven import Surface, SurfaceMap
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.scenes.builtin._liver_parts import MM
+from mereo.scenes.recorded_states import States, SurfaceFrames, load_states
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import synthesize
 
 STATES = Path(__file__).parents[1] / "src/mereo/states/liver.npz"
 POINTS = 1500

@@ -16,15 +16,16 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from mereo.camera import PointCloud
-from mereo.evaluation import grid_scores
-from mereo.input_config import InputConfig, IsolationConfig
-from mereo.isolation import isolate
-from mereo.observation import read_observation
-from mereo.scans import scan_in_camera
-from mereo.shading import Viewpoint
-from mereo.sheets import cloud_picture, contact_sheet, save_png
-from mereo.weights import load_model
+from mereo.evaluation.scans import scan_in_camera
+from mereo.evaluation.scoring import grid_scores
+from mereo.geometry.camera import PointCloud
+from mereo.io.config import InputConfig
+from mereo.models.weights import load_model
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.isolation import isolate
+from mereo.reconstruction.observation import read_observation
+from mereo.visualization.contact_sheets import cloud_picture, contact_sheet, save_png
+from mereo.visualization.renderer import Viewpoint
 
 SCAN = "bun000"
 

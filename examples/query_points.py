@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 import mereo
-from mereo.frames import load_frame
+from mereo.evaluation.sample_views import load_frame
 
 
 def main(weights: str = "bunny", queries: int = 2000) -> None:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import mereo
-from mereo.frames import load_frame
+from mereo.evaluation.sample_views import load_frame
 
 
 def main(cloud_path: str | None = None, output: str = "out/example", weights: str = "bunny") -> None:

@@ -13,14 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mereo.camera import DepthImage
-from mereo.config import SENSORS, GenerateConfig, SensorConfig
-from mereo.scene import load_scene
-from mereo.sensor import Observation, observe
-from mereo.sheets import Picture, contact_sheet, depth_to_rgb, enlarge, save_png
-from mereo.solid import Solids
-from mereo.surroundings import OBJECT, OCCLUDER
-from mereo.synthesis import example_rng, sample_view
+from mereo.geometry.camera import DepthImage
+from mereo.geometry.solids import Solids
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.clutter import OBJECT, OCCLUDER
+from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
+from mereo.synthesis.depth_sensor import SimulatedView, observe
+from mereo.synthesis.examples import sample_view
+from mereo.visualization.contact_sheets import Picture, contact_sheet, depth_to_rgb, enlarge, save_png
 
 STRAY, LEFT_OUT = (214, 39, 40), (176, 180, 188)
 OFF = SensorConfig()
@@ -40,7 +41,7 @@ TERMS: dict[str, SensorConfig] = {
 }
 
 
-def draw(seen: Observation, limits: tuple[float, float], width: int) -> Picture:
+def draw(seen: SimulatedView, limits: tuple[float, float], width: int) -> Picture:
     """The middle of the image: the cloud's pixels by depth, strays in red, occluders left out by the mask in grey."""
     picture = depth_to_rgb(DepthImage(np.clip(seen.image.depth, 0, limits[1]), seen.image.camera), limits)
     left_out = seen.whole.valid & ~seen.mask

@@ -9,14 +9,14 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from mereo.assets import AssetUnavailable
-from mereo.config import TEST_SEED_START
-from mereo.error_pictures import ErrorCase, error_picture
-from mereo.evaluation import evaluate
-from mereo.weights import load_model, shipped_names
+from mereo.evaluation.scoring import EvaluatedView, evaluate
+from mereo.models.weights import load_model, shipped_names
+from mereo.scenes.assets import AssetUnavailable
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.visualization.error_maps import error_picture
 
 
-def first_view(name: str, cells: int) -> ErrorCase:
+def first_view(name: str, cells: int) -> EvaluatedView:
     """The first test view with its labels, true and predicted; the row says how good this one is."""
     evaluation = evaluate(load_model(name), examples=1, cells=cells, seed=TEST_SEED_START)
     scores = evaluation.scores
@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=100, help="grid cells along each axis")
     options = parser.parse_args()
 
-    cases: list[ErrorCase] = []
+    cases: list[EvaluatedView] = []
     for name in options.weights:
         try:
             cases.append(first_view(name, options.cells))

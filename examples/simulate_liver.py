@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from mereo import assets
-from mereo.output import atomic_file
-from mereo.scene import load_scene
-from mereo.solid import Solids
-from mereo.tetrahedra import Tetrahedra
+from mereo.deformation.tetrahedral import Tetrahedra
+from mereo.geometry.solids import Solids
+from mereo.io.atomic_files import atomic_file
+from mereo.scenes import assets
+from mereo.scenes.registry import load_scene
 
 YOUNG_PA, POISSON, DENSITY, GRAVITY = 5000.0, 0.4, 1060.0, 9.81
 BACK, HELD_MM = np.array([0.05, 0.6, 0.8]), 40.0

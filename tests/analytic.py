@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from scipy.special import softmax
 
-from mereo.config import PRESETS
-from mereo.mesh import PALETTE
-from mereo.model import Answer, EncodedCloud, Model
-from mereo.network import Network
+from mereo.geometry.mesh import PALETTE
+from mereo.models.model import Answer, EncodedCloud, Model
+from mereo.models.network import Network
+from mereo.training.config import PRESETS
 
 Points = np.ndarray
 Distance = Callable[[Points], np.ndarray]

@@ -9,7 +9,7 @@ from jaxtyping import install_import_hook
 # before the first import of mereo: from here on a wrong shape or dtype is an error
 install_import_hook("mereo", "type_checker.check")
 
-from mereo import assets  # noqa: E402
+from mereo.scenes import assets  # noqa: E402
 
 
 def find_asset(name: str) -> Path:

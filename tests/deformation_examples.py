@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mereo.deformation import Compose, Deformation, Identity, Localized, Rigid
-from mereo.skeleton import Bone, Hinge, Skeleton
-from mereo.warps import Bend, CurveSweep, FreeFormLattice, SmoothField, Squash, Taper, Twist
+from mereo.deformation.maps import Compose, Deformation, Identity, Localized, Rigid
+from mereo.deformation.skeleton import Bone, Hinge, Skeleton
+from mereo.deformation.warps import Bend, CurveSweep, FreeFormLattice, SmoothField, Squash, Taper, Twist
 
 HALF = 10.0
 """The random points fill the cube [-HALF, HALF]^3."""

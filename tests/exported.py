@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mereo.config import PRESETS, NetworkConfig
-from mereo.mesh import PALETTE
-from mereo.model import Model
-from mereo.network import Network
-from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
+from mereo.geometry.mesh import PALETTE
+from mereo.models.config import NetworkConfig
+from mereo.models.model import Model
+from mereo.models.network import Network
+from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
+from mereo.training.config import PRESETS
 
 NAMES = ("head", "left ear", "tail")
 

@@ -5,8 +5,8 @@ from itertools import permutations
 import numpy as np
 from shapes import box
 
-from mereo.mesh import Segment, SegmentedMesh
-from mereo.tetrahedra import Tetrahedra
+from mereo.deformation.tetrahedral import Tetrahedra
+from mereo.geometry.mesh import Segment, SegmentedMesh
 
 SIZE = (5, 3, 3)
 """Unit cubes along x, y and z, from 0."""

@@ -5,7 +5,7 @@ from pathlib import Path
 import trimesh
 from shapes import box
 
-from mereo.mesh import Segment
+from mereo.geometry.mesh import Segment
 
 HEAD = """\
 name: bar

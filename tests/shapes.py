@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from mereo.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 
 
 def segment(mesh: trimesh.Trimesh, name: str = "part", color: int = 0) -> Segment:

@@ -6,7 +6,7 @@ import igl
 import numpy as np
 from manifold3d import Manifold, Mesh64
 
-from mereo.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh
 
 
 def solid(segment: Segment) -> Manifold:

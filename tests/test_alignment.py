@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from mereo.aligner import AlignmentNet
-from mereo.alignment import Alignment, fit_rigid
-from mereo.config import PRESETS
-from mereo.losses import rest_loss
-from mereo.network import Network
+from mereo.models.alignment_network import AlignmentNet
+from mereo.models.network import Network
+from mereo.models.rigid_alignment import Alignment, fit_rigid
+from mereo.training.config import PRESETS
+from mereo.training.losses import rest_loss
 
 TINY = PRESETS["tiny"].network
 

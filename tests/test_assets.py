@@ -16,8 +16,9 @@ import pytest
 import requests
 import trimesh
 
-from mereo import assets
-from mereo.assets import ASSETS, BUNNY_SCAN_POSES, Asset, AssetUnavailable
+from mereo.evaluation.scans import BUNNY_SCAN_POSES
+from mereo.scenes import assets
+from mereo.scenes.assets import ASSETS, Asset, AssetUnavailable
 
 CONTENT = b"OFF\n0 0 0\n"
 

@@ -12,21 +12,22 @@ from shapes import ball
 from toy_data import write_toy_dataset
 from training_runs import assert_resumes_exactly, train_in_two_processes
 
-from mereo import training, validation
-from mereo.camera import PointCloud
-from mereo.config import PRESETS, AugmentConfig, NetworkConfig, TrainConfig
-from mereo.dataset import Dataset
-from mereo.decoder import Code
-from mereo.encoders.autodecoder import Autodecoder
-from mereo.encoders.encoding import Encoding
-from mereo.evaluation import TestCase, score_cases
-from mereo.frames import truth_grid
-from mereo.mesh import SegmentedMesh
-from mereo.model import Model
-from mereo.network import Network
-from mereo.reconstruction import reconstruct
-from mereo.run import start_network
-from mereo.weights import load_model
+from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.scoring import TestCase, score_cases
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.models.config import NetworkConfig
+from mereo.models.decoder import Code
+from mereo.models.encoders.autodecoder import Autodecoder
+from mereo.models.encoders.encoding import Encoding
+from mereo.models.model import Model
+from mereo.models.network import Network
+from mereo.models.weights import load_model
+from mereo.reconstruction.pipeline import reconstruct
+from mereo.training import trainer, validation
+from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
+from mereo.training.dataset import Dataset
+from mereo.training.run_directory import start_network
 
 SMALL = TrainConfig(
     network=NetworkConfig(
@@ -91,7 +92,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """250 passes over twelve examples."""
     run = tmp_path_factory.mktemp("pairs") / "run"
-    training.train(dataset, run, SMALL)
+    trainer.train(dataset, run, SMALL)
     return run
 
 
@@ -172,10 +173,10 @@ def test_only_the_codes_of_a_batch_move_and_at_their_own_rate(dataset: Path, dat
     """Adam's first step moves every coordinate by the rate."""
     config = replace(SMALL, batch=5, code_rate=0.01, learning_rate=1e-5)
     network = start_network(config, data)
-    trainer = training.Trainer(config, data, network, tmp_path, training.Process(), torch.device("cpu"))
+    loop = trainer.Trainer(config, data, network, tmp_path, trainer.Process(), torch.device("cpu"))
     before = network.encoder.codes.detach().clone()
-    batch = next(trainer.batches())
-    trainer.train_step(batch)
+    batch = next(loop.batches())
+    loop.train_step(batch)
     moved = (network.encoder.codes.detach() - before).abs()
     assert torch.allclose(moved[batch.index], torch.tensor(0.01), rtol=1e-2)
     others = [i for i in range(12) if i not in batch.index.tolist()]
@@ -237,11 +238,11 @@ def test_the_papers_recipe() -> None:
 
 def test_what_cannot_train_an_autodecoder_is_refused(data: Dataset, dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="the loss is 'ce', but an autodecoder finds the code .* take --loss l1, ce"):
-        training.train(dataset, tmp_path / "run", replace(SMALL, loss="ce"))
+        trainer.train(dataset, tmp_path / "run", replace(SMALL, loss="ce"))
     with pytest.raises(ValueError, match="one code per training example, and augmentation .* train without"):
-        training.train(dataset, tmp_path / "run", replace(SMALL, augment=AugmentConfig(roll=True)))
+        trainer.train(dataset, tmp_path / "run", replace(SMALL, augment=AugmentConfig(roll=True)))
     with pytest.raises(ValueError, match="local_neighbors is 6, but an autodecoder has no features .*-neighbors 0"):
-        training.train(dataset, tmp_path / "run", replace(SMALL, network=replace(SMALL.network, local_neighbors=6)))
+        trainer.train(dataset, tmp_path / "run", replace(SMALL, network=replace(SMALL.network, local_neighbors=6)))
     assert not (tmp_path / "run").exists()
 
 
@@ -262,7 +263,7 @@ def test_reconstruct_and_evaluate(dataset: Path, model: Model) -> None:
 def test_distances_alone_give_one_object_and_no_miou(dataset: Path, tmp_path: Path) -> None:
     """The paper's "DeepSDF with L1"."""
     config = replace(SMALL, loss="l1", epochs=100, holdout=1)
-    model = load_model(training.train(dataset, tmp_path / "run", config))
+    model = load_model(trainer.train(dataset, tmp_path / "run", config))
     case = TestCase("pair", PointCloud(seen(dataset, 2)), truth_grid(truth(dataset, 2), 24))
     result = score_cases(model, lambda _: case, 1, progress=False)
     assert result.names == ("object",) and result.scores.iou > 0.6 and np.isnan(result.scores.miou)

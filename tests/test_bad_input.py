@@ -11,12 +11,12 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from mereo import __main__ as command_line
-from mereo.config import PRESETS
-from mereo.mesh import Segment, SegmentedMesh, check_segment
-from mereo.model import Model
-from mereo.network import Network
-from mereo.overlap import check_overlap
-from mereo.weights import load_model, save_model
+from mereo.geometry.mesh import Segment, SegmentedMesh, check_segment
+from mereo.geometry.overlap import check_overlap
+from mereo.models.model import Model
+from mereo.models.network import Network
+from mereo.models.weights import load_model, save_model
+from mereo.training.config import PRESETS
 
 
 @pytest.fixture(scope="module")

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from mereo import bench_command
-from mereo.bench import fitting
-from mereo.bench.floor import Machine, Work, count_operations
-from mereo.bench.report import table
-from mereo.bench.rival import Rival, farthest_points
-from mereo.bench.stages import Bench, Stage, needed_nodes, random_points
-from mereo.config import PRESETS
-from mereo.frames import load_frame
-from mereo.ordering import farthest_point_order
-from mereo.weights import load_model
+from mereo.cli import bench_command
+from mereo.evaluation.sample_views import load_frame
+from mereo.experiments.speed import fitted_model
+from mereo.experiments.speed.baseline import Rival, farthest_points
+from mereo.experiments.speed.report import table
+from mereo.experiments.speed.roofline import Machine, Work, count_operations
+from mereo.experiments.speed.stages import Bench, Stage, needed_nodes, random_points
+from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.models.weights import load_model
+from mereo.training.config import PRESETS
 
 MACHINE = Machine(1e11, 1e10)
 
@@ -66,10 +66,10 @@ def test_work_is_bound_by_operations_or_bytes() -> None:
 
 
 def test_a_fitted_network_knows_its_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "STEPS", 60)
-    monkeypatch.setattr(fitting, "QUERIES", 512)
+    monkeypatch.setattr(fitted_model, "STEPS", 60)
+    monkeypatch.setattr(fitted_model, "QUERIES", 512)
     frame = load_frame("rope")
-    model = fitting.fitted_model("tiny", frame)
+    model = fitted_model.fitted_model("tiny", frame)
     grid, kept = frame.truth.grid, frame.truth.kept
     cells = np.argwhere(kept & (grid.labels > 0))[::50]
     labels = model.query(model.encode(frame.depth.to_points()), grid.positions(cells)).label

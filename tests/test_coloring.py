@@ -6,21 +6,20 @@ import numpy as np
 import pytest
 from shapes import ball
 
-from mereo.camera import Camera, DepthImage
-from mereo.coloring import (
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.mesh import SegmentedMesh, vertex_normals
+from mereo.geometry.solids import Solids
+from mereo.models.model import Answer
+from mereo.visualization.vertex_colors import (
     Scale,
     confidence,
     distance_scale,
     error_scale,
     observed_distance,
     surface_error,
-    vertex_normals,
 )
-from mereo.inspection import first_hit
-from mereo.laboratory import FAR, NEAR, NOTHING, depth_picture
-from mereo.mesh import SegmentedMesh
-from mereo.model import Answer
-from mereo.solid import Solids
+from mereo.visualization.viewer.laboratory import FAR, NEAR, NOTHING, depth_picture
+from mereo.visualization.viewer.probe import first_hit
 
 GREYS = Scale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
 

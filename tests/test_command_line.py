@@ -12,10 +12,11 @@ from typing import get_args
 import pytest
 
 import mereo.__main__ as command_line
-from mereo import commands
-from mereo.config import PRESETS, GenerateConfig, PresetName, SamplingConfig
-from mereo.input_config import InputConfig
-from mereo.scene import SCENES
+from mereo.cli import commands
+from mereo.io.config import InputConfig
+from mereo.scenes.registry import SCENES
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.training.config import PRESETS, PresetName
 
 WITHOUT_NETWORK = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import mereo.__main__ as command_line
-from mereo.config import PRESETS
-from mereo.input_config import InputConfig
+from mereo.io.config import InputConfig
+from mereo.training.config import PRESETS
 
 
 @pytest.mark.parametrize(
@@ -16,29 +16,29 @@ from mereo.input_config import InputConfig
     [
         (
             "generate rope --examples 7 --seed 3 --output out --workers 2 --shard 1/4 --resume",
-            "mereo.generation",
+            "mereo.synthesis.shards",
             "generate",
             {"examples": 7, "seed": 3, "output": Path("out"), "workers": 2, "shard": (1, 4), "resume": True},
         ),
         (
             "train data --output run --preset tiny",
-            "mereo.training",
+            "mereo.training.trainer",
             "train",
             {"dataset_dir": Path("data"), "run_dir": Path("run"), "config": PRESETS["tiny"]},
         ),
         (
             "evaluate bunny --output out --examples 4 --seed 1000001",
-            "mereo.evaluation",
+            "mereo.visualization.result_files",
             "evaluate_weights",
             {"weights": "bunny", "output": Path("out"), "examples": 4, "seed": 1_000_001, "scene": None},
         ),
         (
             "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force",
-            "mereo.reconstruction",
+            "mereo.cli.reconstruct",
             "reconstruct_file",
             {"reading": InputConfig(Path("k.json"), 5000.0, Path("m.png")), "force": True},
         ),
-        ("demo --output out", "mereo.demo", "main", {"output": Path("out")}),
+        ("demo --output out", "mereo.cli.demo", "main", {"output": Path("out")}),
     ],
 )
 def test_command_calls_the_library_with_its_options(

@@ -7,8 +7,8 @@ import pytest
 import torch
 from toy_data import write_toy_dataset
 
-from mereo.config import AugmentConfig
-from mereo.dataset import Dataset, augment_batch, choose_points
+from mereo.training.config import AugmentConfig
+from mereo.training.dataset import Dataset, augment_batch, choose_points
 
 NONE = AugmentConfig()
 FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.01, roll=True)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mereo.deformation import (
+from mereo.deformation.maps import (
     Compose,
     Deformation,
     Identity,
@@ -16,7 +16,7 @@ from mereo.deformation import (
     jacobian,
     jacobian_determinant,
 )
-from mereo.skeleton import Bone, Hinge, Skeleton
+from mereo.deformation.skeleton import Bone, Hinge, Skeleton
 
 
 @pytest.mark.parametrize("name", MAKERS)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mereo.camera import Camera, PointCloud
-from mereo.depth_formats import is_depth_image
-from mereo.files import read_camera, read_depth_image, read_mask
+from mereo.geometry.camera import Camera, PointCloud
+from mereo.io.depth_formats import is_depth_image
+from mereo.io.readers import read_camera, read_depth_image, read_mask
 
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
 
@@ -140,7 +140,7 @@ def test_exr(tmp_path: Path, channels: dict[str, float]) -> None:
 
 
 def test_exr_without_its_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.depth_formats.find_spec", lambda _: None)
+    monkeypatch.setattr("mereo.io.depth_formats.find_spec", lambda _: None)
     (tmp_path / "d.exr").write_bytes(b"anything")
     with pytest.raises(ImportError, match=r"needs OpenEXR.*: pip install 'mereo\[sensors\]'"):
         read_depth_image(tmp_path / "d.exr", CAMERA)

@@ -8,12 +8,13 @@ import pytest
 from scene_files import write_mesh
 from shapes import ball, box
 
-from mereo.config import GenerateConfig, SamplingConfig
-from mereo.mesh import Segment, SegmentedMesh
-from mereo.scene import load_scene
-from mereo.scene_file import MeshWarning
-from mereo.solid import _DIRECTIONS, Solids, label_grid
-from mereo.synthesis import example_rng, synthesize
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.solids import _DIRECTIONS, Solids, label_grid
+from mereo.scenes.files.build import MeshWarning
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import synthesize
 
 WHOLE = ball((0, 0, 0), 2.0, level=3)
 

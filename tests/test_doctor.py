@@ -5,7 +5,7 @@ import sys
 import pytest
 import torch
 
-from mereo import doctor
+from mereo.cli import doctor
 
 
 def test_report_names_versions_device_and_features(capsys: pytest.CaptureFixture[str]) -> None:

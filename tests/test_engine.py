@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from solid_pairs import gap, overlapping_pairs
 
-from mereo.deformation import Deformation, jacobian_determinant
-from mereo.scene import load_scene
-from mereo.scenes import _engine_parts as parts
-from mereo.scenes import engine
+from mereo.deformation.maps import Deformation, jacobian_determinant
+from mereo.scenes.builtin import _engine_parts as parts
+from mereo.scenes.builtin import engine
+from mereo.scenes.registry import load_scene
 
 ANGLES_RAD = np.linspace(0.0, engine.CYCLE_RAD, 19)[:-1] + 0.11
 NAMES = engine.rest_mesh().names

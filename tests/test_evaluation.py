@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 from analytic import AnalyticModel, untrained
 
-from mereo import demo
-from mereo.assets import AssetUnavailable
-from mereo.camera import PointCloud
-from mereo.config import GenerateConfig
-from mereo.evaluation import (
+from mereo.cli import demo
+from mereo.evaluation.ground_truth import TruthGrid, truth_grid
+from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
+from mereo.evaluation.sample_views import DEPTH_STEP, load_frame, make_frame, save_frame
+from mereo.evaluation.scoring import (
     Evaluation,
     TestCase,
     evaluate,
-    evaluate_weights,
     grid_confusion,
     grid_scores,
     markdown_table,
@@ -23,13 +22,16 @@ from mereo.evaluation import (
     score_cases,
     trained_scene,
 )
-from mereo.frames import DEPTH_STEP, TruthGrid, load_frame, make_frame, save_frame, truth_grid
-from mereo.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.metrics import confusion_matrix, intersection_over_union
-from mereo.scene import load_scene
-from mereo.solid import Solids
-from mereo.synthesis import example_rng, sample_view
-from mereo.weights import save_model
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.models.weights import save_model
+from mereo.scenes.assets import AssetUnavailable
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
+from mereo.visualization.result_files import evaluate_weights
 
 NAMES = ("left", "right")
 

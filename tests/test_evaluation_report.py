@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from mereo.evaluation_report import write_evaluation_report
-from mereo.report import BUDGET_BYTES
+from mereo.visualization.evaluation_report import write_evaluation_report
+from mereo.visualization.reconstruction_report import BUDGET_BYTES
 
 METRICS = {
     "weights": "bunny",

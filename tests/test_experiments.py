@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from mereo.config import GenerateConfig
-from mereo.experiments.registry import EXPERIMENTS, run_experiment
-from mereo.experiments.result import Claim, Result, Row, better, markdown, published, write_result
-from mereo.experiments.scales import SCALES
-from mereo.experiments.store import Score, Store, content_key, read_score
+from mereo.experiments.paper.registry import EXPERIMENTS, run_experiment
+from mereo.experiments.paper.result import Claim, Result, Row, better, markdown, published, write_result
+from mereo.experiments.paper.scales import SCALES
+from mereo.experiments.paper.store import Score, Store, content_key, read_score
+from mereo.synthesis.config import GenerateConfig
 
 NAN = float("nan")
 

@@ -15,15 +15,15 @@ import torch
 from exported import CASES, NAMES, model_of, seen
 
 from mereo.__main__ import parse
-from mereo.commands import Export
-from mereo.config import PRESETS
-from mereo.export import ANSWERS, RUNNER, code_tensors, export_weights
-from mereo.mereo_onnx import main, prepare
-from mereo.mesh import PALETTE
-from mereo.model import Model
-from mereo.network import Network
-from mereo.ordering import farthest_point_order
-from mereo.weights import load_model, save_model
+from mereo.cli.commands import Export
+from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.geometry.mesh import PALETTE
+from mereo.models.export.mereo_onnx import main, prepare
+from mereo.models.export.onnx_export import ANSWERS, RUNNER, code_tensors, export_weights
+from mereo.models.model import Model
+from mereo.models.network import Network
+from mereo.models.weights import load_model, save_model
+from mereo.training.config import PRESETS
 
 TOLERANCE = 1e-4
 
@@ -93,7 +93,9 @@ def test_an_autodecoder_is_refused(tmp_path: Path) -> None:
 
 
 def test_missing_packages_are_named_with_their_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.export.find_spec", lambda name: None if name == "onnxscript" else object())
+    monkeypatch.setattr(
+        "mereo.models.export.onnx_export.find_spec", lambda name: None if name == "onnxscript" else object()
+    )
     with pytest.raises(ImportError, match=r"onnxscript is needed to export to ONNX: pip install 'mereo\[onnx\]'"):
         export_weights(SHIPPED, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from analytic import Distance, ball, half, logits_of, plate, union
 
-from mereo.assets import AssetUnavailable
-from mereo.evaluation import trained_scene
-from mereo.extraction import Extraction, _grid, extract, extract_dense, extract_whole, locate
-from mereo.mesh import PALETTE, Segment
-from mereo.refinement import Field, sample_coarse_to_fine, sample_dense
-from mereo.scene import load_scene
-from mereo.synthesis import GenerateConfig, example_rng, sample_view
-from mereo.weights import load_model, shipped_names
+from mereo.evaluation.scoring import trained_scene
+from mereo.geometry.mesh import PALETTE, Segment
+from mereo.models.weights import load_model, shipped_names
+from mereo.reconstruction.coarse_to_fine import Field, sample_coarse_to_fine, sample_dense
+from mereo.reconstruction.isosurfaces import Extraction, _grid, extract, extract_dense, extract_whole, locate
+from mereo.scenes.assets import AssetUnavailable
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.examples import GenerateConfig, sample_view
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 

@@ -10,9 +10,9 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mereo.camera import Camera
-from mereo.files import read_camera, read_mask, read_point_cloud, read_segmented_mesh
-from mereo.point_formats import _lzf_decompress
+from mereo.geometry.camera import Camera
+from mereo.io.point_cloud_formats import _lzf_decompress
+from mereo.io.readers import read_camera, read_mask, read_point_cloud, read_segmented_mesh
 
 POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import nn
 
-from mereo.config import PRESETS, NetworkConfig
-from mereo.folding import fold_batch_norm
-from mereo.network import Network
+from mereo.models.batch_norm_fusion import fold_batch_norm
+from mereo.models.config import NetworkConfig
+from mereo.models.network import Network
+from mereo.training.config import PRESETS
 
 SMALL = replace(PRESETS["tiny"].network, points=64)
 

@@ -16,12 +16,14 @@ import pytest
 from safetensors.numpy import load_file
 from toy_scene import toy_scene
 
-from mereo import generation, progress
-from mereo.config import TEST_SEED_START, GenerateConfig, SamplingConfig
-from mereo.dataset import Dataset
-from mereo.generation import example_bytes, generate
-from mereo.scene import Scene, load_scene
-from mereo.synthesis import Example, example_rng, synthesize
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis import progress, shards
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import Example, synthesize
+from mereo.synthesis.shards import example_bytes, generate
+from mereo.training.dataset import Dataset
 
 SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 TOY = toy_scene()
@@ -29,7 +31,7 @@ TOY = toy_scene()
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(generation, "SHARD_SIZE", 4)
+    monkeypatch.setattr(shards, "SHARD_SIZE", 4)
 
 
 def contents(directory: Path) -> dict[str, bytes]:
@@ -41,7 +43,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten examples, made in one go: shards of 4, 4 and 2."""
     output = tmp_path_factory.mktemp("whole") / "data"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generation, "SHARD_SIZE", 4)
+        patch.setattr(shards, "SHARD_SIZE", 4)
         generate(TOY, output, SMALL, examples=10, seed=3)
     return output
 
@@ -63,7 +65,7 @@ def test_killed_and_resumed_equals_uninterrupted(
         return synthesize(scene, settings, rng)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(generation, "synthesize", stops)
+        patch.setattr(shards, "synthesize", stops)
         generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3)
     complete = contents(tmp_path / "data")
     assert len(complete) == 2 + calls // 4  # manifest and template come first

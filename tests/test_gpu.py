@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from mereo import alignment
-from mereo.alignment import fit_rigid
-from mereo.bench.stages import random_points
-from mereo.frames import load_frame
-from mereo.gpu.static_frames import StaticFrames
-from mereo.model import Model
-from mereo.weights import load_model
+from mereo.evaluation.sample_views import load_frame
+from mereo.experiments.speed.stages import random_points
+from mereo.models import rigid_alignment
+from mereo.models.cuda_graphs import StaticFrames
+from mereo.models.model import Model
+from mereo.models.rigid_alignment import fit_rigid
+from mereo.models.weights import load_model
 
 KERNELS = """
 import numpy as np, torch
@@ -143,7 +143,7 @@ def test_rotation_is_the_same_from_either_decomposition(monkeypatch: pytest.Monk
     source[2, :, 2] = 0.0
     turned = source @ torch.linalg.qr(torch.randn(5, 3, 3, generator=torch.Generator().manual_seed(1)))[0] + 0.3
     expected = fit_rigid(source, turned)
-    monkeypatch.setattr(alignment, "_svd", alignment.svd3)
+    monkeypatch.setattr(rigid_alignment, "_svd", rigid_alignment.svd3)
     found = fit_rigid(source, turned)
     torch.testing.assert_close(found.rotation, expected.rotation, atol=1e-5, rtol=0)
     torch.testing.assert_close(found.shift, expected.shift, atol=1e-5, rtol=0)

@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial import cKDTree
 from solid_pairs import crowded
 
-from mereo.scene import load_scene
-from mereo.scenes import human
-from mereo.scenes._human_joints import JOINTS, NAMES, rotations, turn_limits
-from mereo.scenes._human_parts import rest_mesh
-from mereo.scenes._human_skin import PosedBody
+from mereo.scenes.builtin import human
+from mereo.scenes.builtin._human_joints import JOINTS, NAMES, rotations, turn_limits
+from mereo.scenes.builtin._human_parts import rest_mesh
+from mereo.scenes.builtin._human_skin import PosedBody
+from mereo.scenes.registry import load_scene
 
 
 @pytest.fixture(autouse=True)

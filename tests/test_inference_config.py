@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from mereo import __main__ as command_line
-from mereo.hardware import BFLOAT16_PAYS, bfloat16_gain, find_device
-from mereo.inference_config import EXACT, InferenceConfig
-from mereo.reconstruction import reconstruct_file
-from mereo.weights import load_for
+from mereo.cli.reconstruct import reconstruct_file
+from mereo.models.config import EXACT, InferenceConfig
+from mereo.models.device import BFLOAT16_PAYS, bfloat16_gain, find_device
+from mereo.models.weights import load_for
 
 CPU = InferenceConfig(device="cpu", precision="bfloat16")
 

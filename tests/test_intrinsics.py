@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.camera import Camera
-from mereo.files import read_camera, read_intrinsics
-from mereo.intrinsics import CameraWarning
+from mereo.geometry.camera import Camera
+from mereo.io.intrinsics import CameraWarning
+from mereo.io.readers import read_camera, read_intrinsics
 
 K = [[525.0, 0.0, 319.5], [0.0, 520.0, 239.5], [0.0, 0.0, 1.0]]
 FLAT = [v for row in K for v in row]

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.camera import Camera, DepthImage, PointCloud
-from mereo.evaluation import grid_scores
-from mereo.input_config import IsolationConfig
-from mereo.isolation import clusters, isolate
-from mereo.plane import largest_plane
-from mereo.scans import SCANS, scan_in_camera
-from mereo.thinning import spacing, thin_to_grid
-from mereo.weights import load_model
+from mereo.evaluation.scans import SCANS, scan_in_camera
+from mereo.evaluation.scoring import grid_scores
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.downsampling import spacing, thin_to_grid
+from mereo.geometry.plane_fitting import largest_plane
+from mereo.models.weights import load_model
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.isolation import clusters, isolate
 
 
 def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from jaxtyping import Int
 
-from mereo.label_volume import is_volume, read_label_volume, segment_surfaces
-from mereo.mesh import SegmentedMesh
-from mereo.overlap import check_overlap
-from mereo.scene import load_scene
-from mereo.solid import Solids
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.overlap import check_overlap
+from mereo.geometry.solids import Solids
+from mereo.io.label_volumes import is_volume, read_label_volume, segment_surfaces
+from mereo.scenes.registry import load_scene
 
 nibabel = pytest.importorskip("nibabel")
 nrrd = pytest.importorskip("nrrd")

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from toy_scene import toy_scene
 
-from mereo.evaluation import grid_scores
-from mereo.frame import transform_points
-from mereo.freedoms import freedoms, random_state, set_value
-from mereo.laboratory import CameraPlace, Laboratory
-from mereo.scene import Workspace, load_scene
-from mereo.weights import load_model
+from mereo.evaluation.scoring import grid_scores
+from mereo.geometry.transforms import transform_points
+from mereo.models.weights import load_model
+from mereo.scenes.parameters import parameters, random_state, set_value
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Workspace
+from mereo.visualization.viewer.laboratory import CameraPlace, Laboratory
 
 
 def test_the_camera_stands_where_its_place_says_and_sees_the_state() -> None:
@@ -44,7 +45,7 @@ def test_pictures_do_not_flicker_and_follow_a_slider() -> None:
     played, place = random_state(laboratory.scene, 2), laboratory.first_place()
     first, again = (laboratory.look(played, place).depth.depth for _ in range(2))
     np.testing.assert_array_equal(first, again)
-    moved = set_value(laboratory.scene, played, freedoms(played)[-1], 0.5)
+    moved = set_value(laboratory.scene, played, parameters(played)[-1], 0.5)
     assert (laboratory.look(moved, place).depth.depth != first).any()
 
 

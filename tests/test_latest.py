@@ -4,7 +4,7 @@ import threading
 
 from browser import until
 
-from mereo.latest import LatestWins
+from mereo.visualization.viewer.latest_request import LatestWins
 
 
 def test_only_the_newest_waiting_request_is_served_and_refined() -> None:

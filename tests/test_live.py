@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mereo.camera import Camera, DepthImage
-from mereo.frame import inverse_rigid
-from mereo.freedoms import freedoms, random_state, set_value
-from mereo.input_config import InputConfig, IsolationConfig
-from mereo.live import stream_reconstructions
-from mereo.mesh import SegmentedMesh
-from mereo.output import write_camera
-from mereo.rendering import add_depth_noise, render_depth
-from mereo.scene import load_scene
-from mereo.stream_sources import frames_of
+from mereo.cli.stream import stream_reconstructions
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.transforms import inverse_rigid
+from mereo.io.atomic_files import write_camera
+from mereo.io.config import InputConfig
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.stream_sources import frames_of
+from mereo.scenes.parameters import parameters, random_state, set_value
+from mereo.scenes.registry import load_scene
+from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
 
 FRAMES, BAD, RATE_HZ = 30, 12, 30.0
 UNIT_M = 0.005
@@ -30,13 +31,13 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Segme
     folder = tmp_path_factory.mktemp("sequence")
     scene, rng = load_scene("rope"), np.random.default_rng(0)
     played = random_state(scene, 1_000_003)
-    freedom = next(f for f in freedoms(played) if f.high > f.low)
+    parameter = next(f for f in parameters(played) if f.high > f.low)
     camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
     T_camera_world = None
     truth = []
     for number in range(FRAMES):
         share = 0.3 + 0.4 * number / FRAMES
-        state = set_value(scene, played, freedom, freedom.low + share * (freedom.high - freedom.low))
+        state = set_value(scene, played, parameter, parameter.low + share * (parameter.high - parameter.low))
         mesh = scene.deform(state.deformations).mesh
         if T_camera_world is None:
             T_camera_world = inverse_rigid(scene.workspace.sample(rng, mesh.bounds.mean(axis=0)))

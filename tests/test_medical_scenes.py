@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.deformation import jacobian_determinant
-from mereo.manifold import mesh_of, solid_of
-from mereo.mesh_repair import close_holes, largest_piece
-from mereo.overlap import check_overlap
-from mereo.scene import load_scene
-from mereo.scenes import _liver_parts, skull, tumor
-from mereo.solid import Solids
+from mereo.deformation.maps import jacobian_determinant
+from mereo.geometry.manifold import mesh_of, solid_of
+from mereo.geometry.mesh_repair import close_holes, largest_piece
+from mereo.geometry.overlap import check_overlap
+from mereo.geometry.solids import Solids
+from mereo.scenes.builtin import _liver_parts, skull, tumor
+from mereo.scenes.registry import load_scene
 
 Require = Callable[[str], Path]
 

@@ -9,12 +9,12 @@ import trimesh
 from scene_files import write_bar, write_mesh
 from shapes import ball, box, knobbly_torus, segment
 
-from mereo.mesh import Segment, SegmentedMesh
-from mereo.mesh_check import examine, likely_unit
-from mereo.mesh_repair import repaired, without_overlaps
-from mereo.overlap import check_overlap, overlaps
-from mereo.scene import load_scene
-from mereo.scene_check import check_scene
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh_check import examine, likely_unit
+from mereo.geometry.mesh_repair import repaired, without_overlaps
+from mereo.geometry.overlap import check_overlap, overlaps
+from mereo.scenes.files.check import check_scene
+from mereo.scenes.registry import load_scene
 
 
 def joined(*parts: Segment) -> Segment:

@@ -10,20 +10,27 @@ from scipy.spatial import cKDTree
 from shapes import ball, box
 from toy_scene import Shear
 
-from mereo.config import GenerateConfig, SamplingConfig
-from mereo.deformation import Deformation
-from mereo.extraction import extract, extract_dense
-from mereo.frame import rigid, transform_points
-from mereo.generation import make_manifest
-from mereo.mesh import SegmentedMesh
-from mereo.overlap import check_overlap
-from mereo.ownership import owner_labels
-from mereo.query_sampling import label_uniform, nested_sort_sample, sample_queries, sort_sample, volume_uniform
-from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
-from mereo.scene import Scene
-from mereo.shading import Viewpoint, shade
-from mereo.solid import Solids, label_grid, signed_distance_and_direction
-from mereo.synthesis import example_rng, sample_view, synthesize
+from mereo.deformation.maps import Deformation
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.overlap import check_overlap
+from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
+from mereo.geometry.transforms import rigid, transform_points
+from mereo.reconstruction.isosurfaces import extract, extract_dense
+from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import sample_view, synthesize
+from mereo.synthesis.label_rules import owner_labels
+from mereo.synthesis.query_sampling import (
+    label_uniform,
+    nested_sort_sample,
+    sample_queries,
+    sort_sample,
+    volume_uniform,
+)
+from mereo.synthesis.shards import make_manifest
+from mereo.visualization.renderer import Viewpoint, shade
 
 CORE, ORGAN = ((2.0, 0.0, 0.0), 2.6), ((0.0, 0.0, 0.0), 5.0)
 """Centre and radius; the core comes as near as 0.4 to the organ's surface."""

@@ -17,14 +17,15 @@ from test_report import page_data
 from test_training import SMALL
 from toy_data import write_toy_dataset
 
-from mereo.camera import PointCloud
-from mereo.overlap import check_overlap
-from mereo.pictures import render_cloud_and_segments
-from mereo.reconstruction import Reconstruction, reconstruct, write_reconstruction
-from mereo.solid import Solids
-from mereo.training import train
-from mereo.weights import load_model, save_model
-from mereo.writers.glb import OUTER_OPACITY
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.overlap import check_overlap
+from mereo.geometry.solids import Solids
+from mereo.io.writers.glb import OUTER_OPACITY
+from mereo.models.weights import load_model, save_model
+from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.training.trainer import train
+from mereo.visualization.previews import render_cloud_and_segments
+from mereo.visualization.result_files import write_reconstruction
 
 NESTED = (("core", "organ"),)
 CENTER, RADIUS = (0.0, 0.0, 5.0), 1.0

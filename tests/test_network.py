@@ -6,11 +6,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mereo.config import PRESETS, Loss, NetworkConfig
-from mereo.decoder import FrequencyEncoding, Prediction
-from mereo.encoders.pointnet2 import PointNet2
-from mereo.losses import occupancy_loss
-from mereo.network import Network
+from mereo.models.config import NetworkConfig
+from mereo.models.decoder import FrequencyEncoding, Prediction
+from mereo.models.encoders.pointnet2 import PointNet2
+from mereo.models.network import Network
+from mereo.training.config import PRESETS, Loss
+from mereo.training.losses import occupancy_loss
 
 TINY = PRESETS["tiny"].network
 

@@ -9,13 +9,14 @@ import pytest
 from PIL import Image
 
 from mereo import __main__ as command_line
-from mereo import commands
-from mereo.camera import Camera
-from mereo.files import read_point_cloud
-from mereo.input_config import InputConfig, IsolationConfig
-from mereo.observation import read_observation, size_warning
-from mereo.output import write_camera
-from mereo.weights import load_model
+from mereo.cli import commands
+from mereo.geometry.camera import Camera
+from mereo.io.atomic_files import write_camera
+from mereo.io.config import InputConfig
+from mereo.io.readers import read_point_cloud
+from mereo.models.weights import load_model
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import read_observation, size_warning
 
 CAMERA = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
 
@@ -156,9 +157,9 @@ def test_zdf_is_an_organized_cloud_in_millimetres(tmp_path: Path) -> None:
 
 
 def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, module, library in (("a.zdf", "point_formats", "netCDF4"), ("a.mcap", "recordings", "rosbags")):
+    for name, module, library in (("a.zdf", "point_cloud_formats", "netCDF4"), ("a.mcap", "ros_recordings", "rosbags")):
         (tmp_path / name).write_bytes(b"anything")
-        monkeypatch.setattr(f"mereo.{module}.find_spec", lambda _: None)
+        monkeypatch.setattr(f"mereo.io.{module}.find_spec", lambda _: None)
         with pytest.raises(ImportError, match=rf"{name} needs {library}.*: pip install 'mereo\[sensors\]'"):
             read_observation(tmp_path / name)
 

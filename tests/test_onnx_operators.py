@@ -4,9 +4,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mereo.alignment import fit_rigid
-from mereo.onnx_operators import trilinear
-from mereo.svd import svd3
+from mereo.models.export.onnx_operators import trilinear
+from mereo.models.ops.svd import svd3
+from mereo.models.rigid_alignment import fit_rigid
 
 
 def matrices(count: int) -> torch.Tensor:

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from mereo.ordering import farthest_point_order
+from mereo.geometry.farthest_point_sampling import farthest_point_order
 
 
 def lattice(side: int) -> np.ndarray:

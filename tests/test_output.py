@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.camera import Camera
-from mereo.files import read_camera
-from mereo.output import atomic_file, new_directory, write_camera, write_json
+from mereo.geometry.camera import Camera
+from mereo.io.atomic_files import atomic_file, new_directory, write_camera, write_json
+from mereo.io.readers import read_camera
 
 INTERRUPTIONS = [ValueError("no"), KeyboardInterrupt(), SystemExit(1)]
 

@@ -7,20 +7,20 @@ import pytest
 import trimesh
 from PIL import Image
 
-from mereo.camera import Camera, DepthImage, PointCloud
-from mereo.error_pictures import OVER, UNDER, WRONG, error_grids, voxel_triangles
-from mereo.frame import rigid
-from mereo.mesh import PALETTE, Color, Segment, SegmentedMesh
-from mereo.pictures import (
-    ErrorCase,
+from mereo.evaluation.scoring import EvaluatedView
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.geometry.transforms import rigid
+from mereo.synthesis.examples import View
+from mereo.visualization.error_maps import OVER, UNDER, WRONG, error_grids, voxel_triangles
+from mereo.visualization.previews import (
     contact_sheet,
     depth_to_rgb,
     error_picture,
     render_cloud_and_segments,
     scene_preview,
 )
-from mereo.shading import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
-from mereo.synthesis import View
+from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
 
 FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 
@@ -157,7 +157,7 @@ def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -
     found[15:18, 5:15, 5:15], found[5:7, 5:15, 5:15], found[8:12, 5:15, 5:15] = 1, 0, 1
     cloud = PointCloud(np.argwhere(truth)[::7].astype(float))
     colors = [(0, 158, 115), (240, 228, 66)]
-    case = ErrorCase("box", cloud, truth, found, np.zeros(3), np.ones(3), colors)
+    case = EvaluatedView("box", cloud, truth, found, np.zeros(3), np.ones(3), colors)
     error_picture(tmp_path / "e.png", [case], size=60)
     picture = np.asarray(Image.open(tmp_path / "e.png"))
     columns = np.array_split(picture[:, 12:], 7, axis=1)
@@ -173,7 +173,7 @@ def test_an_empty_prediction_can_be_drawn(tmp_path: Path) -> None:
     truth = np.zeros((6, 6, 6), np.uint8)
     truth[2:4, 2:4, 2:4] = 1
     cloud = PointCloud(np.argwhere(truth).astype(float))
-    case = ErrorCase("none", cloud, truth, np.zeros_like(truth), np.zeros(3), np.ones(3), [PALETTE[0]])
+    case = EvaluatedView("none", cloud, truth, np.zeros_like(truth), np.zeros(3), np.ones(3), [PALETTE[0]])
     error_picture(tmp_path / "e.png", [case], size=40)
     assert (tmp_path / "e.png").stat().st_size > 500
 

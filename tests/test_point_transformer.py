@@ -13,17 +13,18 @@ from torch import Tensor
 from toy_data import NAMES, write_toy_dataset
 from training_runs import assert_resumes_exactly
 
-from mereo import training
-from mereo.camera import PointCloud
-from mereo.config import PRESETS, AugmentConfig, NetworkConfig
-from mereo.encoders.point_transformer import PointTransformer, TransitionDown, VectorAttention
-from mereo.evaluation import TestCase, score_cases
-from mereo.frames import truth_grid
-from mereo.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.neighbors import distinct_distances, nearest
-from mereo.network import Network
-from mereo.reconstruction import reconstruct
-from mereo.weights import load_model
+from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.scoring import TestCase, score_cases
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.models.config import NetworkConfig
+from mereo.models.encoders.point_transformer import PointTransformer, TransitionDown, VectorAttention
+from mereo.models.network import Network
+from mereo.models.ops.neighbors import distinct_distances, nearest
+from mereo.models.weights import load_model
+from mereo.reconstruction.pipeline import reconstruct
+from mereo.training import trainer
+from mereo.training.config import PRESETS, AugmentConfig
 
 TINY = NetworkConfig(
     encoder="point-transformer",
@@ -218,7 +219,7 @@ def half_balls(center: np.ndarray, radius: float) -> SegmentedMesh:
 def test_it_learns_and_goes_the_whole_path(dataset: Path, tmp_path: Path) -> None:
     """Train, evaluate, reconstruct: the two halves of a ball, from its front."""
     config = replace(CONFIG, epochs=24, augment=AugmentConfig())
-    model = load_model(training.train(dataset, tmp_path / "run", config))
+    model = load_model(trainer.train(dataset, tmp_path / "run", config))
     center, rng = np.array([3.0, -2.0, 150.0]), np.random.default_rng(0)
     front = rng.normal(size=(300, 3))
     front *= 8.0 / np.linalg.norm(front, axis=1, keepdims=True)

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from balls import Balls
 
-from mereo import query_sampling
-from mereo.config import SamplingConfig
-from mereo.experiments.sampling_figure import Polygons2D, read_outlines
-from mereo.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.ownership import Shape, owner_labels
-from mereo.query_sampling import (
+from mereo.experiments.paper.sampling_figure import Polygons2D, read_outlines
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.synthesis import query_sampling
+from mereo.synthesis.config import SamplingConfig
+from mereo.synthesis.label_rules import Shape, owner_labels
+from mereo.synthesis.query_sampling import (
     Samples,
     extended_boxes,
     joint_box,
@@ -21,7 +22,6 @@ from mereo.query_sampling import (
     sort_sample,
     volume_uniform,
 )
-from mereo.solid import Solids
 
 
 def square(low: float, high: float, shift: float = 0.0) -> np.ndarray:

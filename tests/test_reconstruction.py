@@ -14,20 +14,16 @@ import trimesh
 from analytic import AnalyticModel, ball, logits_of, union, untrained
 
 import mereo
-from mereo.camera import PointCloud
-from mereo.frame import inverse_rigid, transform_points
-from mereo.input_config import IsolationConfig
-from mereo.observation import SizeWarning
-from mereo.reconstruction import (
-    Frame,
-    Reconstruction,
-    reconstruct,
-    reconstruct_file,
-    summarize,
-    write_reconstruction,
-)
-from mereo.scans import scanner_to_camera
-from mereo.weights import save_model
+from mereo.cli.reconstruct import reconstruct_file
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.scanner_axes import scanner_to_camera
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.models.weights import save_model
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import SizeWarning
+from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.visualization.result_files import summarize, write_reconstruction
 
 NAMES = ("big", "small", "absent")
 BIG, SMALL = ((0.02, -0.03, 0.6), 0.06), ((0.02, 0.0605, 0.6), 0.03)
@@ -46,7 +42,7 @@ def two_balls(points: np.ndarray) -> np.ndarray:
     return 200.0 * logits_of(ball(*BIG), ball(*SMALL), nowhere)(points)
 
 
-def scene(frame: Frame) -> tuple[np.ndarray, AnalyticModel]:
+def scene(frame: CloudAxes) -> tuple[np.ndarray, AnalyticModel]:
     """The two balls as given in ``frame``, and a model that knows them in the camera frame that is made of it."""
     if frame == "camera":
         return np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)]), AnalyticModel.of(two_balls, NAMES)
@@ -56,12 +52,12 @@ def scene(frame: Frame) -> tuple[np.ndarray, AnalyticModel]:
 
 
 @pytest.fixture(scope="module", params=["camera", "scanner"])
-def found(request: pytest.FixtureRequest) -> tuple[Frame, np.ndarray, Reconstruction]:
+def found(request: pytest.FixtureRequest) -> tuple[CloudAxes, np.ndarray, Reconstruction]:
     cloud, model = scene(request.param)
     return request.param, cloud, reconstruct(cloud, model, resolution=48, frame=request.param)
 
 
-def test_labels_are_the_fields_at_their_positions(found: tuple[Frame, np.ndarray, Reconstruction]) -> None:
+def test_labels_are_the_fields_at_their_positions(found: tuple[CloudAxes, np.ndarray, Reconstruction]) -> None:
     """Grid, origin and spacing are in the input's frame: every voxel has the label of its own place."""
     grid = found[2].labels
     index = np.indices(grid.labels.shape).reshape(3, -1).T
@@ -70,7 +66,7 @@ def test_labels_are_the_fields_at_their_positions(found: tuple[Frame, np.ndarray
     assert grid.names == NAMES and not found[2].clipped
 
 
-def test_segments_are_where_they_are(found: tuple[Frame, np.ndarray, Reconstruction]) -> None:
+def test_segments_are_where_they_are(found: tuple[CloudAxes, np.ndarray, Reconstruction]) -> None:
     for segment, surface, (center, radius) in zip(
         found[2].segments, found[2].surfaces.segments, (BIG, SMALL), strict=False
     ):
@@ -83,7 +79,7 @@ def test_segments_are_where_they_are(found: tuple[Frame, np.ndarray, Reconstruct
         np.testing.assert_allclose(surface.bounds, segment.box, atol=1e-9)
 
 
-def test_an_absent_segment_is_listed(found: tuple[Frame, np.ndarray, Reconstruction]) -> None:
+def test_an_absent_segment_is_listed(found: tuple[CloudAxes, np.ndarray, Reconstruction]) -> None:
     absent = found[2].segments[2]
     assert (absent.name, absent.volume, absent.voxels, absent.components) == ("absent", 0.0, 0, 0)
     assert np.isnan(absent.confidence) and np.isnan(absent.box).all()
@@ -119,7 +115,7 @@ def test_the_unit_of_the_cloud_does_not_matter() -> None:
         assert 1024.0**3 * a.volume == pytest.approx(b.volume, rel=1e-9)
 
 
-def test_files(found: tuple[Frame, np.ndarray, Reconstruction], tmp_path: Path) -> None:
+def test_files(found: tuple[CloudAxes, np.ndarray, Reconstruction], tmp_path: Path) -> None:
     frame, cloud, result = found
     write_reconstruction(result, PointCloud(cloud), tmp_path / "out", frame=frame, title="two balls")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
@@ -145,7 +141,7 @@ def test_files(found: tuple[Frame, np.ndarray, Reconstruction], tmp_path: Path) 
     np.testing.assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
 
 
-def test_an_existing_result_is_kept(found: tuple[Frame, np.ndarray, Reconstruction], tmp_path: Path) -> None:
+def test_an_existing_result_is_kept(found: tuple[CloudAxes, np.ndarray, Reconstruction], tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/mine.txt").write_text("keep")
     with pytest.raises(FileExistsError, match="choose another --output or pass --force"):
@@ -157,7 +153,7 @@ def test_from_file_to_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cloud, model = scene("camera")
-    monkeypatch.setattr("mereo.reconstruction.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: model)
     np.save(tmp_path / "cloud.npy", cloud)
     result = reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "out", resolution=16)
     assert summarize(result)["segments"][0]["name"] == "big"
@@ -173,7 +169,7 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     """Strays beside the object are pointed out, and left out when asked; the summary says so."""
     cloud, model = scene("camera")
     np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
-    monkeypatch.setattr("mereo.reconstruction.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
+    monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
     read = partial(reconstruct_file, tmp_path / "cloud.npy", "any", resolution=16)
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
         read(output=tmp_path / "crowded")

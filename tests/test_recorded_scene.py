@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scene_files import write_bar
 
-from mereo.config import TEST_SEED_START
-from mereo.mesh_files import read_segmented_mesh
-from mereo.scene import load_scene
-from mereo.scene_check import check_scene
+from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.scenes.files.check import check_scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START
 
 FRAMES = 10
 

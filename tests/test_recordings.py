@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mereo.camera import Camera, DepthImage
-from mereo.files import read_intrinsics
-from mereo.input_config import InputConfig
-from mereo.intrinsics import CameraWarning
-from mereo.observation import read_observation
-from mereo.recordings import recorded_frame, recorded_frames
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.io.config import InputConfig
+from mereo.io.intrinsics import CameraWarning
+from mereo.io.readers import read_intrinsics
+from mereo.io.ros_recordings import recorded_frame, recorded_frames
+from mereo.reconstruction.observation import read_observation
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")
 

@@ -7,11 +7,11 @@ import pytest
 from align_cases import object_at_rest, perturbed, pose_error, scan_of, true_poses
 from shapes import ball
 
-from mereo.frame import transform_points
-from mereo.mesh import SegmentedMesh
-from mereo.placement import Placement, Start, _check_runaway, place
-from mereo.registration import Matches, Registration, icp, load_icp
-from mereo.scan_surface import exposed, moved
+from mereo.evaluation.registration.icp import Matches, Registration, icp, load_icp
+from mereo.evaluation.registration.placement import Placement, Start, _check_runaway, place
+from mereo.evaluation.registration.visible_surface import exposed, moved
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.transforms import transform_points
 
 pytest.importorskip("small_gicp", reason="the extra align is not installed")
 

@@ -11,8 +11,8 @@ import torch
 from safetensors.torch import load_file
 
 from mereo import __main__ as command_line
-from mereo.release import card, release
-from mereo.weights import PACKED, _pack, _unpack, find_weights, load_model, save_model, shipped_names
+from mereo.models.weights import PACKED, _pack, _unpack, find_weights, load_model, save_model, shipped_names
+from mereo.training.model_card import card, release
 
 TEST = {
     "seed": 1_000_000,

@@ -13,9 +13,9 @@ from browser import BROWSER
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from mereo.camera import PointCloud
-from mereo.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.report import BUDGET_BYTES, cluster, write_report
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.visualization.reconstruction_report import BUDGET_BYTES, cluster, write_report
 
 
 def ball(name: str, shift: float, color: tuple[int, int, int], level: int = 3) -> Segment:

@@ -11,14 +11,15 @@ import trimesh
 from analytic import AnalyticModel, ball, logits_of
 
 from mereo.__main__ import main, parse
-from mereo.camera import PointCloud
-from mereo.commands import Reconstruct
-from mereo.measurement import segment_points
-from mereo.mesh import PALETTE
-from mereo.reconstruction import Reconstruction, reconstruct, write_reconstruction
-from mereo.writers import FilesConfig
-from mereo.writers.formats import WRITERS, Results, chosen_formats, write_formats
-from mereo.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.cli.commands import Reconstruct
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import PALETTE
+from mereo.io.config import FilesConfig
+from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
+from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.reconstruction.segment_statistics import segment_points
+from mereo.visualization.result_files import write_reconstruction
 
 NAMES = ("big", "small")
 BIG, SMALL = ((0.1, 0.2, 0.5), 0.06), ((0.1, 0.2905, 0.5), 0.03)

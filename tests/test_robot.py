@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from solid_pairs import gap, overlapping_pairs
 
-from mereo.deformation import jacobian
-from mereo.mesh import SegmentedMesh
-from mereo.scene import State, load_scene
-from mereo.scenes import _robot_parts as parts
-from mereo.scenes import robot
+from mereo.deformation.maps import jacobian
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.scenes.builtin import _robot_parts as parts
+from mereo.scenes.builtin import robot
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import State
 
 LINKS = ("base", "column", "upper_arm", "elbow", "forearm", "wrist", "hand")
 

@@ -5,12 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mereo.deformation import jacobian_determinant
-from mereo.mesh import SegmentedMesh
-from mereo.overlap import check_overlap
-from mereo.scene import load_scene
-from mereo.scenes import rope
-from mereo.solid import Solids
+from mereo.deformation.maps import jacobian_determinant
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.overlap import check_overlap
+from mereo.geometry.solids import Solids
+from mereo.scenes.builtin import rope
+from mereo.scenes.registry import load_scene
 
 STATES = 100
 

@@ -8,8 +8,8 @@ import pytest
 from align_cases import object_at_rest
 from scipy.spatial.transform import Rotation
 
-from mereo.frame import rigid, transform_points
-from mereo.rough_start import pose_of_pairs, read_start
+from mereo.evaluation.registration.initial_poses import pose_of_pairs, read_start
+from mereo.geometry.transforms import rigid, transform_points
 
 SCALE = 2.5
 TURN = Rotation.from_euler("xyz", [20, -30, 50], degrees=True).as_matrix()

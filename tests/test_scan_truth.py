@@ -11,20 +11,22 @@ import pytest
 from align_cases import bar_scan, perturbed, pose_error
 from analytic import AnalyticModel
 
-from mereo import assets
 from mereo.__main__ import main
-from mereo.mesh import SegmentedMesh
-from mereo.mesh_files import read_segmented_mesh
-from mereo.metrics import Scores
-from mereo.placement import Start, place
-from mereo.rough_start import start_from_model
-from mereo.scan_evaluation import evaluate_scans
-from mereo.scan_surface import moved
-from mereo.scan_truth import read_truth
-from mereo.scans import SCANS, bunny_posed, bunny_scan
-from mereo.scene import Scene, load_scene
-from mereo.solid import Solids
-from mereo.weights import load_model
+from mereo.evaluation.metrics import Scores
+from mereo.evaluation.registration.initial_poses import start_from_model
+from mereo.evaluation.registration.placement import Start, place
+from mereo.evaluation.registration.truth_file import read_truth
+from mereo.evaluation.registration.visible_surface import moved
+from mereo.evaluation.scan_scoring import evaluate_scans
+from mereo.evaluation.scans import SCANS, bunny_posed, bunny_scan
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.models.weights import load_model
+from mereo.scenes import assets
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.visualization.result_files import evaluate_on_scans
 
 pytest.importorskip("small_gicp", reason="the extra align is not installed")
 
@@ -69,7 +71,7 @@ def oracle(folder: Path, shift_mm: float) -> Scores:
     truth = read_truth(folder / "truth").truth
     solids, shift = Solids(truth), np.array([shift_mm, 0.0, 0.0])
     model = AnalyticModel.of(lambda points: 5.0 * np.eye(3)[solids.label(points - shift)], truth.names)
-    evaluation = evaluate_scans(model, folder / f"test{shift_mm}", truths=[folder / "truth"], cells=20)
+    evaluation = evaluate_on_scans(model, folder / f"test{shift_mm}", truths=[folder / "truth"], cells=20)
     assert list(evaluation.examples) == ["truth"]
     written = json.loads((folder / f"test{shift_mm}/metrics.json").read_text())
     assert written["iou"] == evaluation.scores.iou and written["scans"] == ["truth"]
@@ -155,14 +157,14 @@ TOLERANCE = {"body": (0.25, 0.4), "tail": (0.7, 2.0)} | dict.fromkeys(("head", "
 
 def bunny_scale() -> float:
     """Metres per scene unit."""
-    from mereo.scenes.bunny import model_to_scene
+    from mereo.scenes.builtin.bunny import model_to_scene
 
     return 1 / model_to_scene()[1]
 
 
 def bunny_truth_pose(name: str) -> tuple[SegmentedMesh, np.ndarray]:
     """The bunny at rest, and its published pose in a scan."""
-    from mereo.scenes.bunny import model_to_scene
+    from mereo.scenes.builtin.bunny import model_to_scene
 
     T_model_scene = np.diag([bunny_scale()] * 3 + [1.0])
     T_model_scene[:3, 3] = model_to_scene()[0]

@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.frame import Normalizer, inverse_rigid, transform_points
-from mereo.scans import SCANS, VIEW_DISTANCE, bunny_scan, bunny_truth, scan_in_camera, scanner_to_camera
-from mereo.solid import Solids
+from mereo.evaluation.scans import SCANS, bunny_scan, bunny_truth, scan_in_camera
+from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.scanner_axes import VIEW_DISTANCE, scanner_to_camera
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid, transform_points
 
 Require = Callable[[str], Path]
 

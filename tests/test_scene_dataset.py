@@ -9,9 +9,9 @@ from scene_files import write_bar, write_mesh
 from shapes import ball
 from test_scene_file import CODE
 
-from mereo.config import GenerateConfig, SamplingConfig
-from mereo.evaluation import trained_scene
-from mereo.generation import generate
+from mereo.evaluation.scoring import trained_scene
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.shards import generate
 
 SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 

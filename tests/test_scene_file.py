@@ -10,12 +10,12 @@ import trimesh
 from scene_files import HEAD, write_bar, write_mesh
 from shapes import ball, box
 
-from mereo.deformation import jacobian_determinant
-from mereo.mesh import PALETTE
-from mereo.random_motion import RandomMotion
-from mereo.scene import SCENES, load_scene
-from mereo.scene_schema import Deformation, SceneFile
-from mereo.warps import FreeFormLattice
+from mereo.deformation.maps import jacobian_determinant
+from mereo.deformation.samplers import RandomMotion
+from mereo.deformation.warps import FreeFormLattice
+from mereo.geometry.mesh import PALETTE
+from mereo.scenes.files.schema import Deformation, SceneFile
+from mereo.scenes.registry import SCENES, load_scene
 
 EVERYTHING = """
 deformations:
@@ -186,10 +186,10 @@ def test_unknown_names_say_what_a_file_would_be() -> None:
 # --- Python -----------------------------------------------------------------------------------------------------------
 
 CODE = """
-from mereo.deformation import Identity
-from mereo.mesh import SegmentedMesh
-from mereo.mesh_files import read_segmented_mesh
-from mereo.scene import Scene
+from mereo.deformation.maps import Identity
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.scenes.scene import Scene
 
 def still(rng):
     return (Identity(),)

@@ -11,11 +11,11 @@ from shapes import ball, box
 from test_label_volume import halves, write_nifti
 
 import mereo.__main__ as command_line
-from mereo.camera import Camera
-from mereo.frame import inverse_rigid, transform_points
-from mereo.random_motion import RandomMotion
-from mereo.scene import SCENES, load_scene
-from mereo.scene_new import identifier, write_scene_file
+from mereo.deformation.samplers import RandomMotion
+from mereo.geometry.camera import Camera
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.scenes.files.template import identifier, write_scene_file
+from mereo.scenes.registry import SCENES, load_scene
 
 
 def uncommented(text: str) -> str:

@@ -8,10 +8,11 @@ import pytest
 from PIL import Image
 from toy_scene import toy_scene
 
-from mereo import scene_pictures
-from mereo.scene import SCENES, Scene
-from mereo.scene_commands import ScenePreview
-from mereo.scene_pictures import SIZE, preview_all, scene_row
+from mereo.cli.scene_commands import ScenePreview
+from mereo.scenes.registry import SCENES
+from mereo.scenes.scene import Scene
+from mereo.visualization import scene_previews
+from mereo.visualization.scene_previews import SIZE, preview_all, scene_row
 
 
 def toy(name: str) -> Scene:
@@ -23,7 +24,7 @@ def colored(picture: np.ndarray) -> np.ndarray:
 
 
 def test_every_scene_has_a_view() -> None:
-    assert set(scene_pictures.VIEWS) == set(SCENES)
+    assert set(scene_previews.VIEWS) == set(SCENES)
 
 
 def test_a_row_is_three_states_at_one_scale_and_a_depth_image() -> None:
@@ -50,8 +51,8 @@ def test_the_sheet_has_a_row_of_four_for_every_scene(monkeypatch: pytest.MonkeyP
         loaded.append(name)
         return toy(name)
 
-    monkeypatch.setattr(scene_pictures, "load_scene", load)
-    monkeypatch.setattr(scene_pictures, "SCENES", ("robot", "sheet", "tumor"))
+    monkeypatch.setattr(scene_previews, "load_scene", load)
+    monkeypatch.setattr(scene_previews, "SCENES", ("robot", "sheet", "tumor"))
     preview_all(tmp_path / "all.png", seed=2)
     assert loaded == ["robot", "sheet", "tumor"]
     picture = np.asarray(Image.open(tmp_path / "all.png"))

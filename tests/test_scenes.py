@@ -9,15 +9,17 @@ import pytest
 from scipy.spatial import ConvexHull, cKDTree
 from solid_pairs import crowded
 
-from mereo.camera import Camera
-from mereo.config import MIN_POINTS, GenerateConfig
-from mereo.deformation import invert, jacobian_determinant
-from mereo.frame import inverse_rigid, transform_points
-from mereo.mesh import SegmentedMesh
-from mereo.overlap import check_overlap
-from mereo.rendering import render_depth
-from mereo.scene import SCENES, Scene, State, Workspace, load_scene, look_at
-from mereo.solid import Solids, label_grid
+from mereo.deformation.maps import invert, jacobian_determinant
+from mereo.geometry.camera import Camera
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.overlap import check_overlap
+from mereo.geometry.solids import Solids, label_grid
+from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
+from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.scene import Scene, State, Workspace
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.depth_rendering import render_depth
 
 STATES, MANY_STATES, CAMERAS = 12, 200, 50
 

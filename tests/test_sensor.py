@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from shapes import ball, box, one
 
-from mereo.camera import Camera
-from mereo.config import SENSORS, SensorConfig
-from mereo.mesh import SegmentedMesh
-from mereo.rendering import add_depth_noise, render_depth
-from mereo.sensor import (
-    Observation,
+from mereo.geometry.camera import Camera
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.synthesis.config import SENSOR_TERMS, SENSORS, SensorConfig, SensorModel
+from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
+from mereo.synthesis.depth_sensor import (
+    SimulatedView,
     axial_std_m,
     check_sensor,
     dropout_probability,
@@ -23,8 +24,6 @@ from mereo.sensor import (
     sample_mask,
     smooth_field,
 )
-from mereo.sensor_config import SENSOR_TERMS, SensorModel
-from mereo.solid import Solids
 
 CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
 RAYS = CAMERA.directions()
@@ -47,7 +46,7 @@ def slant(tilt_deg: float) -> np.ndarray:
     return np.arccos(np.abs(RAYS @ normal) / np.linalg.norm(RAYS, axis=-1))
 
 
-def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object) -> Observation:
+def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object) -> SimulatedView:
     return observe(solids, CAMERA, noise_std, replace(OFF, **terms), np.random.default_rng(seed))  # type: ignore[arg-type]
 
 

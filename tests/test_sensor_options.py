@@ -10,12 +10,12 @@ import pytest
 from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
-from mereo import commands, evaluation
-from mereo.config import SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
-from mereo.evaluation import evaluate_weights
-from mereo.generation import generate
-from mereo.sensor import check_sensor
-from mereo.sensor_config import SENSOR_TERMS
+from mereo.cli import commands
+from mereo.evaluation import scoring
+from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
+from mereo.synthesis.depth_sensor import check_sensor
+from mereo.synthesis.shards import generate
+from mereo.visualization.result_files import evaluate_weights
 
 SMALL = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
 BASICS = "generate rope --examples 7 --output out"
@@ -110,8 +110,8 @@ def test_evaluation_looks_through_the_sensor_and_says_so(tmp_path: Path, monkeyp
         clouds.append(arguments[1])
         return predict(*arguments)
 
-    predict = evaluation.predict_grid
-    monkeypatch.setattr(evaluation, "predict_grid", watch)
+    predict = scoring.predict_grid
+    monkeypatch.setattr(scoring, "predict_grid", watch)
     for number, settings in enumerate((None, GenerateConfig(noise_std=0.5, sensor=SENSORS["structured-light"]))):
         evaluate_weights("rope", tmp_path / str(number), examples=1, cells=12, settings=settings)
     facts = [json.loads((tmp_path / str(number) / "metrics.json").read_text()) for number in range(2)]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from solid_pairs import crowded
 
-from mereo.deformation import Deformation, jacobian
-from mereo.scene import load_scene
-from mereo.scenes import sheet
-from mereo.scenes._sheet_parts import THICKNESS, middle_points
+from mereo.deformation.maps import Deformation, jacobian
+from mereo.scenes.builtin import sheet
+from mereo.scenes.builtin._sheet_parts import THICKNESS, middle_points
+from mereo.scenes.registry import load_scene
 
 
 def underside_share(deformation: Deformation) -> float:

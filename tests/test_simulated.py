@@ -10,16 +10,17 @@ from lattice import SIZE, boxes, lattice, states
 from shapes import ball
 from toy_scene import toy_scene
 
-from mereo import generation
-from mereo.config import TEST_SEED_START, GenerateConfig, SamplingConfig
-from mereo.deformation import invert, jacobian_determinant
-from mereo.evaluation import evaluate
-from mereo.generation import generate
-from mereo.scene import Scene
-from mereo.simulated import load_states
-from mereo.state_files import TetrahedralRecord, read_states
-from mereo.surface_states import Surface, SurfaceMap
-from mereo.tetrahedra import Tetrahedra, TetrahedralMap
+from mereo.deformation.maps import invert, jacobian_determinant
+from mereo.deformation.surface_driven import Surface, SurfaceMap
+from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
+from mereo.evaluation.scoring import evaluate
+from mereo.io.simulation_states import TetrahedralRecord, read_states
+from mereo.scenes.recorded_states import load_states
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis import shards
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.shards import generate
 
 SHIPPED = Path(__file__).parents[1] / "src/mereo/states/liver.npz"
 
@@ -133,7 +134,7 @@ def test_the_last_tenth_of_the_frames_is_for_testing(tmp_path: Path) -> None:
 def test_generation_and_evaluation_take_held_out_states_for_test_seeds_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(generation, "rest_distances", lambda rest: np.zeros((4, 2, 2, 2), dtype=np.float16))  # slow
+    monkeypatch.setattr(shards, "rest_distances", lambda rest: np.zeros((4, 2, 2, 2), dtype=np.float16))  # slow
 
     def forbidden(rng: np.random.Generator) -> tuple:
         raise AssertionError("drawn from the wrong states")

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from shapes import ball, box, knobbly_torus, one, segment
 
-from mereo.mesh import Segment, SegmentedMesh
-from mereo.overlap import check_overlap
-from mereo.solid import Solids, label_grid, signed_distance_and_direction
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.overlap import check_overlap
+from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
 
 
 def convex_polyhedron(seed: int) -> tuple[Segment, np.ndarray, np.ndarray]:

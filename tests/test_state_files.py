@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from lattice import boxes, lattice, states
 
-from mereo.simulated import load_states
-from mereo.tetrahedra import TetrahedralMap
+from mereo.deformation.tetrahedral import TetrahedralMap
+from mereo.scenes.recorded_states import load_states
 
 SCALE, SHIFT = 0.5, (1.0, -2.0, 3.0)
 """From the files' coordinates to those of the scene, in which ``boxes`` are."""

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from mereo.camera import PointCloud
-from mereo.stream import Counter, StreamFrame, stream
+from mereo.geometry.camera import PointCloud
+from mereo.reconstruction.stream import Counter, StreamFrame, stream
 
 
 def frame(number: int, time_s: float = 0.0) -> StreamFrame:

@@ -9,12 +9,12 @@ import pytest
 import trimesh
 from written_results import CENTER, COLORS, NAMES, SIDES, segments
 
-from mereo.files import read_segmented_mesh
-from mereo.mesh import SegmentedMesh
-from mereo.writers.glb import write_segments_glb
-from mereo.writers.obj import write_segments_obj
-from mereo.writers.ply import write_segments_ply
-from mereo.writers.stl import stl_name, write_segments_stl
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.readers import read_segmented_mesh
+from mereo.io.writers.glb import write_segments_glb
+from mereo.io.writers.obj import write_segments_obj
+from mereo.io.writers.ply import write_segments_ply
+from mereo.io.writers.stl import stl_name, write_segments_stl
 
 BOX = np.stack([CENTER - SIDES / 2, CENTER + SIDES / 2])
 
@@ -134,7 +134,7 @@ def test_half_an_obj_never_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("mereo.writers.obj._object", full)
+    monkeypatch.setattr("mereo.io.writers.obj._object", full)
     with pytest.raises(OSError, match="disk is full"):
         write_segments_obj(tmp_path / "s.obj", segments())
     assert list(tmp_path.iterdir()) == [], "its material library neither"

@@ -8,14 +8,16 @@ import trimesh
 from shapes import ball, box, one, segment
 from toy_scene import toy_scene
 
-from mereo.camera import Camera
-from mereo.config import MIN_POINTS, SENSORS, GenerateConfig, SamplingConfig, SensorConfig
-from mereo.mesh import Segment, SegmentedMesh
-from mereo.rays import first_hits
-from mereo.sensor import Observation, observe
-from mereo.solid import Solids
-from mereo.surroundings import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
-from mereo.synthesis import example_rng, sample_view, synthesize
+from mereo.geometry.camera import Camera
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.raycasting import first_hits
+from mereo.geometry.solids import Solids
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
+from mereo.synthesis.config import SENSORS, GenerateConfig, SamplingConfig, SensorConfig
+from mereo.synthesis.depth_sensor import SimulatedView, observe
+from mereo.synthesis.examples import sample_view, synthesize
 
 CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
 RAYS = CAMERA.directions().reshape(-1, 3)
@@ -24,7 +26,7 @@ SCENE = toy_scene()
 PAIR = Solids(SegmentedMesh((ball((-5, 0, 150), 15.0), box((12, -15, 140), (30, 15, 165), color=1))))
 
 
-def look(seed: int, solids: Solids = PAIR, **terms: float) -> Observation:
+def look(seed: int, solids: Solids = PAIR, **terms: float) -> SimulatedView:
     return observe(solids, CAMERA, 0.0, replace(OFF, **terms), np.random.default_rng(seed))
 
 

@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from toy_scene import rest_mesh, sample_deformations, toy_scene
 
-from mereo.config import MIN_POINTS, GenerateConfig, SamplingConfig
-from mereo.frame import inverse_rigid, rigid, transform_points
-from mereo.mesh import SegmentedMesh
-from mereo.scene import Scene, Workspace
-from mereo.solid import Solids
-from mereo.synthesis import Example, View, _rest_guess, example_rng, sample_view, synthesize
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import Example, View, _rest_guess, sample_view, synthesize
 
 SETTINGS = GenerateConfig(sampling=SamplingConfig(per_segment=128))
 SCENE = toy_scene()

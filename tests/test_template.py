@@ -8,14 +8,16 @@ import torch
 from shapes import one
 from toy_scene import toy_scene
 
-from mereo.config import PRESETS, GenerateConfig, SamplingConfig
-from mereo.dataset import Dataset
-from mereo.generation import generate
-from mereo.mesh import SegmentedMesh
-from mereo.network import Network
-from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
-from mereo.synthesis import example_rng, synthesize
-from mereo.template import RestLookup
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.models.network import Network
+from mereo.models.template_lookup import RestLookup
+from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import synthesize
+from mereo.synthesis.shards import generate
+from mereo.training.config import PRESETS
+from mereo.training.dataset import Dataset
 
 TINY = PRESETS["tiny"].network
 AXIS = torch.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)

@@ -14,10 +14,10 @@ from safetensors.torch import load_file
 from toy_data import NAMES, write_toy_dataset
 from training_runs import assert_resumes_exactly, train_in_two_processes
 
-from mereo import training
-from mereo.config import PRESETS, AugmentConfig, TrainConfig
-from mereo.run import claim_run, start_network
-from mereo.weights import load_model
+from mereo.models.weights import load_model
+from mereo.training import trainer
+from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
+from mereo.training.run_directory import claim_run, start_network
 
 SMALL = replace(
     PRESETS["tiny"],
@@ -40,38 +40,38 @@ def test_killed_and_resumed_equals_uninterrupted(dataset: Path, tmp_path: Path) 
 
 
 def test_a_finished_run_is_left_alone(dataset: Path, tmp_path: Path) -> None:
-    first = training.train(dataset, tmp_path / "run", SMALL).read_bytes()
-    assert training.train(dataset, tmp_path / "run", SMALL).read_bytes() == first
+    first = trainer.train(dataset, tmp_path / "run", SMALL).read_bytes()
+    assert trainer.train(dataset, tmp_path / "run", SMALL).read_bytes() == first
 
 
 def test_other_settings_do_not_continue_a_run(dataset: Path, tmp_path: Path) -> None:
-    training.train(dataset, tmp_path / "run", SMALL)
+    trainer.train(dataset, tmp_path / "run", SMALL)
     with pytest.raises(ValueError, match=r"another train setting learning_rate \(0\.004 instead of 0\.1\)"):
-        training.train(dataset, tmp_path / "run", replace(SMALL, learning_rate=0.1))
+        trainer.train(dataset, tmp_path / "run", replace(SMALL, learning_rate=0.1))
 
 
 def test_a_run_of_an_older_mereo_is_continued(dataset: Path, tmp_path: Path) -> None:
     """It does not state the settings that came later, and their defaults are what it did."""
-    first = training.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes()
+    first = trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes()
     path = tmp_path / "run" / "config.json"
     settings = json.loads(path.read_text())
     del settings["train"]["network"]["encoder"], settings["train"]["network"]["dropout"], settings["train"]["init"]
     path.write_text(json.dumps(settings))
-    assert training.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes() == first
+    assert trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes() == first
     with pytest.raises(ValueError, match="another train setting network"):
         other = replace(SMALL.network, encoder="point-transformer")
-        training.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2, network=other))
+        trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2, network=other))
 
 
 def test_a_directory_with_other_things_is_not_a_run(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(FileExistsError, match="exists and is not a training run"):
-        training.train(dataset, tmp_path, SMALL)
+        trainer.train(dataset, tmp_path, SMALL)
     assert os.listdir(tmp_path) == ["thesis.tex"]
 
 
 def test_run_directory_tells_the_story(dataset: Path, tmp_path: Path) -> None:
-    training.train(dataset, tmp_path / "run", SMALL)
+    trainer.train(dataset, tmp_path / "run", SMALL)
     with (tmp_path / "run" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["step"]) for row in rows] == list(range(1, 16))  # 58 examples, batches of 8, two passes
@@ -85,7 +85,7 @@ def test_run_directory_tells_the_story(dataset: Path, tmp_path: Path) -> None:
 
 
 def test_class_offsets_are_in_the_last_bias_and_nowhere_else(dataset: Path, tmp_path: Path) -> None:
-    weights = load_model(training.train(dataset, tmp_path / "run", SMALL))
+    weights = load_model(trainer.train(dataset, tmp_path / "run", SMALL))
     offsets = weights.provenance["class_offsets"]
     assert isinstance(offsets, list) and len(offsets) == 3 and offsets[0] == 0
     average = load_file(tmp_path / "run" / "checkpoint.safetensors")
@@ -97,18 +97,18 @@ def test_class_offsets_are_in_the_last_bias_and_nowhere_else(dataset: Path, tmp_
 
 
 def test_batches_visit_every_example_once_per_pass(dataset: Path, tmp_path: Path) -> None:
-    data = training.Dataset.load(dataset)
+    data = trainer.Dataset.load(dataset)
     config = replace(SMALL, holdout=4, epochs=4)
     network = start_network(config, data)
-    trainer = training.Trainer(config, data, network, tmp_path, training.Process(), torch.device("cpu"))
-    seen = torch.cat([trainer._batch_index(step) for step in range(trainer.total)])
-    assert trainer.total * 8 == 4 * 60
+    loop = trainer.Trainer(config, data, network, tmp_path, trainer.Process(), torch.device("cpu"))
+    seen = torch.cat([loop._batch_index(step) for step in range(loop.total)])
+    assert loop.total * 8 == 4 * 60
     assert torch.equal(seen.bincount(), torch.full((60,), 4))
 
 
 def test_it_learns_the_two_halves(dataset: Path, tmp_path: Path) -> None:
     """Thirty passes over 58 examples suffice to beat any constant answer by far."""
-    training.train(dataset, tmp_path / "run", replace(SMALL, epochs=40, augment=AugmentConfig()))
+    trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=40, augment=AugmentConfig()))
     with (tmp_path / "run" / "metrics.csv").open() as file:
         last = list(csv.DictReader(file))[-1]
     assert float(last["val_iou"]) > 0.85 and float(last["val_miou"]) > 0.75
@@ -127,7 +127,7 @@ def test_it_learns_the_two_halves(dataset: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("loss", ["ce", "l1", "ce+l1", "ce+l1+cd"])
 def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, loss: str) -> None:
     config = replace(SMALL, loss=loss, epochs=0.2)  # type: ignore[arg-type]
-    model = load_model(training.train(dataset, tmp_path / "run", config))
+    model = load_model(trainer.train(dataset, tmp_path / "run", config))
     cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 50.0), size=(80, 3))
     answer = model.query(model.encode(cloud), cloud[:7])
     assert answer.label.shape == (7,) and answer.probability.shape[1] == (2 if loss == "l1" else 3)
@@ -137,14 +137,14 @@ def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, lo
 
 
 def test_bfloat16_trains(dataset: Path, tmp_path: Path) -> None:
-    model = load_model(training.train(dataset, tmp_path / "run", replace(SMALL, precision="bfloat16")))
+    model = load_model(trainer.train(dataset, tmp_path / "run", replace(SMALL, precision="bfloat16")))
     assert all(torch.isfinite(value).all() for value in model.network.state_dict().values())
 
 
 def test_training_starts_from_given_weights(dataset: Path, tmp_path: Path) -> None:
     """Without any step, the network is that of the weights; other networks are refused."""
-    first = training.train(dataset, tmp_path / "first", replace(SMALL, epochs=0.2))
-    data, config = training.Dataset.load(dataset), replace(SMALL, init=str(first))
+    first = trainer.train(dataset, tmp_path / "first", replace(SMALL, epochs=0.2))
+    data, config = trainer.Dataset.load(dataset), replace(SMALL, init=str(first))
     network = start_network(config, data)
     assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
     other_counts = replace(config.network, points=48, neighbors=6)  # the same weights fit
@@ -156,14 +156,14 @@ def test_training_starts_from_given_weights(dataset: Path, tmp_path: Path) -> No
     with pytest.raises(ValueError, match="another network setting width"):
         start_network(replace(config, network=replace(config.network, width=32)), data)
     with pytest.raises(FileNotFoundError, match="no weights 'lost'"):
-        training.train(dataset, tmp_path / "second", replace(config, init="lost"))
+        trainer.train(dataset, tmp_path / "second", replace(config, init="lost"))
     assert not (tmp_path / "second").exists()
 
 
 def test_training_starts_from_another_objects_weights(dataset: Path, tmp_path: Path) -> None:
     """All that is not about segments is taken; segments and template are new."""
-    first = training.train(dataset, tmp_path / "first", replace(SMALL, epochs=0.2))
-    data = training.Dataset.load(dataset)
+    first = trainer.train(dataset, tmp_path / "first", replace(SMALL, epochs=0.2))
+    data = trainer.Dataset.load(dataset)
     manifest = data.manifest | {"segments": [{"name": "whole", "color": [1, 2, 3]}]}
     data = replace(data, manifest=manifest, template=torch.rand(1, 64, 64, 64))
     given = load_file(first)
@@ -181,8 +181,8 @@ def test_training_starts_from_another_objects_weights(dataset: Path, tmp_path: P
 def test_a_lookup_may_be_added_to_given_weights(dataset: Path, tmp_path: Path) -> None:
     """Its grid is the dataset's; all else is that of the weights."""
     plain = replace(SMALL, network=replace(SMALL.network, rest_template=False))
-    first = training.train(dataset, tmp_path / "first", replace(plain, epochs=0.2))
-    data = training.Dataset.load(dataset)
+    first = trainer.train(dataset, tmp_path / "first", replace(plain, epochs=0.2))
+    data = trainer.Dataset.load(dataset)
     network = start_network(replace(SMALL, init=str(first)), data)
     state = network.state_dict()
     assert all(torch.equal(state[k], v) for k, v in load_file(first).items())
@@ -197,10 +197,10 @@ def test_a_dataset_without_template_is_refused(dataset: Path, tmp_path: Path) ->
     with pytest.raises(
         ValueError, match=r"has no template.safetensors.*continue it with mereo generate \.\.\. --resume"
     ):
-        training.train(old, tmp_path / "run", SMALL)
+        trainer.train(old, tmp_path / "run", SMALL)
     assert not (tmp_path / "run").exists()
     plain = replace(SMALL, epochs=0.2, network=replace(SMALL.network, rest_template=False))
-    training.train(old, tmp_path / "run", plain)
+    trainer.train(old, tmp_path / "run", plain)
 
 
 def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:
@@ -216,21 +216,21 @@ def test_only_the_first_process_claims_the_directory(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A process that comes while the first one writes the settings waits instead of refusing the directory."""
-    data, waited = training.Dataset.load(dataset), []
+    data, waited = trainer.Dataset.load(dataset), []
     monkeypatch.setattr(torch.distributed, "barrier", lambda: waited.append(True))
     run = tmp_path / "run"
     run.mkdir()
     (run / ".config.json.partial").touch()  # what the first one is writing
-    claim_run(run, SMALL, data, training.Process(1, 2))
+    claim_run(run, SMALL, data, trainer.Process(1, 2))
     assert waited and not (run / "config.json").exists()
     with pytest.raises(FileExistsError, match="is not a training run"):
-        claim_run(run, SMALL, data, training.Process(0, 2))
+        claim_run(run, SMALL, data, trainer.Process(0, 2))
 
 
 def test_batch_must_be_divisible(dataset: Path, tmp_path: Path) -> None:
-    data = training.Dataset.load(dataset)
+    data = trainer.Dataset.load(dataset)
     with pytest.raises(ValueError, match="batch of 8 cannot be shared by 3 processes"):
-        claim_run(tmp_path / "run", SMALL, data, training.Process(0, 3))
+        claim_run(tmp_path / "run", SMALL, data, trainer.Process(0, 3))
 
 
 def test_paper_preset_is_the_papers_recipe() -> None:

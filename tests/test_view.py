@@ -16,17 +16,17 @@ from browser import BROWSER, Page, pixels_of, until
 from PIL import Image
 from toy_scene import rest_mesh, toy_scene
 
-from mereo.camera import PointCloud
-from mereo.config import PRESETS
-from mereo.extraction import LabelGrid
-from mereo.inspection import Inspection
-from mereo.laboratory import Laboratory
-from mereo.model import Answer, Model
-from mereo.network import Network
-from mereo.reconstruction import Reconstruction
-from mereo.viewer import stage, words
-from mereo.viewer.frame_page import FramePage
-from mereo.viewer.lab_page import LabPage
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.labels import LabelGrid
+from mereo.models.model import Answer, Model
+from mereo.models.network import Network
+from mereo.reconstruction.pipeline import Reconstruction
+from mereo.training.config import PRESETS
+from mereo.visualization.viewer import display, html
+from mereo.visualization.viewer.frame_page import FramePage
+from mereo.visualization.viewer.lab_page import LabPage
+from mereo.visualization.viewer.laboratory import Laboratory
+from mereo.visualization.viewer.probe import Inspection
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome in PATH")
@@ -55,7 +55,7 @@ def toy_inspection() -> Told:
 
 @pytest.fixture
 def server() -> Iterator[object]:
-    started = stage.start_server(0, "mereo")
+    started = display.start_server(0, "mereo")
     yield started
     started.stop()
 
@@ -111,7 +111,7 @@ def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object)
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as answer:
         assert answer.status == 200
     with pytest.raises(OSError, match=f"port {port} is taken or not allowed; choose another one with --port"):
-        stage.start_server(port, "mereo")
+        display.start_server(port, "mereo")
 
 
 @needs_viser
@@ -145,7 +145,7 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
 ) -> None:
     from mereo.__main__ import main
 
-    monkeypatch.setattr("mereo.viewer.serve.import_viser", lambda: None)
+    monkeypatch.setattr("mereo.visualization.viewer.serve.import_viser", lambda: None)
     assert main(["view", *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("mereo: error: ") and error.count("\n") == 1
@@ -167,9 +167,9 @@ def test_names_cannot_break_the_panels() -> None:
     answer = Answer(
         np.array([1], dtype=np.uint8), np.array([[0.25, 0.75]]), np.array([-2.0]), np.array([[0.0, 1.0, 0.0]])
     )
-    text = words.answer(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), (1.0, 2.0, 3.0), " mm")
+    text = html.answer(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), (1.0, 2.0, 3.0), " mm")
     shown = re.sub(r"<[^>]+>", " ", text)
-    assert "<script" not in text + words.chips((name,), ((1, 2, 3),)) + words.heading(name, name) + words.message(name)
+    assert "<script" not in text + html.chips((name,), ((1, 2, 3),)) + html.heading(name, name) + html.message(name)
     for told in ("0.75", "2 mm inside the nearest surface", "towards 0, 1, 0", "at 1, 2, 3 mm"):
         assert told in shown
     assert shown.index("0.75") < shown.index("0.25")  # the likeliest first

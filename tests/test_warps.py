@@ -10,9 +10,18 @@ from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from mereo.deformation import Identity, Localized, Rigid, jacobian_determinant, smooth_step
-from mereo.skeleton import Bone, Skeleton
-from mereo.warps import Bend, CurveSweep, FreeFormLattice, SmoothField, Squash, Taper, Twist, transport_frames
+from mereo.deformation.maps import Identity, Localized, Rigid, jacobian_determinant, smooth_step
+from mereo.deformation.skeleton import Bone, Skeleton
+from mereo.deformation.warps import (
+    Bend,
+    CurveSweep,
+    FreeFormLattice,
+    SmoothField,
+    Squash,
+    Taper,
+    Twist,
+    transport_frames,
+)
 
 
 def test_bend_preserves_arc_length_and_has_the_closed_form_jacobian() -> None:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from mereo.config import TEST_SEED_START, GenerateConfig
-from mereo.scene import load_scene
-from mereo.synthesis import example_rng, sample_view
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
 
 
 def mereo(*arguments: object) -> str:

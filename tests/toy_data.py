@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
-from mereo.config import TEMPLATE
-from mereo.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
+from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
+from mereo.synthesis.config import TEMPLATE
 
 NAMES = ("left", "right")
 SHARD = 32

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from shapes import ball, box
 
-from mereo.deformation import Deformation
-from mereo.mesh import SegmentedMesh
-from mereo.scene import Scene, Workspace
+from mereo.deformation.maps import Deformation
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.scenes.scene import Scene, Workspace
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from mereo import training
-from mereo.config import TrainConfig
+from mereo.training import trainer
+from mereo.training.config import TrainConfig
 
 
 class _Killed(Exception):
@@ -18,24 +18,24 @@ class _Killed(Exception):
 
 
 def _kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
-    original = training.Trainer.train_step
+    original = trainer.Trainer.train_step
 
-    def step(self: training.Trainer, batch: object) -> None:
+    def step(self: trainer.Trainer, batch: object) -> None:
         if self.step == steps:
             raise _Killed
         original(self, batch)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(training.Trainer, "train_step", step)
+    monkeypatch.setattr(trainer.Trainer, "train_step", step)
 
 
 def assert_resumes_exactly(dataset: Path, folder: Path, config: TrainConfig, steps: int) -> None:
     """A run that is killed after ``steps`` and started again ends with the same bits as an uninterrupted one."""
-    training.train(dataset, folder / "whole", config, checkpoint_every_s=0.0)
+    trainer.train(dataset, folder / "whole", config, checkpoint_every_s=0.0)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(_Killed):
         _kill_after(patch, steps)
-        training.train(dataset, folder / "parts", config, checkpoint_every_s=0.0)
+        trainer.train(dataset, folder / "parts", config, checkpoint_every_s=0.0)
     assert not list((folder / "parts").glob(".*"))  # a file being written has a hidden name
-    training.train(dataset, folder / "parts", config, checkpoint_every_s=0.0)
+    trainer.train(dataset, folder / "parts", config, checkpoint_every_s=0.0)
     whole, parts = (load_file(folder / name / "checkpoint.safetensors") for name in ("whole", "parts"))
     assert whole.keys() == parts.keys()
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
@@ -48,7 +48,7 @@ def train_in_two_processes(dataset: Path, folder: Path, module: str, config: str
     script.write_text(
         "import sys\nfrom dataclasses import replace\nfrom pathlib import Path\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        f"from {module} import SMALL\nfrom mereo.training import train\n"
+        f"from {module} import SMALL\nfrom mereo.training.trainer import train\n"
         f"train(Path(sys.argv[1]), Path(sys.argv[2]), {config})\n"
     )
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]

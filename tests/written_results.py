@@ -3,9 +3,8 @@
 import numpy as np
 import trimesh
 
-from mereo.extraction import LabelGrid
-from mereo.measurement import SegmentedCloud
-from mereo.mesh import Segment, SegmentedMesh
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
+from mereo.geometry.mesh import Segment, SegmentedMesh
 
 NAMES = ("zebra head", "lost", "Öhrchen")
 COLORS = ((86, 180, 233), (9, 9, 9), (3, 7, 255))

@@ -7,38 +7,38 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mereo.camera import Camera as Camera
-    from mereo.camera import DepthImage as DepthImage
-    from mereo.camera import PointCloud as PointCloud
-    from mereo.evaluation import evaluate as evaluate
-    from mereo.files import read_camera as read_camera
-    from mereo.files import read_depth_image as read_depth_image
-    from mereo.files import read_point_cloud as read_point_cloud
-    from mereo.mesh import Segment as Segment
-    from mereo.mesh import SegmentedMesh as SegmentedMesh
-    from mereo.model import Model as Model
-    from mereo.reconstruction import reconstruct as reconstruct
-    from mereo.reconstruction import write_reconstruction as write_reconstruction
-    from mereo.scene import load_scene as load_scene
-    from mereo.synthesis import synthesize as synthesize
-    from mereo.weights import load_model as load_model
+    from mereo.evaluation.scoring import evaluate as evaluate
+    from mereo.geometry.camera import Camera as Camera
+    from mereo.geometry.camera import DepthImage as DepthImage
+    from mereo.geometry.camera import PointCloud as PointCloud
+    from mereo.geometry.mesh import Segment as Segment
+    from mereo.geometry.mesh import SegmentedMesh as SegmentedMesh
+    from mereo.io.readers import read_camera as read_camera
+    from mereo.io.readers import read_depth_image as read_depth_image
+    from mereo.io.readers import read_point_cloud as read_point_cloud
+    from mereo.models.model import Model as Model
+    from mereo.models.weights import load_model as load_model
+    from mereo.reconstruction.pipeline import reconstruct as reconstruct
+    from mereo.scenes.registry import load_scene as load_scene
+    from mereo.synthesis.examples import synthesize as synthesize
+    from mereo.visualization.result_files import write_reconstruction as write_reconstruction
 
 _HOME = {
-    "Camera": "camera",
-    "DepthImage": "camera",
-    "Model": "model",
-    "PointCloud": "camera",
-    "Segment": "mesh",
-    "SegmentedMesh": "mesh",
-    "evaluate": "evaluation",
-    "load_model": "weights",
-    "load_scene": "scene",
-    "read_camera": "files",
-    "read_depth_image": "files",
-    "read_point_cloud": "files",
-    "reconstruct": "reconstruction",
-    "synthesize": "synthesis",
-    "write_reconstruction": "reconstruction",
+    "Camera": "geometry.camera",
+    "DepthImage": "geometry.camera",
+    "Model": "models.model",
+    "PointCloud": "geometry.camera",
+    "Segment": "geometry.mesh",
+    "SegmentedMesh": "geometry.mesh",
+    "evaluate": "evaluation.scoring",
+    "load_model": "models.weights",
+    "load_scene": "scenes.registry",
+    "read_camera": "io.readers",
+    "read_depth_image": "io.readers",
+    "read_point_cloud": "io.readers",
+    "reconstruct": "reconstruction.pipeline",
+    "synthesize": "synthesis.examples",
+    "write_reconstruction": "visualization.result_files",
 }
 """The module of each public name."""
 

@@ -12,14 +12,15 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo import commands, scene_commands
-from mereo.align_command import Align
-from mereo.bench_command import BenchCommand
-from mereo.config import PRESETS, SENSORS, GenerateConfig, SensorConfig, TrainConfig
-from mereo.experiment_command import Experiment
-from mereo.release_command import Release
-from mereo.stream_command import StreamCommand
-from mereo.view_command import View
+from mereo.cli import commands, scene_commands
+from mereo.cli.align_command import Align
+from mereo.cli.bench_command import BenchCommand
+from mereo.cli.experiment_command import Experiment
+from mereo.cli.release_command import Release
+from mereo.cli.stream_command import StreamCommand
+from mereo.cli.view_command import ViewCommand
+from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
+from mereo.training.config import PRESETS, TrainConfig
 
 Choice = TypeVar("Choice")
 
@@ -30,7 +31,7 @@ USER_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 
 @runtime_checkable
 class Command(Protocol):
-    """What the arguments are read into: one of the classes of ``mereo.commands``."""
+    """What the arguments are read into: one of the classes of ``mereo.cli.commands``."""
 
     def run(self) -> None: ...
 
@@ -118,7 +119,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
         | Annotated[Align, subcommand("align")]
-        | Annotated[View, subcommand("view")]
+        | Annotated[ViewCommand, subcommand("view")]
         | Annotated[StreamCommand, subcommand("stream")]
         | Annotated[commands.Export, subcommand("export")]
         | Annotated[Experiment, subcommand("experiment")]

@@ -1,4 +1,1 @@
-"""The paper's experiments, one module each: ``mereo experiment NAME`` repeats a table or figure.
-
-Each module has ``run(store, scale)``, which makes or finds what it needs and returns a ``Result``.
-"""
+"""The paper's experiments, and speed against roofline and baseline."""

@@ -1,1 +1,1 @@
-"""Built-in scenes, one module each, with a function ``scene()``; ``mereo.scene.load_scene`` finds them by name."""
+"""Deformable objects: the type, the built-in ones, and those that users define in files."""

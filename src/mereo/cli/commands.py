@@ -1,0 +1,263 @@
+"""The command line: one dataclass per command, its fields the options, ``run`` the work.
+
+``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
+"""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from mereo.io.config import FilesConfig, InputConfig
+from mereo.models.config import EXACT, InferenceConfig
+from mereo.reconstruction.config import IsolationConfig
+from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
+from mereo.training.config import PresetName, TrainConfig
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Reconstruct a real scan and shipped depth frames, and compare them with the truth.
+
+    Attributes:
+        output: folder for meshes, pictures and reports.
+    """
+
+    output: Path = Path("out/demo")
+
+    def run(self) -> None:
+        from mereo.cli.demo import main
+
+        main(self.output)
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Show versions, device, CPU features and extras, and how to install what is missing."""
+
+    def run(self) -> None:
+        from mereo.cli.doctor import diagnose
+
+        diagnose()
+
+
+@dataclass(frozen=True)
+class AssetsList:
+    """Name the downloadable meshes and scans, with licence and credit."""
+
+    def run(self) -> None:
+        from mereo.scenes.assets import ASSETS, location
+
+        for asset in ASSETS.values():
+            print(f"{asset.name}\n  {asset.description}\n  {asset.licence}; credit: {asset.credit}")
+            print(f"  {location(asset.name) or 'not here yet'}")
+
+
+@dataclass(frozen=True)
+class AssetsGet:
+    """Download assets, check them, and print where they are.
+
+    Attributes:
+        names: from `mereo assets list`; none means all of them.
+    """
+
+    names: Positional[tuple[str, ...]] = ()
+
+    def run(self) -> None:
+        from mereo.scenes.assets import ASSETS, get
+
+        for name in self.names or ASSETS:
+            print(get(name))
+
+
+@dataclass(frozen=True)
+class Generate:
+    """Make labelled training examples of a scene.
+
+    Attributes:
+        scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
+        examples: how many.
+        output: folder to create.
+        seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
+        workers: processes; the result does not depend on them. 0 means one per core.
+        shard: make only part i of n, as i/n from 0/n to (n-1)/n, for example on several machines.
+        resume: go on with a run that was stopped.
+        test: allow a test seed.
+        sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
+        settings: how one example is made.
+    """
+
+    scene: Positional[str]
+    examples: int
+    output: Path
+    seed: int = 0
+    workers: int = 0
+    shard: str = "0/1"
+    resume: bool = False
+    test: bool = False
+    sensor: Sensor = "paper"
+    settings: Annotated[GenerateConfig, arg(name="")] = field(default_factory=GenerateConfig)
+
+    def run(self) -> None:
+        from mereo.synthesis.shards import generate
+
+        generate(
+            self.scene,
+            self.output,
+            self.settings,
+            examples=self.examples,
+            seed=self.seed,
+            workers=self.workers or os.cpu_count() or 1,
+            shard=part_of(self.shard),
+            resume=self.resume,
+            test=self.test,
+        )
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a network on generated examples; the same command again continues a stopped run.
+
+    Attributes:
+        dataset: folder written by `mereo generate`.
+        output: folder of the run.
+        preset: what the options below start from: as published, as published for --network.encoder autodecoder,
+            recommended, the same for a GPU, a two-minute trial.
+        config: the recipe; defaults are the chosen preset's.
+    """
+
+    dataset: Positional[Path]
+    output: Path
+    preset: PresetName = "base"
+    config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+
+    def run(self) -> None:
+        from mereo.training.trainer import train
+
+        print(f"weights: {train(self.dataset, self.output, self.config)}")
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score weights on test examples of their scene: IoU, mIoU, per segment, with pictures of the errors.
+
+    Attributes:
+        weights: a shipped name or a file.
+        output: folder to create.
+        examples: how many.
+        seed: test seeds start at 1,000,000.
+        scene: the scene's name or file, where it is not the built-in one that the weights were trained on.
+        scans: score real scans instead of rendered views: truth files, or their folders, of `mereo align`; without
+            any, the four range scans of the bunny, whose poses are known.
+        sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
+        noise_std: Gaussian noise on the depth, standard deviation in scene units.
+        terms: what else is wrong with the depth image.
+        inference: where and how exactly the network computes.
+    """
+
+    weights: Positional[str]
+    output: Path
+    examples: int = 128
+    seed: int = 1_000_000
+    scene: str | None = None
+    scans: tuple[Path, ...] | None = None
+    sensor: Sensor = "paper"
+    noise_std: float = 0.1
+    terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = EXACT
+
+    def run(self) -> None:
+        from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
+
+        settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)
+        if self.scans is not None:
+            from mereo.models.weights import load_for
+
+            if settings != GenerateConfig():
+                raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
+            evaluate_on_scans(load_for(self.weights, self.inference), self.output, truths=self.scans)
+            return
+        evaluate_weights(
+            self.weights,
+            self.output,
+            examples=self.examples,
+            seed=self.seed,
+            scene=self.scene,
+            settings=settings,
+            inference=self.inference,
+        )
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Reconstruct all segments from one frame: a depth image (PNG, TIFF, EXR, NPY), a point cloud (PLY, PCD, XYZ, NPY,
+    NPZ, ZDF) or a ROS recording (bag, MCAP).
+
+    Attributes:
+        input: the file; results are in its frame and units.
+        weights: a shipped name or a file.
+        output: folder to create.
+        resolution: grid cells along the longest side.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
+        files: which files, and in which unit.
+        force: replace an existing output folder.
+    """
+
+    input: Positional[Path]
+    weights: str
+    output: Path
+    resolution: int = 128
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
+    force: bool = False
+
+    def run(self) -> None:
+        from mereo.cli.reconstruct import reconstruct_file
+
+        reconstruct_file(
+            self.input,
+            self.weights,
+            self.output,
+            resolution=self.resolution,
+            reading=self.reading,
+            isolation=self.isolation,
+            inference=self.inference,
+            files=self.files,
+            force=self.force,
+        )
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write weights as two graphs, encoder and query, for ONNX Runtime (no torch needed) or for torch.export.
+
+    Attributes:
+        weights: a shipped name or a file.
+        output: folder to create; for ONNX with mereo_onnx.py, which runs the graphs with numpy and onnxruntime alone.
+        format: onnx, or torch for .pt2 files.
+        force: replace an existing output folder.
+    """
+
+    weights: Positional[str]
+    output: Path
+    format: Literal["onnx", "torch"] = "onnx"
+    force: bool = False
+
+    def run(self) -> None:
+        from mereo.models.export.onnx_export import export_weights
+
+        export_weights(self.weights, self.output, self.format, self.force)
+
+
+def part_of(shard: str) -> tuple[int, int]:
+    """``"1/4"`` is part 1 of 4, counted from 0."""
+    part, _, parts = shard.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
+        raise ValueError(f"the shard is {shard!r}; it must be i/n with i from 0 to n - 1: give for example --shard 0/4")
+    return int(part), int(parts)

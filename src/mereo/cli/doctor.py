@@ -1,0 +1,115 @@
+"""``mereo doctor``: what this machine offers and what is installed, for bug reports and for choosing settings."""
+
+import importlib.metadata
+import os
+import platform
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+
+import torch
+
+from mereo.models.device import bfloat16_gain, cpu_features, pick_device, pick_precision
+
+PURPOSES: dict[str, str] = {
+    "view": "the pages of `mereo view`",
+    "track": "training curves in TensorBoard",
+    "vtk": "tests that read written files with VTK",
+    "onnx": "networks for other runtimes",
+    "cad": "3MF files",
+    "medical": "NIfTI and NRRD volumes",
+    "sensors": "ROS bags, EXR depth images and Zivid clouds",
+    "simulation": "states from finite elements",
+    "cluster": "data generation on several machines",
+    "align": "ground truth from scans",
+    "docs": "the documentation as pages",
+    "dev": "tests and checks",
+}
+"""What each extra of pyproject.toml is for; which packages it means is read from the installed metadata."""
+
+
+def diagnose() -> None:
+    """Print versions, device, threads, CPU features and extras, one fact a line."""
+    for line in (*_platform(), *_packages(), *_device(), *_extras()):
+        print(line)
+
+
+def _row(name: str, value: object) -> str:
+    return f"{name:<14} {value}"
+
+
+def _platform() -> Iterator[str]:
+    yield _row("mereo", _version("mereo") or "not installed")
+    yield _row("python", f"{platform.python_version()} ({sys.executable})")
+    yield _row("system", f"{platform.system()} {platform.machine()}")
+
+
+def _packages() -> Iterator[str]:
+    if not requirements(""):
+        yield _row("packages", "unknown: mereo is not installed; run in its folder: pip install -e .")
+    for requirement in requirements(""):
+        name = _name(requirement)
+        yield _row(name, _version(name) or f"missing: {install_command([requirement])}")
+
+
+def requirements(extra: str) -> list[str]:
+    """What pyproject.toml declares for ``extra``, for example ``tensorboard>=2.18``; ``""`` is mereo itself."""
+    try:
+        declared = importlib.metadata.requires("mereo") or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    found = []
+    for entry in declared:
+        requirement, _, marker = entry.partition(";")
+        named = re.search(r"extra == ['\"](.+?)['\"]", marker)
+        if (named.group(1) if named else "") == extra:
+            found.append(requirement.strip())
+    return found
+
+
+def install_command(missing: list[str]) -> str:
+    """The command line that installs these requirements for the running Python."""
+    return shlex.join([sys.executable, "-m", "pip", "install", *missing])
+
+
+def _name(requirement: str) -> str:
+    return re.split(r"[^A-Za-z0-9._-]", requirement)[0]
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _device() -> Iterator[str]:
+    yield ""
+    if torch.cuda.is_available():
+        free, total = torch.cuda.mem_get_info()
+        memory = f"{free / 2**30:.1f} of {total / 2**30:.1f} GiB free"
+        yield _row("device", f"cuda: {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}, {memory}")
+    else:
+        yield _row("device", "cpu")
+    yield _row("threads", f"{torch.get_num_threads()} of {os.cpu_count()} cores")
+    features = cpu_features()
+    for name, present in features.items():
+        yield _row(name, {True: "yes", False: "no", None: "unknown"}[present])
+    yield _row("bfloat16", _bfloat16())
+
+
+def _bfloat16() -> str:
+    device = pick_device()
+    verdict = "does not pay here" if pick_precision("auto", device) is None else "pays here"
+    return verdict if device.type == "cuda" else f"{verdict}: {bfloat16_gain():.1f} times float32"
+
+
+def _extras() -> Iterator[str]:
+    yield ""
+    for extra, purpose in PURPOSES.items():
+        missing = [r for r in requirements(extra) if _version(_name(r)) is None]
+        if missing:
+            yield _row(extra, f"missing, for {purpose}: {install_command(missing)}")
+        else:
+            yield _row(extra, f"installed, for {purpose}")

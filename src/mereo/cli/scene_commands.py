@@ -1,0 +1,121 @@
+"""The commands ``mereo scene ...``: list, write, check, draw and export scenes. See ``commands``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class SceneList:
+    """Name the built-in scenes."""
+
+    def run(self) -> None:
+        from mereo.scenes.registry import SCENES
+
+        for name in SCENES:
+            print(name)
+
+
+@dataclass(frozen=True)
+class SceneNew:
+    """Write a scene file for an object of your own, with every choice explained in comments.
+
+    Attributes:
+        files: one mesh for each segment (STL, PLY, OBJ, OFF), one file of named parts (GLB, OBJ, 3MF), or one label
+            volume (NIfTI, NRRD).
+        output: the YAML file; by default called after the first file, in the working directory.
+        units: of the files; guessed where not given.
+    """
+
+    files: Positional[tuple[Path, ...]]
+    output: Path | None = None
+    units: Literal["mm", "cm", "m", "in"] | None = None
+
+    def run(self) -> None:
+        from mereo.scenes.files.template import write_scene_file
+
+        path = write_scene_file(self.files, self.output, self.units)
+        print(f"wrote {path}; read it, then:")
+        print(f"  mereo scene check {path}")
+        print(f"  mereo scene preview {path} --output states.png")
+
+
+@dataclass(frozen=True)
+class SceneCheck:
+    """Check every segment (closed, outward oriented, no self-intersection), overlaps, the unit, and random states.
+
+    Attributes:
+        scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
+        repair: write repaired copies of faulty meshes, and a scene file that names them, beside a YAML scene file.
+    """
+
+    scene: Positional[str]
+    repair: bool = False
+
+    def run(self) -> None:
+        from mereo.scenes.files.check import check_scene
+
+        check_scene(self.scene, self.repair)
+
+
+@dataclass(frozen=True)
+class ScenePreview:
+    """Draw nine random states of a scene, each with its camera and depth image; or all built-in scenes on one sheet.
+
+    Attributes:
+        output: the picture, a PNG file.
+        scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
+        all: draw every built-in scene: at rest, two random states and a depth image.
+        seed: another seed shows other states.
+    """
+
+    output: Path
+    scene: Positional[str] = ""
+    all: bool = False
+    seed: int = 0
+
+    def run(self) -> None:
+        from mereo.scenes.registry import load_scene
+        from mereo.visualization.previews import preview_scene
+        from mereo.visualization.scene_previews import preview_all
+
+        if self.all == bool(self.scene):
+            given = f"both {self.scene!r} and --all are" if self.all else "neither a scene nor --all is"
+            raise ValueError(f"{given} given; one of them is needed: name a scene, or give --all")
+        if self.all:
+            preview_all(self.output, self.seed)
+        else:
+            preview_scene(load_scene(self.scene), self.output, self.seed)
+        print(f"wrote {self.output}")
+
+
+@dataclass(frozen=True)
+class SceneExport:
+    """Write a scene's segments at rest, in scene units: to look at, or to pick points in for `mereo align`.
+
+    Attributes:
+        scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
+        output: a PLY file (one mesh, coloured), or a GLB file (a node for each segment).
+    """
+
+    scene: Positional[str]
+    output: Path
+
+    def run(self) -> None:
+        import numpy as np
+
+        from mereo.io.writers.glb import write_segments_glb
+        from mereo.io.writers.ply import write_segments_ply
+        from mereo.scenes.registry import load_scene
+
+        suffix = self.output.suffix.lower()
+        if suffix not in (".ply", ".glb"):
+            raise ValueError(f"{self.output} has the suffix {suffix!r}; it must be .ply or .glb: rename it")
+        rest = load_scene(self.scene).rest
+        if suffix == ".ply":
+            write_segments_ply(self.output, rest)
+        else:
+            write_segments_glb(self.output, rest, np.eye(3))
+        print(f"wrote {self.output}")

@@ -1,0 +1,211 @@
+"""The random deformations of a scene file: each draws one map of space within its bounds.
+
+They are applied in the file's order, and all places in them are those of the rest pose; a joint at the tip of a chain
+therefore comes before the one that carries it. A map that depends on where the object is by then (a bend on its
+thickness, a push on its surface) is drawn for the points as the maps before it have left them.
+
+Every map that can be drawn has a positive Jacobian throughout the object: each is bounded by its own rule, and maps one
+after the other multiply. Only a bend's bound depends on the maps before it, which may have moved the object away from
+its axis: the angle is drawn from what that leaves of its range. Lengths are in scene units, angles in radians.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.deformation.maps import Compose, Deformation, Localized, Rigid, unit
+from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
+from mereo.geometry.mesh import SegmentedMesh
+
+Range = tuple[float, float]
+Vector = Float[np.ndarray, "3"]
+
+Surface = Callable[[], tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]]
+"""Vertices of what is to be moved, as the maps before have left them, and outward unit normals."""
+
+FOLD_SHARE = 0.9
+"""A bend stays below this share of the angle at which space would fold over."""
+
+
+@runtime_checkable
+class Draw(Protocol):
+    """The bounds of one deformation."""
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation: ...
+
+
+@dataclass(frozen=True, eq=False)
+class DrawLattice:
+    """A free-form lattice over a box; the control points move by at most ``strength`` of what is injective."""
+
+    bounds: Float[np.ndarray, "2 3"]
+    cells: tuple[int, int, int]
+    strength: float
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        return FreeFormLattice.sample(rng, self.bounds, self.cells, self.strength)
+
+
+@dataclass(frozen=True)
+class DrawWaves:
+    """A smooth field whose gradient is at most ``strength``, which is uniform up to the bound."""
+
+    wavelength: Range
+    strength: float
+    modes: int
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        return SmoothField.sample(rng, rng.uniform(0.0, self.strength), self.wavelength, self.modes)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawBend:
+    """A bend about an axis, to a random side where ``toward`` is None."""
+
+    origin: Vector
+    axis: Vector
+    length: float
+    angle_rad: Range
+    toward: Vector | None
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        toward = rng.normal(size=3) if self.toward is None else self.toward
+        radius = distance_from_line(surface()[0], self.origin, self.axis)
+        most = FOLD_SHARE * self.length / max(radius, 1e-12)
+        angle = rng.uniform(*np.clip(self.angle_rad, -most, most))
+        return Bend(self.origin, self.axis, toward, self.length, angle, radius)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawTwist:
+    """A twist about an axis, any angle of which preserves volume."""
+
+    origin: Vector
+    axis: Vector
+    length: float
+    angle_rad: Range
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        return Twist(self.origin, self.axis, self.length, rng.uniform(*self.angle_rad))
+
+
+@dataclass(frozen=True, eq=False)
+class DrawTaper:
+    """Factors are uniform in their logarithm, so that a half is as likely as a double."""
+
+    origin: Vector
+    axis: Vector
+    length: float
+    factor: Range
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        return Taper(self.origin, self.axis, self.length, float(np.exp(rng.uniform(*np.log(self.factor)))))
+
+
+@dataclass(frozen=True, eq=False)
+class DrawSquash:
+    """Along a random axis where ``axis`` is None; factors are uniform in their logarithm."""
+
+    center: Vector
+    axis: Vector | None
+    factor: Range
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        axis = rng.normal(size=3) if self.axis is None else self.axis
+        return Squash(self.center, axis, float(np.exp(rng.uniform(*np.log(self.factor)))))
+
+
+@dataclass(frozen=True, eq=False)
+class DrawJoint:
+    """A rigid motion: a turn about an axis, a slide along it, and a shift of at most ``shift`` along x, y, z."""
+
+    pivot: Vector
+    axis: Vector
+    angle_rad: Range
+    slide: Range
+    shift: Vector
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        axis = unit(self.axis)
+        rotation = axis * rng.uniform(*self.angle_rad)
+        return Rigid(rotation, axis * rng.uniform(*self.slide) + rng.uniform(-self.shift, self.shift), self.pivot)
+
+
+@dataclass(frozen=True)
+class DrawPush:
+    """An instrument moves the tissue around a random vertex, within 30 degrees or so of its normal.
+
+    The map's Jacobian is at least 1 - 15/8 |distance| / (reach - tip), which the schema keeps above 0.05.
+    """
+
+    distance: Range
+    tip: float
+    reach: float
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        vertices, normals = surface()
+        index = rng.integers(len(vertices))
+        direction = unit(normals[index] + 0.35 * rng.normal(size=3))
+        pull = Rigid(np.zeros(3), direction * rng.uniform(*self.distance), vertices[index])
+        return Localized(pull, vertices[index], self.tip, self.reach)
+
+
+@dataclass(frozen=True, eq=False)
+class RandomMotion:
+    """``Scene.sample_deformations`` of a scene file: steps one after the other, each for some segments.
+
+    Attributes:
+        rest: the segments at rest.
+        steps: what to draw, and the indices of the segments that it moves.
+
+    Segments with the same steps share one map and so stay in contact.
+    """
+
+    rest: SegmentedMesh
+    steps: tuple[tuple[Draw, tuple[int, ...]], ...]
+
+    def __call__(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
+        chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
+        for draw, members in self.steps:
+
+            def surface(members: tuple[int, ...] = members) -> tuple[np.ndarray, np.ndarray]:
+                return _surface(self.rest, chains, members)
+
+            drawn = draw(rng, surface)
+            for index in members:
+                chains[index] = (*chains[index], drawn)
+        shared: dict[tuple[int, ...], Compose] = {}
+        return tuple(shared.setdefault(tuple(id(part) for part in chain), Compose(chain)) for chain in chains)
+
+
+def _surface(
+    rest: SegmentedMesh, chains: Sequence[tuple[Deformation, ...]], members: Sequence[int]
+) -> tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]:
+    """Vertices of segments after their maps so far, and their normals, weighted by area."""
+    vertices, normals = [], []
+    for index in members:
+        moved, faces = Compose(chains[index])(rest.segments[index].vertices), rest.segments[index].faces
+        a, b, c = (moved[faces[:, k]] for k in range(3))
+        normal = np.zeros_like(moved)
+        for k in range(3):
+            np.add.at(normal, faces[:, k], np.cross(b - a, c - a))
+        vertices.append(moved)
+        normals.append(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30))
+    return np.concatenate(vertices), np.concatenate(normals)
+
+
+def distance_from_line(points: Float[np.ndarray, "n 3"], origin: Vector, axis: Vector) -> float:
+    """Largest distance of the points; that of all of a mesh is at a vertex, because the distance is convex."""
+    local = points - origin
+    across = local - np.outer(local @ unit(axis), unit(axis))
+    return float(np.linalg.norm(across, axis=1).max())
+
+
+def default_cells(bounds: Float[np.ndarray, "2 3"]) -> tuple[int, int, int]:
+    """Cells of a lattice over a box: roughly cubes, two along the shortest side and at most six along the longest."""
+    sides = bounds[1] - bounds[0]
+    x, y, z = np.clip(np.rint(2 * sides / sides.min()), 2, 6).astype(int)
+    return int(x), int(y), int(z)

@@ -1,0 +1,196 @@
+"""Maps of space given by tetrahedra: where the nodes of a finite-element mesh go, all points in it go along.
+
+A surface inside the mesh, or near it, is moved by the tetrahedra around it, as in SOFA's ``BarycentricMapping``; the
+mesh of the simulation may be much coarser than the surface.
+
+Notation: X are node positions at rest, x in the deformed state. In each tetrahedron the map is affine,
+``f(p) = A p + b`` with the deformation gradient ``A = D D0^-1``, where the columns of D and D0 are the edges from the
+first node, deformed and at rest.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import igl
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array, csr_array
+
+from mereo.deformation.maps import newton
+from mereo.geometry.mesh import barycentric
+
+
+class Tetrahedra:
+    """A tetrahedral mesh at rest with its search trees, which all of its states share.
+
+    Args:
+        nodes: positions, any unit.
+        elements: four node indices each, in either orientation.
+
+    Raises ``ValueError`` for NaN, indices that do not exist, and tetrahedra without volume.
+    """
+
+    def __init__(self, nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"]) -> None:
+        if len(elements) == 0:
+            raise ValueError("there are no tetrahedra; at least one is needed: export the volume mesh")
+        if not np.isfinite(nodes).all():
+            raise ValueError(f"rest node {_first(~np.isfinite(nodes).all(axis=1))} is not finite: export it again")
+        if elements.min() < 0 or elements.max() >= len(nodes):
+            raise ValueError(
+                f"a tetrahedron refers to node {int(elements.max() if elements.min() >= 0 else elements.min())}, but "
+                f"there are {len(nodes)}; indices run from 0: subtract 1 where they were counted from 1"
+            )
+        self.nodes = np.ascontiguousarray(nodes, dtype=np.float64)
+        self.elements = np.ascontiguousarray(elements, dtype=np.int64)
+        edges = _edges(self.nodes, self.elements)
+        self.volumes = np.linalg.det(edges) / 6
+        size = float(np.ptp(self.nodes, axis=0).max())
+        if (flat := np.abs(self.volumes) <= 1e-12 * size**3).any():
+            raise ValueError(
+                f"tetrahedron {_first(flat)} has no volume at rest; it must have some: remove it from the mesh"
+            )
+        self._rest_inverse = np.linalg.inv(edges)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the search trees, which cannot be pickled; they are built again on first use."""
+        return {key: value for key, value in self.__dict__.items() if key not in ("_tree", "_surface_tree")}
+
+    @cached_property
+    def _tree(self) -> igl.AABB:
+        return _tree(self.nodes, self.elements)
+
+    @cached_property
+    def surface(self) -> Int[np.ndarray, "f 3"]:
+        """The faces that one tetrahedron has alone, counter-clockwise from outside."""
+        outward = np.where((self.volumes < 0)[:, None], self.elements[:, [1, 0, 2, 3]], self.elements)
+        return np.ascontiguousarray(igl.boundary_facets(outward)[0].astype(np.int64))
+
+    @cached_property
+    def _surface_tree(self) -> igl.AABB:
+        return _tree(self.nodes, self.surface)
+
+    @cached_property
+    def _node_mean(self) -> csr_array:
+        """From values of tetrahedra to their means at nodes, weighted by volume."""
+        weight = np.repeat(np.abs(self.volumes), 4)
+        rows, columns = self.elements.ravel(), np.repeat(np.arange(len(self.elements)), 4)
+        total = np.bincount(rows, weights=weight, minlength=len(self.nodes))
+        return coo_array((weight / total[rows], (rows, columns)), (len(self.nodes), len(self.elements))).tocsr()
+
+    def volume_ratios(self, nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
+        """Each tetrahedron's volume at other node positions, of that at rest; 0 or less where it is inverted."""
+        return np.linalg.det(_edges(nodes, self.elements)) / (6 * self.volumes)
+
+    def gradients(self, nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3 3"]:
+        """Deformation gradients A."""
+        return _edges(nodes, self.elements) @ self._rest_inverse
+
+    def node_gradients(self, gradients: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+        """Gradients averaged at nodes, which makes them continuous over the surface."""
+        mean: np.ndarray = self._node_mean @ gradients.reshape(-1, 9)
+        return mean.reshape(-1, 3, 3)
+
+    def locate(self, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, " p"]:
+        """The tetrahedron around each point at rest, -1 outside."""
+        return _locate(self._tree, self.nodes, self.elements, points)
+
+    def closest(
+        self, points: Float[np.ndarray, "p 3"]
+    ) -> tuple[Int[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
+        """Corners, barycentric weights and place of the closest point of the surface at rest."""
+        _, face, place = self._surface_tree.squared_distance(self.nodes, self.surface, np.ascontiguousarray(points))
+        corners = self.surface[face]
+        return corners, barycentric(self.nodes[corners], place), place
+
+
+@dataclass(frozen=True, eq=False)
+class TetrahedralMap:
+    """One state of a tetrahedral mesh as a map of space; satisfies ``Deformation`` and ``Invertible``.
+
+    Inside the mesh it is piecewise affine, so the Jacobian's determinant is a tetrahedron's ratio of volumes. Outside
+    it goes on from the closest surface point c along the gradient averaged there, ``f(p) = f(c) + A(c) (p - c)``: a
+    continuous map as far as c is continuous, that is nearer to the mesh than the mesh is to itself.
+
+    Attributes:
+        rest: the mesh at rest.
+        nodes: its deformed node positions.
+    """
+
+    rest: Tetrahedra
+    nodes: Float[np.ndarray, "n 3"]
+
+    @cached_property
+    def _gradients(self) -> Float[np.ndarray, "m 3 3"]:
+        return self.rest.gradients(self.nodes)
+
+    @cached_property
+    def _node_gradients(self) -> Float[np.ndarray, "n 3 3"]:
+        return self.rest.node_gradients(self._gradients)
+
+    def __call__(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+        element = self.rest.locate(points)
+        moved = np.empty_like(points, dtype=np.float64)
+        inside = element >= 0
+        first = self.rest.elements[element[inside], 0]
+        offset = points[inside] - self.rest.nodes[first]
+        moved[inside] = self.nodes[first] + _apply(self._gradients[element[inside]], offset)
+        if not inside.all():
+            moved[~inside] = self._beyond(points[~inside])
+        return moved
+
+    def _beyond(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+        corners, weights, place = self.rest.closest(points)
+        base = np.einsum("pk,pki->pi", weights, self.nodes[corners])
+        gradient = np.einsum("pk,pkij->pij", weights, self._node_gradients[corners])
+        return base + _apply(gradient, points - place)
+
+    def rest_points(
+        self, points: Float[np.ndarray, "p 3"], guess: Float[np.ndarray, "p 3"]
+    ) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, " p"]]:
+        """Exact for points in a deformed tetrahedron: the affine map undone; Newton's method for those outside.
+
+        Where the deformed mesh overlaps itself one of the answers is given.
+        """
+        elements = self.rest.elements
+        element = _locate(_tree(self.nodes, elements), self.nodes, elements, points)
+        inside = element >= 0
+        rest, found = np.empty_like(points, dtype=np.float64), inside.copy()
+        first = elements[element[inside], 0]
+        back = np.linalg.inv(self._gradients[element[inside]])
+        rest[inside] = self.rest.nodes[first] + _apply(back, points[inside] - self.nodes[first])
+        if not inside.all():
+            rest[~inside], found[~inside] = newton(self, points[~inside], guess[~inside])
+        return rest, found
+
+
+def _edges(nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 3 3"]:
+    """Edges from the first node as columns."""
+    corners = nodes[elements]
+    return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+
+
+def _tree(vertices: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m k"]) -> igl.AABB:
+    tree = igl.AABB()
+    tree.init(vertices, elements)
+    return tree
+
+
+def _locate(
+    tree: igl.AABB,
+    nodes: Float[np.ndarray, "n 3"],
+    elements: Int[np.ndarray, "m 4"],
+    points: Float[np.ndarray, "p 3"],
+) -> Int[np.ndarray, " p"]:
+    if len(points) == 0:  # libigl's loop expects some
+        return np.empty(0, dtype=np.int64)
+    found: np.ndarray = igl.in_element(nodes, elements, np.ascontiguousarray(points, dtype=np.float64), tree)
+    return found.astype(np.int64)  # C's long long, which numpy tells apart
+
+
+def _apply(matrix: Float[np.ndarray, "p 3 3"], vector: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    return np.einsum("pij,pj->pi", matrix, vector)
+
+
+def _first(mask: Bool[np.ndarray, " n"]) -> int:
+    return int(np.argmax(mask))

@@ -1,0 +1,288 @@
+"""Shapes of deformation: bend, twist, taper, squash, waves, lattices and sweeps along curves.
+
+Each states the bound under which its Jacobian is positive and refuses parameters beyond it (``ValueError``), so that
+what can be made can be used. Global deformations after Barr, "Global and local deformations of solid primitives",
+SIGGRAPH 1984. Lengths share one unit, angles are in radians; notation as in ``deformation``.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import map_coordinates
+
+from mereo.deformation.maps import smooth_step, turn, unit
+
+LATTICE_LIMIT = 1 / 2.48
+"""Choi & Lee, "Injectivity conditions of 2D and 3D uniform cubic B-spline functions", Graphical Models 62, 2000."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bend:
+    """Bends a straight axis into a circular arc; before and beyond it space moves rigidly (Barr 1984).
+
+    Attributes:
+        origin, axis: where the arc starts, and its direction there.
+        toward: the side to which it bends; its part along ``axis`` is dropped.
+        length: arc length; the axis keeps its length.
+        angle_rad: angle between the two ends.
+        radius: largest distance from the axis of anything to be moved; ``|angle| * radius < length`` is required,
+            which keeps the Jacobian, 1 minus curvature times the offset toward the centre, positive.
+    """
+
+    origin: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"]
+    toward: Float[np.ndarray, "3"]
+    length: float
+    angle_rad: float
+    radius: float
+
+    def __post_init__(self) -> None:
+        _check_curvature(abs(self.angle_rad) / self.length, self.radius)
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        axis = unit(self.axis)
+        side = unit(self.toward - (self.toward @ axis) * axis)
+        local = points - self.origin
+        along, offset = local @ axis, local @ side
+        s = np.clip(along, 0.0, self.length)
+        angle = s * (self.angle_rad / self.length)
+        # of the arc: (sin a / k, (1 - cos a) / k), written so that it holds for curvature zero
+        half = np.sinc(angle / (2 * np.pi))
+        x, y = s * half * np.cos(angle / 2), s * half * np.sin(angle / 2)
+        cosine, sine, beyond = np.cos(angle), np.sin(angle), along - s
+        new_along = x + beyond * cosine - offset * sine
+        new_offset = y + beyond * sine + offset * cosine
+        return points + np.outer(new_along - along, axis) + np.outer(new_offset - offset, side)
+
+
+@dataclass(frozen=True, eq=False)
+class Twist:
+    """Turns cross-sections about an axis by an angle that grows smoothly from 0 to ``angle_rad`` over ``length``.
+
+    Preserves volume exactly, whatever the angle: the Jacobian is 1 (Barr 1984).
+    """
+
+    origin: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"]
+    length: float
+    angle_rad: float
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        axis = unit(self.axis)
+        weight = smooth_step((points - self.origin) @ axis / self.length)
+        return turn(points, self.origin, axis, self.angle_rad * weight)
+
+
+@dataclass(frozen=True, eq=False)
+class Taper:
+    """Scales cross-sections by a factor that goes smoothly from 1 to ``factor`` > 0 over ``length`` (Barr 1984).
+
+    The Jacobian is the square of the local factor.
+    """
+
+    origin: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"]
+    length: float
+    factor: float
+
+    def __post_init__(self) -> None:
+        _check_factor(self.factor)
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        axis = unit(self.axis)
+        local = points - self.origin
+        along = local @ axis
+        growth = (self.factor - 1.0) * smooth_step(along / self.length)
+        return points + growth[:, None] * (local - np.outer(along, axis))
+
+
+@dataclass(frozen=True, eq=False)
+class Squash:
+    """Scales by ``factor`` > 0 along ``axis`` and by its inverse square root across: volume is preserved."""
+
+    center: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"]
+    factor: float
+
+    def __post_init__(self) -> None:
+        _check_factor(self.factor)
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        axis, across = unit(self.axis), self.factor**-0.5
+        matrix = across * np.eye(3) + (self.factor - across) * np.outer(axis, axis)
+        return self.center + (points - self.center) @ matrix
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothField:
+    """Random smooth waves: ``x + sum_k a_k sin(b_k . x + c_k)``.
+
+    The displacement's gradient has norm at most ``g = sum_k |a_k| |b_k|``. For g < 1, which is required, the map is a
+    diffeomorphism of all space: distances change by a factor in [1 - g, 1 + g].
+
+    Attributes:
+        amplitudes: a, in length.
+        frequencies: b, in radians per length.
+        phases: c.
+    """
+
+    amplitudes: Float[np.ndarray, "k 3"]
+    frequencies: Float[np.ndarray, "k 3"]
+    phases: Float[np.ndarray, " k"]
+
+    def __post_init__(self) -> None:
+        if not self.gradient_bound < 1:
+            raise ValueError(
+                f"the waves' gradient may reach {self.gradient_bound:.3g}; it must stay below 1 or space folds over: "
+                "make the amplitudes smaller or the wavelengths longer"
+            )
+
+    @property
+    def gradient_bound(self) -> float:
+        """g, from 0 to below 1."""
+        lengths = [np.linalg.norm(vectors, axis=1) for vectors in (self.amplitudes, self.frequencies)]
+        return float(lengths[0] @ lengths[1])
+
+    @classmethod
+    def sample(
+        cls, rng: np.random.Generator, strength: float, wavelength: tuple[float, float], modes: int = 4
+    ) -> "SmoothField":
+        """``modes`` waves in random directions, wavelengths uniform in a range, with gradient bound ``strength``."""
+        directions, amplitudes = rng.normal(size=(2, modes, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        frequencies = directions * 2 * np.pi / rng.uniform(*wavelength, size=(modes, 1))
+        shares = np.linalg.norm(amplitudes, axis=1) @ np.linalg.norm(frequencies, axis=1)
+        return cls(amplitudes * (strength / shares), frequencies, rng.uniform(0, 2 * np.pi, size=modes))
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        return points + np.sin(points @ self.frequencies.T + self.phases) @ self.amplitudes
+
+
+@dataclass(frozen=True, eq=False)
+class FreeFormLattice:
+    """Displaces space by a uniform cubic B-spline lattice; two spacings beyond the control points nothing moves.
+
+    Each component of a control point's displacement must stay below ``spacing / 2.48``, under which the map is
+    injective with a positive Jacobian (Choi & Lee 2000).
+
+    Attributes:
+        origin: position of control point (0, 0, 0).
+        spacing: distance between control points along x, y, z.
+        displacements: of the control points, in length.
+    """
+
+    origin: Float[np.ndarray, "3"]
+    spacing: Float[np.ndarray, "3"]
+    displacements: Float[np.ndarray, "a b c 3"]
+
+    def __post_init__(self) -> None:
+        share = float(np.abs(self.displacements / self.spacing).max())
+        if not share < LATTICE_LIMIT:
+            raise ValueError(
+                f"a lattice control point moves by {share:.3g} of the spacing; it must stay below "
+                f"{LATTICE_LIMIT:.3g} or space may fold over: make the displacements smaller or the lattice coarser"
+            )
+
+    @classmethod
+    def sample(
+        cls, rng: np.random.Generator, bounds: Float[np.ndarray, "2 3"], cells: tuple[int, int, int], strength: float
+    ) -> "FreeFormLattice":
+        """Random control points over a box of ``cells`` and one spacing around; ``strength`` in [0, 1) of the limit."""
+        spacing = (bounds[1] - bounds[0]) / np.array(cells)
+        shape = (cells[0] + 3, cells[1] + 3, cells[2] + 3, 3)
+        limit = strength * LATTICE_LIMIT * spacing
+        return cls(bounds[0] - spacing, spacing, rng.uniform(-limit, limit, size=shape))
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        at = ((points - self.origin) / self.spacing).T
+        moves = [
+            map_coordinates(
+                np.ascontiguousarray(self.displacements[..., k]), at, order=3, mode="grid-constant", prefilter=False
+            )
+            for k in range(3)
+        ]
+        return points + np.stack(moves, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class CurveSweep:
+    """Moves the x axis onto a curve: ``(x, y, z) -> c(x) + y n(x) + z b(x)``; straight before and beyond its ends.
+
+    The Jacobian is the curve's speed times one minus curvature times the offset towards the centre of curvature:
+    positive within ``radius`` of the axis while curvature times radius is below one. Make it with ``through``.
+
+    Attributes:
+        curve: arc length -> centre c, normal n, binormal b as nine numbers.
+        ends: arc length of both ends.
+    """
+
+    curve: CubicSpline
+    ends: tuple[float, float]
+
+    @classmethod
+    def through(
+        cls,
+        nodes: Float[np.ndarray, " m"],
+        centers: Float[np.ndarray, "m 3"],
+        normal: Float[np.ndarray, "3"],
+        radius: float,
+    ) -> "CurveSweep":
+        """The sweep onto a smooth curve, its frame free of twist.
+
+        Args:
+            nodes: ascending arc lengths at which the curve is given.
+            centers: the curve's points there; between them it is a cubic spline.
+            normal: direction of the y axis at the start; its part along the curve is dropped.
+            radius: largest distance from the axis of anything to be moved.
+
+        Raises ``ValueError`` where the curvature times ``radius`` reaches one.
+        """
+        spline = CubicSpline(nodes, centers)
+        velocity, acceleration = spline(nodes, 1), spline(nodes, 2)
+        speed = np.linalg.norm(velocity, axis=1)
+        curvature = np.linalg.norm(np.cross(velocity, acceleration), axis=1) / speed**3
+        _check_curvature(float(curvature.max()), radius)
+        frames = transport_frames(velocity / speed[:, None], normal)
+        curve = CubicSpline(nodes, np.concatenate([centers, frames[:, 1], frames[:, 2]], axis=1))
+        return cls(curve, (float(nodes[0]), float(nodes[-1])))
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        s = np.clip(points[:, 0], *self.ends)
+        values = self.curve(s)
+        center, normal, binormal = values[:, :3], values[:, 3:6], values[:, 6:]
+        moved = center + points[:, 1:2] * normal + points[:, 2:3] * binormal
+        beyond = np.flatnonzero(points[:, 0] != s)
+        tangent = np.cross(normal[beyond], binormal[beyond])
+        moved[beyond] += (points[beyond, 0] - s[beyond])[:, None] * tangent
+        return moved
+
+
+def transport_frames(tangents: Float[np.ndarray, "m 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "m 3 3"]:
+    """Rows tangent, normal, binormal along a curve, by parallel transport: from one tangent to the next the frame turns
+    by the smallest rotation, so it never twists about the curve (Bergou et al., "Discrete elastic rods", 2008).
+    """
+    a, b = tangents[:-1], tangents[1:]
+    cross, cosine = np.cross(a, b), np.einsum("ni,ni->n", a, b)
+    skew = np.cross(cross[:, None], np.eye(3))  # rows v x e_k, so that row vectors are multiplied from the left
+    turns = np.eye(3) + skew + skew @ skew / (1.0 + cosine)[:, None, None]
+    normal = unit(normal - (normal @ tangents[0]) * tangents[0])
+    frames = np.empty((len(tangents), 3, 3))
+    frames[0] = np.stack([tangents[0], normal, np.cross(tangents[0], normal)])
+    for index, rotation in enumerate(turns):
+        frames[index + 1] = frames[index] @ rotation
+    return frames
+
+
+def _check_curvature(curvature: float, radius: float) -> None:
+    if not curvature * radius < 1:
+        raise ValueError(
+            f"curvature {curvature:.3g} times radius {radius:.3g} is {curvature * radius:.3g}; it must be below 1 or "
+            "space folds over at the centre of curvature: bend less sharply or make the object thinner"
+        )
+
+
+def _check_factor(factor: float) -> None:
+    if not (np.isfinite(factor) and factor > 0):
+        raise ValueError(f"the scale factor is {factor:g}; it must be above 0 or space folds over: choose it positive")

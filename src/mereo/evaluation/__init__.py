@@ -1,0 +1,1 @@
+"""The metric of the paper, truth, test sets, and real scans."""

@@ -1,0 +1,41 @@
+"""Truth on a grid: what a reconstruction is scored against."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool
+
+from mereo.geometry.labels import LabelGrid
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import label_grid
+
+BOX_MARGIN = 0.25
+"""The paper's boxes are enlarged by 50 %: by a quarter of their size on each side."""
+
+
+@dataclass(frozen=True, eq=False)
+class TruthGrid:
+    """The right answer for an evaluation (paper, appendix B).
+
+    Attributes:
+        grid: true labels at the centres of the cells into which the joint box of all segments is divided.
+        kept: which of them count: those in the enlarged box of at least one segment.
+    """
+
+    grid: LabelGrid
+    kept: Bool[np.ndarray, "x y z"]
+
+
+def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:
+    """Divide the joint box of all segments into ``cells`` ** 3 cells and label their centres."""
+    low, high = mesh.bounds
+    spacing = (high - low) / cells
+    origin = low + spacing / 2
+    x, y, z = (origin[axis] + np.arange(cells) * spacing[axis] for axis in range(3))
+    kept = np.zeros((cells, cells, cells), dtype=bool)
+    for segment in mesh.segments:
+        first, last = segment.bounds
+        margin = BOX_MARGIN * (last - first)
+        inside = [(c >= a) & (c <= b) for c, a, b in zip((x, y, z), first - margin, last + margin, strict=True)]
+        kept[np.ix_(*inside)] = True
+    return TruthGrid(LabelGrid(label_grid(mesh, x, y, z), origin, spacing, mesh.names), kept)

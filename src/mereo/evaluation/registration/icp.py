@@ -1,0 +1,239 @@
+"""Rigid registration of an object's segments to a scan of it (paper, section 4.3), from a rough start.
+
+ICP is small_gicp's generalized one (plane to plane; Segal, Haehnel and Thrun, RSS 2009); what is decided here is which
+scan points a segment may answer for. A scan shows one side of an object and every segment only in part, so each round
+
+1. leaves out the faces that cannot be in the scan: those turned away from the scanner, those inside or in contact with
+   another segment at rest (nested, a cut, a joint);
+2. gives each scan point to the segment whose remaining surface is nearest, unless that is farther than a limit, which
+   shrinks from round to round;
+3. moves each body (all segments at first, then each by itself) onto its own points.
+
+Where asked, a body is held in the directions in which its points do not constrain it (a ball turns freely, a rod
+slides), after Zhang, Kaess and Singh, "On degeneracy of optimization-based state estimation problems" (ICRA 2016).
+
+Notation: ``T_scan_segment`` maps rest coordinates (scene units) to the scan's frame and unit: a similarity. Motions are
+rigid, in the scan's frame. p points, s segments.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from mereo.evaluation.registration.visible_surface import (
+    CLUSTER,
+    Poses,
+    face_areas,
+    facing,
+    moved,
+    sample_surface,
+    thinned,
+)
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid, rigid
+
+CELLS = 200
+"""Scan points are thinned to one in a cell of a two-hundredth of the object's diagonal."""
+
+WHOLE_LIMITS = (0.15, 0.1, 0.06, 0.04, 0.025, 0.015, 0.01, 0.007, 0.005)
+SEGMENT_LIMITS = (0.05, 0.03, 0.02, 0.013, 0.009, 0.007, 0.005, 0.005)
+"""How far a point may lie from the surface in each round, in diagonals of the object, but see ``NOISE_LIMIT``."""
+
+NOISE_LIMIT = 5.0
+"""A limit is at least this many medians of the points' distances: it trims outliers, not the scanner's noise."""
+
+LEAST_POINTS = 40
+LEAST_SHARE = 0.02
+"""A body is moved only by this many points at least, which cover at least this share of its surface."""
+
+LOOSE = 0.002
+"""A direction whose curvature, per point and with the body's radius as unit, is below this is held. A flat square turns
+about its normal with 0 and tilts with 0.2; the bunny's right ear, seen from the side, has 0.008."""
+
+NEIGHBORS = 12
+"""Scan points from which the scanned surface's direction is estimated."""
+
+FLATNESS = 1e-3
+"""The library's variance of a surface across itself, where that along it is 1. It adds those of scan and model, so that
+one point's distance counts 1 / (2 ``FLATNESS``), and its place on the surface 1/2."""
+
+ITERATIONS = 8
+"""Of ICP in each round; the next round goes on."""
+
+
+def load_icp() -> ModuleType:
+    """The library that does ICP; raises ``ImportError`` with a sentence that names the extra."""
+    try:
+        import small_gicp
+    except ImportError:
+        raise ImportError(
+            "small_gicp, which registers segments to scans, is not installed: pip install 'mereo[align]'"
+        ) from None
+    module: ModuleType = small_gicp
+    return module
+
+
+# --- the scan, and whose its points are -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What is registered to, in its own frame and unit.
+
+    Attributes:
+        points: thinned.
+        viewpoint: where the scanner stood.
+        size: the object's diagonal.
+        area: of the surface that one point stands for.
+    """
+
+    points: Float[np.ndarray, "p 3"]
+    viewpoint: Float[np.ndarray, "3"]
+    size: float
+    area: float
+
+    @classmethod
+    def of(cls, points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"], size: float) -> "Scan":
+        """Thin ``points`` of an object of diagonal ``size``. Raises ``ValueError`` for fewer than ``LEAST_POINTS``."""
+        kept = thinned(points, size / CELLS)
+        if len(kept) < LEAST_POINTS:
+            raise ValueError(
+                f"the scan has {len(kept)} points that are {size / CELLS:.3g} apart; at least {LEAST_POINTS} are "
+                "needed: check the scan and its unit"
+            )
+        apart = KDTree(kept).query(kept, k=2)[0][:, 1]
+        return cls(kept, viewpoint, size, float(np.median(apart)) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Which segment each point lies on.
+
+    Attributes:
+        owner: its index; -1 where the nearest surface is farther than ``limit``.
+        distance: to the nearest surface.
+        limit: in the scan's unit.
+    """
+
+    owner: Int[np.ndarray, " p"]
+    distance: Float[np.ndarray, " p"]
+    limit: float
+
+
+def match(points: Float[np.ndarray, "p 3"], surfaces: SegmentedMesh, limit: float) -> Matches:
+    """Give each point to the segment of the nearest surface, if within ``limit`` or ``NOISE_LIMIT`` medians."""
+    filled = [index for index, segment in enumerate(surfaces.segments) if len(segment.faces)]
+    nearest = Solids(SegmentedMesh(tuple(surfaces.segments[index] for index in filled))).nearest(points)
+    limit = max(limit, NOISE_LIMIT * float(np.median(nearest.distance)))
+    owner = np.where(nearest.distance < limit, np.asarray(filled)[nearest.owner], -1)
+    return Matches(owner, nearest.distance, limit)
+
+
+# --- motion ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Poses that fit a scan.
+
+    Attributes:
+        poses: of every segment.
+        fitted: whether the scan moved the segment's body in the last round; otherwise it shows too little of it.
+        held: in how many of six directions the body was held.
+        matches: of the last round.
+    """
+
+    poses: Poses
+    fitted: Bool[np.ndarray, " s"]
+    held: Int[np.ndarray, " s"]
+    matches: Matches
+
+
+def register(
+    shown: SegmentedMesh,
+    scan: Scan,
+    poses: Poses,
+    bodies: Sequence[Sequence[int]],
+    limits: Sequence[float],
+    hold: bool = False,
+) -> Registration:
+    """Move each body, a list of segments, onto the scan; all segments take part in saying whose a point is.
+
+    Args:
+        shown: from ``exposed``.
+        scan: the scan.
+        poses: where to start.
+        bodies: indices of the segments that move together; what is in none stays.
+        limits: one for each round, in diagonals of the object.
+        hold: keep bodies where they are along directions that the scan does not constrain. Not from a rough start: from
+            there a body must also slide to where its points are.
+    """
+    fitted, held = np.zeros(len(poses), dtype=bool), np.zeros(len(poses), dtype=np.int64)
+    for limit in limits:
+        surfaces = facing(moved(shown, poses), scan.viewpoint)
+        matches = match(scan.points, surfaces, limit * scan.size)
+        poses = poses.copy()
+        for body in map(list, bodies):
+            points = scan.points[np.isin(matches.owner, body)]
+            surface = SegmentedMesh(tuple(surfaces.segments[index] for index in body))
+            fitted[body] = shows(points, surface, scan.area)
+            if fitted[body[0]]:
+                motion, held[body] = icp(points, surface, matches.limit, scan.area, hold)
+                poses[body] = motion @ poses[body]
+    surfaces = facing(moved(shown, poses), scan.viewpoint)
+    return Registration(poses, fitted, held, match(scan.points, surfaces, limits[-1] * scan.size))
+
+
+def shows(points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, area: float) -> bool:
+    """Whether these points, each standing for ``area``, cover enough of the side that faces the scanner."""
+    return len(points) >= LEAST_POINTS and len(points) * area >= LEAST_SHARE * float(face_areas(surface).sum())
+
+
+def icp(
+    points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, limit: float, area: float, hold: bool
+) -> tuple[Float[np.ndarray, "4 4"], int]:
+    """The rigid motion of ``surface`` onto ``points``, and in how many directions it is held."""
+    library = load_icp()
+    samples = sample_surface(surface, area)
+    center = samples.mean(axis=(0, 1))
+    radius = float(np.linalg.norm(samples - center, axis=-1).max())
+    target, source = (library.PointCloud((a - center) / radius) for a in (samples.reshape(-1, 3), points))
+    tree = library.KdTree(target)
+    library.estimate_covariances(target, tree, CLUSTER)
+    library.estimate_covariances(source, num_neighbors=NEIGHBORS)
+    result = library.align(
+        target,
+        source,
+        tree,
+        registration_type="GICP",
+        max_correspondence_distance=2 * (limit + np.sqrt(area)) / radius,  # points are chosen; it only must not cut
+        max_iterations=ITERATIONS,
+        rotation_epsilon=1e-6,
+        translation_epsilon=1e-6,
+    )
+    points_to_surface, held = result.T_target_source, 0
+    if hold:
+        curvature = 2 * FLATNESS * result.H / max(result.num_inliers, 1)
+        points_to_surface, held = constrained(points_to_surface, curvature)
+    motion = inverse_rigid(points_to_surface)
+    motion[:3, 3] = center - motion[:3, :3] @ center + radius * motion[:3, 3]
+    return motion, held
+
+
+def constrained(
+    motion: Float[np.ndarray, "4 4"], curvature: Float[np.ndarray, "6 6"]
+) -> tuple[Float[np.ndarray, "4 4"], int]:
+    """``motion`` without its part along directions (turns, then shifts) curved less than ``LOOSE``, and how many."""
+    values, directions = np.linalg.eigh(curvature)
+    firm = directions[:, values >= LOOSE]
+    if firm.shape[1] == 6:
+        return motion, 0
+    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    kept = firm @ (firm.T @ np.concatenate([turn, motion[:3, 3]]))
+    return rigid(Rotation.from_rotvec(kept[:3]).as_matrix(), kept[3:]), 6 - firm.shape[1]

@@ -1,0 +1,258 @@
+"""Scores on test sets (paper, appendix B), and on synthetic views of a scene; for real scans see ``scan_evaluation``.
+
+The joint box of all true segments is divided into 100^3 cells; their centres are labelled by the truth and by the
+model, and those outside every segment's enlarged box are dropped. One confusion matrix is summed over the whole set;
+IoU and mIoU come from it, and the mean over single examples is reported beside it.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from rich.console import Console
+from rich.progress import track
+
+from mereo.evaluation.ground_truth import TruthGrid, truth_grid
+from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import Color, SegmentedMesh
+from mereo.models.model import Model
+from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
+from mereo.reconstruction.pipeline import segment_names
+from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
+
+PICTURES = 4
+"""The first few examples are drawn with their errors."""
+
+
+CELLS = 100
+"""The paper's grid along each axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class TestCase:
+    """One cloud with its truth, both in the same camera frame."""
+
+    __test__ = False  # not a test, whatever pytest thinks of the name
+
+    name: str
+    cloud: PointCloud
+    truth: TruthGrid
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedView:
+    """One row of the paper's figure of reconstructions.
+
+    Attributes:
+        name: the label at the left.
+        cloud: the input.
+        reference, predicted: labels on the same grid; 0 is empty space.
+        origin, spacing: voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the cloud's frame.
+        colors: of the segments; label k has ``colors[k - 1]``.
+    """
+
+    name: str
+    cloud: PointCloud
+    reference: UInt8[np.ndarray, "x y z"]
+    predicted: UInt8[np.ndarray, "x y z"]
+    origin: Float[np.ndarray, "3"]
+    spacing: Float[np.ndarray, "3"]
+    colors: Sequence[Color]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Scores of a test set.
+
+    Attributes:
+        names: of the segments.
+        confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
+        examples: scores of each test case by its name.
+        cases: the first few with their labels, for pictures.
+        segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
+    """
+
+    names: tuple[str, ...]
+    confusion: Int[np.ndarray, "c c"]
+    examples: dict[str, Scores]
+    cases: tuple[EvaluatedView, ...] = field(default=())
+    segmented: bool = True
+
+    @property
+    def scores(self) -> Scores:
+        """Over the whole set."""
+        return intersection_over_union(self.confusion, self.segmented)
+
+    @property
+    def example_mean(self) -> tuple[float, float]:
+        """IoU and mIoU averaged over the examples."""
+        each = self.examples.values()
+        mious = [s.miou for s in each if not np.isnan(s.miou)]
+        return float(np.mean([s.iou for s in each])), float(np.mean(mious)) if mious else float("nan")
+
+
+# --- one cloud -------------------------------------------------------------------------------------------------------
+
+
+def predict_grid(model: Model, cloud: PointCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
+    """The model's labels on the grid of ``truth``, evaluated coarse to fine."""
+    logits = partial(model.logits, model.encode(cloud))
+    grid = truth.grid
+    x, y, z = grid.labels.shape
+    return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
+
+
+def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segments: int) -> Int[np.ndarray, "c c"]:
+    """True against predicted labels of the points that count; all ``segments`` are one where the model knows one."""
+    labels = np.minimum(truth.grid.labels[truth.kept], segments)
+    return confusion_matrix(labels, predicted[truth.kept], segments + 1)
+
+
+def grid_scores(model: Model, cloud: PointCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
+    """The paper's evaluation of one cloud; ``truth`` is in the cloud's frame and units."""
+    check_names(model, truth.names)
+    grid = truth_grid(truth, cells)
+    segments = len(segment_names(model)[0])
+    return intersection_over_union(grid_confusion(grid, predict_grid(model, cloud, grid), segments), model.segmented)
+
+
+def check_names(model: Model, names: Sequence[str]) -> None:
+    """Raise ``ValueError`` unless the model's labels mean the same as the truth's."""
+    if tuple(names) != model.names:
+        raise ValueError(
+            f"the weights know the segments {', '.join(model.names)} but the truth has {', '.join(names)}; they must "
+            "be the same in the same order: use the weights that belong to this object"
+        )
+
+
+# --- test sets -------------------------------------------------------------------------------------------------------
+
+
+def evaluate(
+    model: Model,
+    scene: Scene | str | None = None,
+    *,
+    examples: int = 128,
+    seed: int = TEST_SEED_START,
+    cells: int = CELLS,
+    progress: bool = False,
+    settings: GenerateConfig | None = None,
+) -> Evaluation:
+    """Scores on synthetic views of a scene, seen as in training: through a noisy depth image.
+
+    Args:
+        model: the trained model.
+        scene: a scene, its name or its file; by default the built-in one that the model was trained on.
+        examples: how many; example i is made from (seed, i) alone.
+        seed: at least ``config.TEST_SEED_START``: smaller ones are for training.
+        cells: of the grid along each axis.
+        progress: show a bar with the time left.
+        settings: the camera (image size, noise, sensor); by default the paper's.
+
+    Raises ``ValueError`` for a training seed, no examples, or another object than the model's.
+    """
+    if seed < TEST_SEED_START:
+        raise ValueError(f"the seed is {seed}; training may have seen it: take a test seed, {TEST_SEED_START} or more")
+    if examples < 1:
+        raise ValueError(f"{examples} examples are asked for; at least 1 is needed: the paper takes 128")
+    if scene is None or isinstance(scene, str):
+        scene = load_scene(scene or trained_scene(model))
+    check_names(model, scene.rest.names)
+    return score_cases(
+        model, partial(_scene_case, scene, settings or GenerateConfig(), seed, cells), examples, progress
+    )
+
+
+def trained_scene(model: Model) -> str:
+    """The built-in scene in the weights' provenance; raises ``ValueError`` where there is none."""
+    scene = model.provenance.get("scene")
+    if not isinstance(scene, str):
+        raise ValueError("the weights do not say which scene they were trained on; name it with --scene")
+    if scene not in SCENES:
+        raise ValueError(
+            f"the weights were trained on the scene {scene!r}, which is not built in; its file is needed: name it with "
+            "--scene FILE.yaml"
+        )
+    return scene
+
+
+def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, index: int) -> TestCase:
+    view = sample_view(scene.for_seed(seed), settings, example_rng(seed, index))
+    return TestCase(f"{scene.name} {index}", view.depth.to_points(), truth_grid(view.mesh, cells))
+
+
+def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progress: bool) -> Evaluation:
+    """One confusion matrix over ``case(0) ... case(count - 1)``, which are made one at a time."""
+    names, colors = segment_names(model)
+    total = np.zeros((len(names) + 1,) * 2, dtype=np.int64)
+    examples: dict[str, Scores] = {}
+    pictures: list[EvaluatedView] = []
+    for one, predicted in _predictions(model, case, count, progress):
+        confusion = grid_confusion(one.truth, predicted, len(names))
+        total += confusion
+        examples[one.name] = intersection_over_union(confusion, model.segmented)
+        if len(pictures) < PICTURES:
+            pictures.append(_picture_case(one, predicted, colors))
+    return Evaluation(names, total, examples, tuple(pictures), model.segmented)
+
+
+def _predictions(
+    model: Model, case: Callable[[int], TestCase], count: int, progress: bool
+) -> Iterator[tuple[TestCase, UInt8[np.ndarray, "x y z"]]]:
+    for index in track(range(count), "evaluating", console=Console(stderr=True), disable=not progress):
+        one = case(index)
+        yield one, predict_grid(model, one.cloud, one.truth)
+
+
+# --- results ---------------------------------------------------------------------------------------------------------
+
+
+def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
+    """What ``metrics.json`` holds."""
+    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
+    return {
+        **facts,
+        "examples": len(evaluation.examples),
+        "definition": f"{CELLS}^3 cell centres of the joint box, kept inside any segment's box enlarged by 50 %; one "
+        "confusion matrix over the set; miou is the mean over the segments without empty space",
+        "iou": scores.iou,
+        "miou": scores.miou,
+        "per_segment": dict(zip(evaluation.names, scores.per_segment.tolist(), strict=True)),
+        "example_mean": {"iou": iou, "miou": miou},
+        "per_example": {name: {"iou": each.iou, "miou": each.miou} for name, each in evaluation.examples.items()},
+        "confusion": evaluation.confusion,
+    }
+
+
+def markdown_table(evaluation: Evaluation) -> str:
+    """The whole set and the mean over its examples; a dash where a score is undefined."""
+    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
+    names = " | ".join(evaluation.names)
+    values = " | ".join(_rounded(value) for value in scores.per_segment)
+    blank = " | ".join("" for _ in evaluation.names)
+    return (
+        f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
+        f"|---|---|---|{'---|' * len(evaluation.names)}\n"
+        f"| whole set | {_rounded(scores.iou)} | {_rounded(scores.miou)} | {values} |\n"
+        f"| mean over examples | {_rounded(iou)} | {_rounded(miou)} | {blank} |\n"
+    )
+
+
+def _rounded(score: float) -> str:
+    return "-" if np.isnan(score) else f"{score:.3f}"
+
+
+def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> EvaluatedView:
+    """Only points that count are shown."""
+    grid = one.truth.grid
+    reference = np.minimum(grid.labels, np.uint8(len(colors)))
+    shown = np.where(one.truth.kept, predicted, np.uint8(0))
+    return EvaluatedView(one.name, one.cloud, reference, shown, grid.origin, grid.spacing, colors)

@@ -1,0 +1,64 @@
+"""How large an experiment is: in minutes to prove that it runs, in hours on two cores, or as published."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from mereo.training.config import PRESETS, TrainConfig
+
+ExperimentName = Literal["reconstruction", "encoders-losses", "sampling", "positional-encoding", "noise", "real-world"]
+ScaleName = Literal["smoke", "cpu", "paper"]
+
+TRAINING_SEED = 1
+"""Of all datasets; test views come from ``config.TEST_SEED_START``."""
+
+
+@dataclass(frozen=True)
+class ExperimentScale:
+    """A budget.
+
+    Attributes:
+        name: its own.
+        recipe: training settings, from which an experiment changes what it compares.
+        rival: a second recipe to report beside it where an experiment compares whole recipes; None for one only.
+        examples, test_examples: of each dataset, and of each evaluation.
+        cells: of the evaluation's grid along each axis; the paper's is 100.
+        objects: the most objects on which variants are compared, in an experiment's own order; None means all.
+        downloads: whether objects are taken whose meshes are downloaded.
+        decides: whether networks learn enough for claims to be judged.
+    """
+
+    name: ScaleName
+    recipe: TrainConfig
+    rival: TrainConfig | None
+    examples: int
+    test_examples: int
+    cells: int
+    objects: int | None
+    downloads: bool
+    decides: bool = True
+
+    def choose(self, objects: tuple[str, ...]) -> tuple[str, ...]:
+        """Those of an experiment's objects that fit the budget."""
+        known = objects if self.downloads else tuple(name for name in objects if name not in DOWNLOADED)
+        return known[: self.objects]
+
+
+DOWNLOADED = ("human", "bunny", "skull", "liver", "tumor", "liver-simulated")
+
+_TINY, _PAPER = PRESETS["tiny"], PRESETS["paper"]
+
+# Small, because hours are few and there are dozens of runs: on two cores it learns more in minutes than the wide one.
+# Without alignment and template, so that what is left is the paper's network with local features and lines of sight:
+# each variant of the paper can be switched on its own in it, and it learns in minutes what the paper's network does not
+# learn in hours (docs/design/0002-learning.md).
+_SHORT = replace(
+    _TINY, network=replace(_TINY.network, points=512, align_points=0, rest_template=False), epochs=8, holdout=32
+)
+
+_ALL = (
+    ExperimentScale("smoke", replace(_TINY, epochs=1, holdout=4), None, 64, 2, 24, 1, downloads=False, decides=False),
+    ExperimentScale("cpu", _SHORT, None, 1536, 32, 64, 2, downloads=True),
+    ExperimentScale("paper", _PAPER, PRESETS["large"], 28_800, 128, 100, None, downloads=True),
+)
+
+SCALES = {str(scale.name): scale for scale in _ALL}

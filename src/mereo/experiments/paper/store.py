@@ -1,0 +1,113 @@
+"""Datasets, runs and scores under names made from their content, so that experiments share and never repeat them.
+
+    ROOT/datasets/SCENE-KEY   ROOT/runs/SCENE-KEY   ROOT/scores/SCENE-KEY
+
+A key is a hash of everything that decides the content. What was stopped half-way is continued.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mereo.evaluation.scoring import EvaluatedView, evaluate
+from mereo.experiments.paper.scales import TRAINING_SEED
+from mereo.io.atomic_files import write_json
+from mereo.models.weights import load_model
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.shards import MANIFEST, NOT_COMPARED, generate, make_manifest
+from mereo.training.config import TrainConfig
+from mereo.training.trainer import train
+from mereo.visualization.result_files import evaluate_weights
+
+FINISHED = "finished.json"
+"""Written into a run's folder after its last step."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """IoU and mIoU over a whole test set (paper, appendix B), and the means over its examples.
+
+    ``miou`` is NaN for a model that knows no segments.
+    """
+
+    iou: float
+    miou: float
+    example_iou: float
+    example_miou: float
+    per_segment: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Store:
+    """A folder of results; ``workers`` processes make datasets, which does not change them."""
+
+    root: Path
+    workers: int = 1
+
+    def dataset(self, scene: str, settings: GenerateConfig, examples: int) -> Path:
+        """A training set, made or found."""
+        manifest = make_manifest(load_scene(scene), settings, examples, TRAINING_SEED)
+        decisive = {key: value for key, value in manifest.items() if key not in NOT_COMPARED}
+        path = self.root / "datasets" / f"{scene}-{content_key(decisive)}"
+        _say("dataset", path)
+        started = (path / MANIFEST).exists()
+        generate(scene, path, settings, examples=examples, seed=TRAINING_SEED, workers=self.workers, resume=started)
+        return path
+
+    def run(self, dataset: Path, config: TrainConfig) -> Path:
+        """The weights of a training run, made, continued or found."""
+        path = self.root / "runs" / f"{_scene_of(dataset)}-{content_key([dataset.name, asdict(config)])}"
+        weights = path / "weights.safetensors"
+        _say("run", path)
+        if not (path / FINISHED).exists():
+            train(dataset, path, config)
+            write_json(path / FINISHED, {"dataset": dataset.name})
+        return weights
+
+    def score(self, weights: Path, settings: GenerateConfig, examples: int, cells: int) -> Score:
+        """A run's score on test views that are seen as ``settings`` say."""
+        scene = _scene_of(weights.parent)
+        key = content_key([weights.parent.name, asdict(settings), examples, cells, TEST_SEED_START])
+        path = self.root / "scores" / f"{scene}-{key}"
+        _say("score", path)
+        if not path.exists():
+            evaluate_weights(weights, path, examples=examples, cells=cells, settings=settings)
+        return read_score(path / "metrics.json")
+
+
+def example_case(weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
+    """The first test view with its labels, for pictures."""
+    evaluation = evaluate(load_model(weights), examples=1, cells=cells, settings=settings)
+    return evaluation.cases[0]
+
+
+def read_score(path: Path) -> Score:
+    """From the ``metrics.json`` of an evaluation, in which null stands for NaN."""
+    metrics = json.loads(path.read_text("utf-8"))
+    mean = metrics["example_mean"]
+    per_segment = {name: _number(value) for name, value in metrics["per_segment"].items()}
+    values = (_number(value) for value in (metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]))
+    iou, miou, example_iou, example_miou = values
+    return Score(iou, miou, example_iou, example_miou, per_segment)
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def content_key(value: Any) -> str:
+    """Twelve hexadecimal digits that stand for a JSON value."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _scene_of(path: Path) -> str:
+    return path.name.rsplit("-", 1)[0]
+
+
+def _say(kind: str, path: Path) -> None:
+    print(f"{kind} {path.name}", flush=True)

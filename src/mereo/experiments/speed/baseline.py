@@ -1,0 +1,86 @@
+"""The straightforward implementation of the same network, to compare with: what one writes first.
+
+Float32, eager; the code is concatenated to every query instead of being multiplied once per cloud; normalization is a
+layer of its own; farthest-point sampling inside the network, and the encoder run again for every chunk of queries. It
+takes its weights from a model and gives its labels. Nearest neighbours, which only local features need, are found as
+in the model itself.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mereo.geometry.normalizer import Normalizer
+from mereo.models.decoder import Code, Decoder, Prediction, joint_linear, line_of_sight
+from mereo.models.model import Model
+from mereo.models.network import Network
+
+CHUNK = 50_000
+"""Queries at once."""
+
+
+class Rival:
+    """A model's answers about one cloud. ``cloud`` and ``viewpoint`` are normalized, one cloud, any order."""
+
+    def __init__(self, model: Model, cloud: Float[Tensor, "1 n 3"], normalizer: Normalizer) -> None:
+        self.model, self.cloud, self.normalizer = model, cloud, normalizer
+        self.viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32)).to(cloud.device)
+
+    @torch.inference_mode()
+    def logits(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+        """Class logits at points in the user's frame, chunk by chunk."""
+        normalized = self.normalizer.apply(points).astype(np.float32)
+        chunks = []
+        for start in range(0, len(normalized), CHUNK):
+            queries = torch.from_numpy(normalized[start : start + CHUNK])[None].to(self.cloud.device)
+            found = self.model.class_logits(self._predict(self.model.network, queries), queries)
+            chunks.append(found[0].cpu())
+        return torch.cat(chunks).numpy()
+
+    def _predict(self, network: Network, queries: Float[Tensor, "1 q 3"]) -> Prediction:
+        count = int(self.cloud.shape[1] * network.config.ratio1)
+        first = farthest_points(self.cloud[0], count)
+        rest = torch.ones(self.cloud.shape[1], dtype=torch.bool, device=first.device)
+        rest[first] = False
+        ordered = torch.cat([self.cloud[:, first], self.cloud[:, rest]], dim=1)
+        alignment = None if network.aligner is None else network.aligner(ordered).alignment
+        encoding = network.encoder(ordered if alignment is None else alignment.apply(ordered))
+        code = network.decoder.prepare(encoding, ordered, self.viewpoint, alignment)
+        return decode(network.decoder, code, encoding.latent, queries)
+
+
+def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, " m"]:
+    """Greedy farthest-point sampling from the first point on, one point after the other; repeated points last."""
+    distance = torch.full((len(points),), torch.inf, device=points.device)
+    chosen = [torch.zeros((), dtype=torch.long, device=points.device)]
+    while len(chosen) < count:
+        distance = torch.minimum(distance, (points - points[chosen[-1]]).square().sum(dim=-1))
+        distance[chosen[-1]] = -1.0  # where points are repeated, each is still taken once
+        chosen.append(distance.argmax())
+    return torch.stack(chosen)
+
+
+def decode(decoder: Decoder, code: Code, latent: Float[Tensor, "1 z"], queries: Float[Tensor, "1 q 3"]) -> Prediction:
+    """As ``Decoder.forward``, with the latent vector at every query; the layers are the decoder's own."""
+    config = decoder.config
+    everywhere = latent[:, None].expand(-1, queries.shape[1], -1)
+    placed = queries if code.alignment is None else code.alignment.apply(queries)
+    encoded = decoder.encode(placed) if config.encode_positions else placed
+    rows = [everywhere, encoded]
+    if config.local_neighbors:
+        rows += [layer(level, placed) for layer, level in zip(decoder.local, code.levels, strict=True)]
+    if config.sight_neighbors:
+        rows.append(line_of_sight(queries, code.cloud, code.viewpoint, config.sight_neighbors))
+    hidden = encoded
+    for number, norm in enumerate(decoder.norms):
+        if number > 0:
+            rows = [hidden]
+        if number == config.skip_after:
+            rows += [everywhere, encoded]
+            if decoder.lookup is not None:
+                rows.append(decoder.lookup(hidden, placed)[1])
+        hidden = joint_linear(decoder.summands(number), rows, None)
+        hidden = torch.relu(norm(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
+    logits, distance, direction = decoder.head(hidden).split([decoder.classes, 1, 3], dim=-1)
+    return Prediction(logits, distance[..., 0], direction)

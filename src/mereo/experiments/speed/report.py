@@ -1,0 +1,125 @@
+"""What ``mereo bench`` prints and writes."""
+
+import os
+import platform
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mereo.evaluation.sample_views import SampleView, load_frame, shipped_frames
+from mereo.experiments.speed.fitted_model import fitted_model
+from mereo.experiments.speed.roofline import Machine, measure_machine
+from mereo.experiments.speed.stages import Bench, Stage, random_points
+from mereo.io.atomic_files import write_json
+from mereo.models.config import Precision
+from mereo.models.device import cpu_features
+from mereo.models.model import Model
+from mereo.models.weights import load_model
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a lower precision changes at 40,000 points of the object's box.
+
+    Attributes:
+        labels: share of points with another label.
+        distance: mean change of the distance, as a share of half the longest visible side.
+    """
+
+    labels: float
+    distance: float
+
+
+def benchmark(
+    weights: str | None,
+    preset: str,
+    device: torch.device,
+    precision: Precision,
+    repeats: int,
+    rival: bool,
+    output: Path | None,
+) -> list[Stage]:
+    """Time all stages, print the table, and write it as JSON where ``output`` says so.
+
+    Weights are a shipped name or a file with a shipped frame of its object; without, the preset's network is fitted to
+    a frame first. Raises ``ValueError`` for weights of an object without a shipped frame.
+    """
+    model, frame = _subject(weights, preset)
+    model.network.to(device)
+    fast = replace(model, precision=precision)
+    machine = measure_machine(device, fast.working_dtype)
+    stages = Bench(fast, frame, machine, repeats, rival).run()
+    facts = _facts(weights or f"preset {preset}, fitted to one frame", fast, machine)
+    cost = _cost(model, fast, frame) if fast.working_dtype is not torch.float32 else None
+    print(table(stages, facts, cost))
+    if output is not None:
+        rows = [{**asdict(stage), "ratio": stage.ratio} for stage in stages]
+        write_json(output, {**facts, "cost": None if cost is None else asdict(cost), "stages": rows})
+        print(f"wrote {output}")
+    return stages
+
+
+def _subject(weights: str | None, preset: str) -> tuple[Model, SampleView]:
+    if weights is None:
+        frame = load_frame(shipped_frames()[0])
+        return fitted_model(preset, frame), frame
+    model = load_model(weights)
+    scene = str(model.provenance.get("scene"))
+    if scene not in shipped_frames():
+        raise ValueError(
+            f"the weights know {scene!r}, of which no frame is shipped; there are frames of "
+            f"{', '.join(shipped_frames())}: time the architecture instead, with --preset"
+        )
+    return model, load_frame(scene)
+
+
+def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:
+    device = model.device
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
+    return {
+        "model": subject,
+        "device": f"{device.type}, {name}",
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "amx": bool(cpu_features()["amx"]),
+        "precision": model.working_precision,
+        "gigaflops": machine.operations / 1e9,
+        "gigabytes_per_second": machine.bandwidth / 1e9,
+    }
+
+
+def _cost(exact: Model, fast: Model, frame: SampleView) -> Cost:
+    cloud = frame.depth.to_points()
+    points = random_points(frame, 40_000, seed=1)
+    code = exact.encode(cloud)
+    one, two = exact.query(code, points), fast.query(fast.encode(cloud), points)
+    change = np.abs(one.distance - two.distance).mean() * code.normalizer.scale
+    return Cost(float((one.label != two.label).mean()), float(change))
+
+
+def table(stages: list[Stage], facts: dict[str, Any], cost: Cost | None = None) -> str:
+    """Markdown; times in milliseconds."""
+    lines = [
+        f"{facts['model']}; {facts['device']}, {facts['threads']} threads of {facts['cores']} cores, AMX "
+        f"{'yes' if facts['amx'] else 'no'}, {facts['precision']}; products {facts['gigaflops']:.0f} GFLOP/s, "
+        f"copies {facts['gigabytes_per_second']:.0f} GB/s",
+        "",
+        "| stage | median, ms | 99 %, ms | floor, ms | times the floor | straightforward, ms | times faster |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for stage in stages:
+        cells = [stage.median, stage.slowest, stage.floor]
+        rival = "" if stage.rival is None else f"{1e3 * stage.rival:.0f}"
+        ratio = "" if stage.ratio is None else f"{stage.ratio:.1f}"
+        times = " | ".join(f"{1e3 * value:.3g}" for value in cells)
+        lines.append(f"| {stage.name} | {times} | {stage.median / stage.floor:.1f} | {rival} | {ratio} |")
+    if cost is not None:
+        lines += [
+            "",
+            f"Against float32: {cost.labels:.2%} of labels change, distances by {cost.distance:.2g} of half the "
+            "object's longest visible side on average.",
+        ]
+    return "\n".join(lines) + "\n"

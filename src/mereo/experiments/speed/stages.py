@@ -1,0 +1,230 @@
+"""The stages of an answer, each timed against its floor and, where there is one, the rival."""
+
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from mereo.evaluation.sample_views import SampleView
+from mereo.experiments.speed.baseline import Rival
+from mereo.experiments.speed.roofline import Machine, Work, count_operations, seconds
+from mereo.geometry.normalizer import Normalizer
+from mereo.models.cuda_graphs import StaticFrames
+from mereo.models.model import EncodedCloud, Model
+from mereo.reconstruction.coarse_to_fine import changing_cells, over_corners, sample_coarse_to_fine, sample_dense
+from mereo.reconstruction.isosurfaces import extract_dense, extract_whole, locate
+from mereo.reconstruction.pipeline import SEARCH_BOX
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage's times in seconds.
+
+    Attributes:
+        name: what is done.
+        median, slowest: of our repetitions; the 99th percentile stands for the slowest where there are a hundred.
+        floor: the least that this machine could take.
+        rival: the straightforward implementation's median; None where it was not run.
+    """
+
+    name: str
+    median: float
+    slowest: float
+    floor: float
+    rival: float | None = None
+
+    @property
+    def ratio(self) -> float | None:
+        """How many times faster than the rival."""
+        return None if self.rival is None else self.rival / self.median
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Everything that is timed about one model and frame.
+
+    Attributes:
+        repeats: of each stage; the rival's grids run once.
+        rival: time the straightforward implementation too, and compare its labels.
+    """
+
+    model: Model
+    frame: SampleView
+    machine: Machine
+    repeats: int = 7
+    rival: bool = False
+
+    def run(self) -> list[Stage]:
+        """All stages, in the order of an answer. Raises ``RuntimeError`` where the rival's labels differ."""
+        self._warm_up()
+        return [self.prepare(), self.encode(), self.queries(40_000), self.whole_frame(), self.labels(), self.surfaces()]
+
+    def prepare(self) -> Stage:
+        """Depth image to normalized points in farthest-point order."""
+        cloud = self.frame.depth.to_points()
+        points, kept = len(cloud), self.model.network.config.points
+        # each chosen point is compared with all: differences, squares, sums and the smaller distance
+        work = Work(operations=9.0 * points * min(points, kept), bytes=float(self.frame.depth.depth.nbytes))
+        return self._stage("preprocessing", work, lambda: self.model.normalized_cloud(self.frame.depth.to_points()))
+
+    def encode(self) -> Stage:
+        """The network's encoder; preprocessing is not in it."""
+        cloud, normalizer = self._input()
+        viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32)).to(self.model.device)
+        with torch.inference_mode():
+            return self._network_stage("encoder", lambda: self.model.inference.encode(cloud, viewpoint))
+
+    def queries(self, count: int) -> Stage:
+        """Class logits at random points of the object's box."""
+        points = random_points(self.frame, count)
+        ours = partial(self.model.logits, self._code, points)
+        rival = partial(self._rival().logits, points) if self.rival else None
+        if rival is not None:
+            self._compare(ours(), rival())
+        return self._network_stage(f"{count // 1000}k queries", ours, rival)
+
+    def whole_frame(self) -> Stage:
+        """Depth image to labels of 10,000 and then 40,000 points, as in the authors' follow-up.
+
+        On CUDA by graphs of fixed shapes, which an autodecoder does not have.
+        """
+        coarse, fine = random_points(self.frame, 10_000), random_points(self.frame, 40_000)
+
+        def plain() -> None:
+            code = self.model.encode(self.frame.depth.to_points())
+            self.model.logits(code, coarse)
+            self.model.logits(code, fine)
+
+        ours = plain if self.model.device.type == "cpu" else self._by_graphs(coarse, fine)
+
+        def straightforward() -> None:
+            rival = self._rival()
+            rival.logits(coarse)
+            rival.logits(fine)
+
+        name = "a frame: 10k + 40k queries"
+        return self._network_stage(name, ours, straightforward if self.rival else None, counted=plain)
+
+    def labels(self) -> Stage:
+        """The labels of the evaluation's grid, 100^3 cells."""
+        grid = self.frame.truth.grid
+        x, y, z = grid.labels.shape
+        field = partial(self.model.logits, self._code)
+
+        def ours() -> UInt8[np.ndarray, "x y z"]:
+            return sample_coarse_to_fine(field, grid.origin, grid.spacing, (x, y, z)).labels
+
+        work = self._grid_work(ours())
+        rival = (
+            partial(sample_dense, self._rival().logits, grid.origin, grid.spacing, (x, y, z)) if self.rival else None
+        )
+        return self._stage(f"labels, {x} x {y} x {z}", work, ours, rival, once=True)
+
+    def surfaces(self) -> Stage:
+        """Closed meshes of all segments, 128 cells along the longest side; finding the object's box is in it."""
+        model = self.model
+        field, search = partial(model.logits, self._code), self._code.normalizer.invert(SEARCH_BOX)
+
+        def ours() -> UInt8[np.ndarray, "x y z"]:
+            found = extract_whole(field, locate(field, search), 128, model.names, model.colors, model.nested)
+            return found.grid.labels
+
+        box = locate(field, search)
+        dense = partial(extract_dense, resolution=128, names=model.names, colors=model.colors, nested=model.nested)
+        rival = (lambda: dense(self._rival().logits, box)) if self.rival else None
+        return self._stage("surfaces of all segments, 128", self._grid_work(ours()), ours, rival, once=True)
+
+    # --- parts ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _code(self) -> EncodedCloud:
+        return self.model.encode(self.frame.depth.to_points())
+
+    def _by_graphs(
+        self, coarse: Float[np.ndarray, "n 3"], fine: Float[np.ndarray, "m 3"]
+    ) -> Callable[[], UInt8[np.ndarray, " m"]]:
+        frames = StaticFrames(self.model, self.frame.depth.camera, (len(coarse), len(fine)))
+
+        def answer() -> UInt8[np.ndarray, " m"]:
+            frames.see(self.frame.depth.depth)
+            frames.ask(coarse)
+            return frames.ask(fine)[0]
+
+        answer()  # records the graphs
+        return answer
+
+    def _warm_up(self) -> None:
+        self.model.logits(self._code, random_points(self.frame, 8192))
+
+    def _input(self) -> tuple[torch.Tensor, Normalizer]:
+        cloud, normalizer = self.model.normalized_cloud(self.frame.depth.to_points())
+        return cloud.to(self.model.device), normalizer
+
+    def _rival(self) -> Rival:
+        return Rival(self.model, *self._input())
+
+    def _grid_work(self, labels: UInt8[np.ndarray, "x y z"]) -> Work:
+        """Asking the corners of every cell that holds a change of label, and nothing else."""
+        points = random_points(self.frame, 4096)
+        each = count_operations(lambda: self.model.logits(self._code, points)) / len(points)
+        return Work(each * int(needed_nodes(labels).sum()), float(labels.nbytes))
+
+    def _network_stage(
+        self,
+        name: str,
+        ours: Callable[[], object],
+        rival: Callable[[], object] | None = None,
+        counted: Callable[[], object] | None = None,
+    ) -> Stage:
+        """``counted`` does the same operations in a way that can be counted; by default ``ours`` does."""
+        weights = sum(parameter.nbytes for parameter in self.model.inference.parameters())
+        return self._stage(name, Work(count_operations(counted or ours), float(weights)), ours, rival)
+
+    def _stage(
+        self,
+        name: str,
+        work: Work,
+        ours: Callable[[], object],
+        rival: Callable[[], object] | None = None,
+        once: bool = False,
+    ) -> Stage:
+        """Ours and the rival's take turns, so that a busy machine slows both."""
+        mine, theirs, device = [], [], self.model.device
+        for repeat in range(self.repeats):
+            mine.append(seconds(ours, device))
+            if rival is not None and not (once and repeat):
+                theirs.append(seconds(rival, device))
+        slowest = float(np.quantile(mine, 0.99))
+        return Stage(
+            name,
+            statistics.median(mine),
+            slowest,
+            work.seconds(self.machine),
+            statistics.median(theirs) if theirs else None,
+        )
+
+    @staticmethod
+    def _compare(ours: Float[np.ndarray, "n c"], theirs: Float[np.ndarray, "n c"]) -> None:
+        """Labels must agree wherever the leading class leads by more than rounding."""
+        best = np.sort(theirs, axis=1)
+        clear = best[:, -1] - best[:, -2] > 1e-3 * np.abs(theirs).max()
+        wrong = int((ours.argmax(axis=1) != theirs.argmax(axis=1))[clear].sum())
+        if wrong:
+            raise RuntimeError(f"{wrong} of {len(ours)} labels differ between the model and the rival; they must agree")
+
+
+def random_points(frame: SampleView, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+    """Places in the box of the frame's object."""
+    grid = frame.truth.grid
+    return grid.origin + np.random.default_rng(seed).random((count, 3)) * grid.spacing * grid.labels.shape
+
+
+def needed_nodes(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Corners of the cells whose corners do not all have one label."""
+    around = np.pad(changing_cells(labels), 1)  # cells beyond the grid change nothing
+    needed: np.ndarray = over_corners(around, np.logical_or)
+    return needed

@@ -1,0 +1,16 @@
+"""Conventions shared by every room: axes of clouds, units of length, the least number of points."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal
+
+MIN_POINTS = 32
+"""Fewer observed points say too little about an object: they are refused, drawn again, or left as they were."""
+
+
+CloudAxes = Literal["camera", "scanner"]
+"""Axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner."""
+
+
+UNITS_M: Mapping[str, float] = MappingProxyType({"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254})
+"""Metres in each unit of length that files and options may name."""

@@ -1,0 +1,61 @@
+"""Labels in space: on a regular grid, and on the points of a cloud."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from mereo.geometry.mesh import Color
+
+
+@dataclass(frozen=True, eq=False)
+class LabelGrid:
+    """Labels on a regular grid.
+
+    Attributes:
+        labels: 0 is empty space, k is ``names[k - 1]``.
+        origin: position of the centre of voxel [0, 0, 0].
+        spacing: between voxel centres along x, y, z.
+        names: of the segments.
+    """
+
+    labels: UInt8[np.ndarray, "x y z"]
+    origin: Float[np.ndarray, "3"]
+    spacing: Float[np.ndarray, "3"]
+    names: tuple[str, ...]
+
+    def axes(self) -> tuple[Float[np.ndarray, " x"], Float[np.ndarray, " y"], Float[np.ndarray, " z"]]:
+        """Coordinates of the voxel centres along each axis."""
+        x, y, z = (self.origin[i] + np.arange(self.labels.shape[i]) * self.spacing[i] for i in range(3))
+        return x, y, z
+
+    def positions(self, index: Int[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Centres of voxels given by their index."""
+        return self.origin + index * self.spacing
+
+    def touched_sides(self) -> Bool[np.ndarray, "2 3"]:
+        """Whether a segment reaches the grid's lower and upper border along x, y, z."""
+        ends = [[np.take(self.labels, end, axis=axis).any() for axis in range(3)] for end in (0, -1)]
+        return np.array(ends, dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedCloud:
+    """The observed points and the segment that each lies on.
+
+    Attributes:
+        points: in the input's frame and units.
+        labels: of the most likely segment, from 1 up. Empty space does not compete: a point on the surface is half in
+            it, so it would win every second time.
+        confidence: probability of that segment among the segments.
+        occupancy: probability of any segment against empty space: about a half on the surface of the object, near 0 at
+            points that are not on it.
+        names, colors: of the segments; ``names[k]`` has label k + 1.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+    confidence: Float[np.ndarray, " n"]
+    occupancy: Float[np.ndarray, " n"]
+    names: tuple[str, ...]
+    colors: tuple[Color, ...]

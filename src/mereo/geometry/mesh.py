@@ -1,0 +1,222 @@
+"""Segmented meshes: an object as named, coloured, closed triangle meshes.
+
+Label ``0`` is empty space everywhere in the package; label ``i + 1`` is ``mesh.segments[i]``. Names and colours are
+part of the data: they travel through datasets, weights and every export, so a label never changes its meaning.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+Color = tuple[int, int, int]
+"""Red, green, blue in 0..255."""
+
+PALETTE: tuple[Color, ...] = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (0, 158, 115),
+    (240, 228, 66),
+    (213, 94, 0),
+    (204, 121, 167),
+    (0, 114, 178),
+    (150, 150, 150),
+    (148, 103, 189),
+    (140, 86, 75),
+    (23, 190, 207),
+    (188, 189, 34),
+)
+"""Okabe and Ito's colours first: distinguishable with colour-vision deficiency."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """One closed part of an object.
+
+    Attributes:
+        name: stable identifier, unique in its mesh.
+        color: red, green, blue in 0..255.
+        vertices: positions, any unit.
+        faces: vertex indices, counter-clockwise seen from outside.
+        solid: whether the faces bound a solid, closed and free of self-intersections. Of a mesh that does not, the
+            generalized winding number decides what is inside, which is slower.
+    """
+
+    name: str
+    color: Color
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    solid: bool = True
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """Lower and upper corner of the axis-aligned box."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @property
+    def volume(self) -> float:
+        """Signed volume (divergence theorem); negative when the faces are inside out."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+    def edge_imbalance(self) -> tuple[int, int]:
+        """``(open, misoriented)`` edge counts: both zero exactly when the mesh is closed and coherently oriented."""
+        directed = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+        low, high = directed.min(axis=1), directed.max(axis=1)
+        key = low * (len(self.vertices) + 1) + high
+        _, inverse, uses = np.unique(key, return_inverse=True, return_counts=True)
+        winding = np.bincount(inverse, weights=np.where(directed[:, 0] == low, 1, -1), minlength=len(uses))
+        open_edges = uses % 2 == 1
+        return int(open_edges.sum()), int(((winding != 0) & ~open_edges).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedMesh:
+    """An object: closed segments that touch but do not overlap, except that one may lie inside another.
+
+    Attributes:
+        segments: in label order.
+        nested: pairs of names (inner, outer): ``outer``'s mesh is its outer surface alone, and the volume inside
+            ``inner`` belongs to ``inner``. The inner segment comes first in ``segments``, so that "the first segment
+            wins" decides everywhere. See docs/design/0005-nested.md.
+    """
+
+    segments: tuple[Segment, ...]
+    nested: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        names = [segment.name for segment in self.segments]
+        if not names:
+            raise ValueError("a segmented mesh has 0 segments; it needs at least one: pass the parts of the object")
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise ValueError(f"segment name {repeated[0]!r} is used twice; names must be unique: rename one of them")
+        if len(names) > 254:
+            raise ValueError(f"a segmented mesh has {len(names)} segments; labels hold at most 254: merge some")
+        for inner, outer in self.nested:
+            if missing := [name for name in (inner, outer) if name not in names]:
+                raise ValueError(
+                    f"{inner!r} is declared nested in {outer!r}, but no segment is called {missing[0]!r}; the segments "
+                    f"are {', '.join(names)}: correct the name"
+                )
+            if names.index(inner) >= names.index(outer):
+                raise ValueError(
+                    f"segment {inner!r} is declared nested in {outer!r} but does not come before it; the first of two "
+                    f"segments owns what both hold: put {inner!r} first"
+                )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(segment.name for segment in self.segments)
+
+    @property
+    def colors(self) -> tuple[Color, ...]:
+        return tuple(segment.color for segment in self.segments)
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """Joint axis-aligned box of all segments."""
+        boxes = np.stack([segment.bounds for segment in self.segments])
+        return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+
+    @property
+    def nesting(self) -> tuple[tuple[int, int], ...]:
+        """``nested`` as indices of segments, with what follows: a in b and b in c puts a in c."""
+        index = {name: i for i, name in enumerate(self.names)}
+        pairs = {(index[inner], index[outer]) for inner, outer in self.nested}
+        while more := {(a, d) for a, b in pairs for c, d in pairs if b == c} - pairs:
+            pairs |= more
+        return tuple(sorted(pairs))
+
+    @property
+    def opaque(self) -> tuple[bool, ...]:
+        """For each segment whether to draw it opaque: it hides no segment that has faces."""
+        hiding = {outer for inner, outer in self.nesting if len(self.segments[inner].faces)}
+        return tuple(index not in hiding for index in range(len(self.segments)))
+
+    @property
+    def owned_volumes(self) -> Float[np.ndarray, " s"]:
+        """The volume that belongs to each segment: its mesh's without that of the segments nested in it."""
+        volumes = np.array([segment.volume for segment in self.segments])
+        for outer in (i for i, s in enumerate(self.segments) if len(s.faces)):  # the inner ones come first and are done
+            volumes[outer] -= sum(volumes[inner] for inner, other in self.nesting if other == outer)
+        return volumes
+
+    def with_vertices(self, vertices: Sequence[Float[np.ndarray, "_ 3"]]) -> "SegmentedMesh":
+        """The same segments at other positions; ``vertices[i]`` belongs to ``segments[i]``."""
+        moved = tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True))
+        return replace(self, segments=moved)
+
+    def transformed(self, transform: Float[np.ndarray, "4 4"]) -> "SegmentedMesh":
+        """All vertices mapped by a homogeneous transform."""
+        rotation, translation = transform[:3, :3], transform[:3, 3]
+        return self.with_vertices([s.vertices @ rotation.T + translation for s in self.segments])
+
+    def merged(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, " f"]]:
+        """All segments in one array: vertices, faces, and for each face the index of its segment."""
+        offsets = np.cumsum([0] + [len(s.vertices) for s in self.segments])
+        vertices = np.concatenate([s.vertices for s in self.segments])
+        faces = np.concatenate([s.faces + o for s, o in zip(self.segments, offsets, strict=False)])
+        owner = np.repeat(np.arange(len(self.segments)), [len(s.faces) for s in self.segments])
+        return vertices, faces, owner
+
+    def check(self) -> None:
+        """Raise ``ValueError`` unless every segment is finite, closed, outward oriented and of positive volume.
+
+        Of a segment that is marked as no solid, only finite vertices and existing indices are asked.
+        Overlap between segments needs inside tests, see ``mereo.geometry.overlap.check_overlap``.
+        """
+        for segment in self.segments:
+            check_segment(segment)
+
+
+def check_segment(segment: Segment) -> None:
+    """Raise ``ValueError`` naming the segment, the rule it breaks and the cure."""
+    name, faces, vertices = segment.name, segment.faces, segment.vertices
+    if len(faces) == 0:
+        raise ValueError(f"segment {name!r} has no faces; it must be a closed mesh: check the exported part")
+    if not np.isfinite(vertices).all():
+        raise ValueError(f"segment {name!r} has NaN or infinite vertices; all must be finite: export the part again")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(
+            f"segment {name!r} has a face that refers to vertex {int(faces.max())} of {len(vertices)}; "
+            "indices must exist: export the part again"
+        )
+    if not segment.solid:
+        return
+    open_edges, misoriented = segment.edge_imbalance()
+    if open_edges:
+        raise ValueError(
+            f"segment {name!r} has {open_edges} open edges; it must be closed: fill its holes "
+            "(for example trimesh.repair.fill_holes or MeshLab's 'Close Holes')"
+        )
+    if misoriented:
+        raise ValueError(
+            f"segment {name!r} has {misoriented} edges whose faces disagree in orientation; all faces must be "
+            "counter-clockwise from outside: fix the winding (for example trimesh.repair.fix_winding)"
+        )
+    if segment.volume <= 0:
+        raise ValueError(
+            f"segment {name!r} has volume {segment.volume:.4g}; it must be positive: its faces point inwards, "
+            "so reverse them (for example trimesh.repair.fix_inversion)"
+        )
+
+
+def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Barycentric coordinates of points in the planes of their triangles."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    normal = np.cross(b - a, c - a)
+    size = np.maximum(np.einsum("ni,ni->n", normal, normal), 1e-30)
+    v = np.einsum("ni,ni->n", np.cross(points - a, c - a), normal) / size
+    w = np.einsum("ni,ni->n", np.cross(b - a, points - a), normal) / size
+    return np.stack([1 - v - w, v, w], axis=1)
+
+
+def vertex_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
+    """Unit normals, outward, weighted by the area of the faces around."""
+    a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
+    normals = np.zeros_like(segment.vertices)
+    for k in range(3):
+        np.add.at(normals, segment.faces[:, k], np.cross(b - a, c - a))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

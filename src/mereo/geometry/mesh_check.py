@@ -1,0 +1,100 @@
+"""What is wrong with a user's meshes, each segment by itself; for segments with each other see ``overlap``."""
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from jaxtyping import Float, Int
+
+from mereo.geometry.mesh import Segment
+
+BESIDE = 1e-4
+"""How far beside a face the winding number is asked, in diagonals of the box; libigl's is in single precision."""
+
+NEGLIGIBLE = 1e-3
+"""Share of a segment's surface that may face inwards."""
+
+MOST_BURIED = 5e-3
+"""Share of a segment's surface that may lie within itself, as lips and eyelids do: two rays are compared anyway."""
+
+MOST_BACKWARDS = 0.05
+"""Share of the surface that may face inwards before the winding number has no meaning."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """What is wrong with one segment, as parts of a sentence that starts with its name.
+
+    Attributes:
+        dirty: faults that the winding number copes with.
+        hopeless: faults that leave no inside.
+    """
+
+    dirty: tuple[str, ...] = ()
+    hopeless: tuple[str, ...] = ()
+
+    @property
+    def sound(self) -> bool:
+        return not (self.dirty or self.hopeless)
+
+
+def examine(segment: Segment) -> Health:
+    """The faults of a mesh: missing or broken data, open edges, faces that disagree, face inwards or are buried.
+
+    Across a face the winding number rises by one from its front to its back. In front of it, it is 0 on a solid's
+    surface, 1 where the face lies within the mesh itself (a self-intersection), and -1 where it faces inwards.
+    """
+    vertices, faces = segment.vertices, segment.faces
+    if len(faces) == 0:
+        return Health(hopeless=("has no faces",))
+    if not np.isfinite(vertices).all():
+        return Health(hopeless=("has NaN or infinite vertices",))
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        return Health(hopeless=(f"has a face that refers to vertex {int(faces.max())} of {len(vertices)}",))
+    if not (segment.bounds[1] > segment.bounds[0]).all():
+        return Health(hopeless=("is flat, without any volume",))
+    dirty = []
+    open_edges, misoriented = segment.edge_imbalance()
+    if open_edges:
+        dirty.append(f"has {open_edges} open edges (holes)")
+    buried, backwards = _wrong_shares(segment)
+    if backwards > MOST_BACKWARDS:
+        return Health(tuple(dirty), (f"has {backwards:.0%} of its surface facing inwards",))
+    if misoriented:
+        dirty.append(f"has {misoriented} edges at which faces disagree in orientation")
+    if buried > MOST_BURIED:
+        dirty.append(f"intersects itself ({buried:.1%} of its surface lies within it)")
+    return Health(tuple(dirty))
+
+
+def faces_astray(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Whether neighbouring faces disagree in orientation, or some face inwards."""
+    segment = Segment("", (0, 0, 0), vertices, faces)
+    return segment.edge_imbalance()[1] > 0 or _wrong_shares(segment)[1] > NEGLIGIBLE
+
+
+def _wrong_shares(segment: Segment) -> tuple[float, float]:
+    """Shares of the surface that lie within the mesh itself, and that face inwards."""
+    low, high = segment.bounds
+    vertices = (segment.vertices - (low + high) / 2) / float(np.linalg.norm(high - low))
+    a, b, c = (vertices[segment.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1)
+    proper = area > 1e-12
+    front = ((a + b + c) / 3)[proper] + BESIDE * normal[proper] / area[proper, None]
+    winding = igl.fast_winding_number(vertices, segment.faces.astype(np.int64), front)
+    share = area[proper] / area.sum()
+    return float(share[winding > 0.5].sum()), float(share[winding < -0.5].sum())
+
+
+# --- units ------------------------------------------------------------------------------------------------------------
+
+
+def likely_unit(bounds: Float[np.ndarray, "2 3"]) -> str:
+    """A guess from the longest side: CAD and scanners write millimetres, robots and glTF metres."""
+    longest = float((bounds[1] - bounds[0]).max())
+    return "m" if longest < 3 else "mm"
+
+
+PLAUSIBLE_M = (0.005, 5.0)
+"""Longest side of what a depth camera looks at: from 5 mm to 5 m."""

@@ -1,0 +1,233 @@
+"""Solid queries on closed meshes: which segment holds a point, how far is its surface, which way.
+
+Inside tests cast one ray and ask whether the first face hit is seen from behind. Two rays in unrelated directions are
+compared; where they disagree (a ray through an edge, an imperfect mesh) the generalized winding number decides
+(Jacobson et al., SIGGRAPH 2013; Barill et al., SIGGRAPH 2018). Each segment has a ray scene of its own: in a joint one
+the coincident faces of two neighbours would make the first face hit ambiguous. A segment that is marked as no solid
+(holes, self-intersections) is left to the winding number altogether.
+"""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import igl
+import numpy as np
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Bool, Float, Int, UInt8
+
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.raycasting import Hits, first_hits, ray_scene, toward
+from mereo.geometry.winding_number import winding_grid
+
+_DIRECTIONS = np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32)
+"""Two generic directions: not along any axis, face diagonal or each other."""
+
+
+class _Solid:
+    """One closed segment with its search structures, built on first use."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.vertices = np.ascontiguousarray(segment.vertices, dtype=np.float64)
+        self.faces = np.ascontiguousarray(segment.faces, dtype=np.int64)
+        self.is_solid = segment.solid
+        self.low, self.high = segment.bounds
+        self.center = (self.low + self.high) / 2
+
+    @cached_property
+    def rays(self) -> EmbreeScene:
+        # about its own centre: a camera frame is hundreds of units away, where single precision is coarse
+        return ray_scene(self.vertices - self.center, self.faces)
+
+    @cached_property
+    def tree(self) -> igl.AABB:
+        tree = igl.AABB()
+        tree.init(self.vertices, self.faces)
+        return tree
+
+    def in_box(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether points lie strictly in the segment's box, outside of which nothing is inside."""
+        result = np.ones(len(points), dtype=bool)
+        for axis in range(3):
+            result &= (points[:, axis] > self.low[axis]) & (points[:, axis] < self.high[axis])
+        return result
+
+    def holds(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether points, already known to lie in the box, are inside."""
+        if len(points) == 0:
+            return np.zeros(0, dtype=bool)
+        if not self.is_solid:
+            return igl.fast_winding_number(self.vertices, self.faces, points) > 0.5
+        first, second = self._behind_first_hit(points)
+        doubtful = first != second
+        if doubtful.any():
+            first[doubtful] = igl.fast_winding_number(self.vertices, self.faces, points[doubtful]) > 0.5
+        return first
+
+    def _behind_first_hit(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "2 n"]:
+        """For each of two rays whether the first face it hits is seen from behind."""
+        origins = np.tile((points - self.center).astype(np.float32), (2, 1))
+        directions = np.repeat(_DIRECTIONS, len(points), axis=0)
+        hits = self.rays.run(origins, directions, output=True)
+        normals = hits["Ng"].reshape(2, -1, 3)
+        behind = np.stack([normal @ direction for normal, direction in zip(normals, _DIRECTIONS, strict=True)]) > 0
+        return behind & (hits["primID"].reshape(2, -1) >= 0)
+
+    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+        """Which rays from the origin hit the segment, and where each of them does first."""
+        rows = toward(directions, self.low, self.high)
+        hit, found = first_hits(self.rays, self.center, directions[rows])
+        return rows[hit], found
+
+    def closest(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """Squared distance to the surface, face and place of the closest surface point."""
+        squared, face, place = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
+        return squared, face.astype(np.int64), place  # libigl's faces are C's long long, which numpy tells apart
+
+    def squared_distance_to_box(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """At most the squared distance to the surface, for points outside the box; 0 inside it."""
+        outside = np.maximum(np.maximum(self.low - points, points - self.high), 0.0)
+        return np.einsum("ij,ij->i", outside, outside)
+
+
+class Nearest(NamedTuple):
+    """The closest surface point of each query point.
+
+    For a point of a nested segment, or of the one around it, the surface of all that is nearest bounds what its owner
+    owns: the way out of the inner segment meets the inner surface first, the way in from empty space the outer one.
+
+    Attributes:
+        distance: unsigned.
+        point: where it is.
+        face: which face of ``mesh.merged()`` it lies on.
+        owner: that face's segment.
+    """
+
+    distance: Float[np.ndarray, " n"]
+    point: Float[np.ndarray, "n 3"]
+    face: Int[np.ndarray, " n"]
+    owner: Int[np.ndarray, " n"]
+
+
+class Solids:
+    """Queries on all segments of an object. Satisfies ``ownership.Shape``.
+
+    Points are [n, 3] in the mesh's frame; distances are in its units.
+    """
+
+    def __init__(self, mesh: SegmentedMesh) -> None:
+        self.mesh = mesh
+        self.count = len(mesh.segments)
+        self.nesting = mesh.nesting
+        self._solids = [_Solid(segment) for segment in mesh.segments]
+
+    @cached_property
+    def _merged(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, " f"]]:
+        return self.mesh.merged()
+
+    def boxes(self) -> Float[np.ndarray, "s 2 3"]:
+        """Axis-aligned box of each segment."""
+        return np.stack([[solid.low, solid.high] for solid in self._solids])
+
+    def inside(self, index: int, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether each point lies in segment ``index``."""
+        solid = self._solids[index]
+        result = solid.in_box(points)
+        result[result] = solid.holds(points[result])
+        return result
+
+    def label(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+        """0 in empty space, else index + 1; where segments overlap the first one owns the point (so a nested one)."""
+        labels = np.zeros(len(points), dtype=np.uint8)
+        for index, solid in enumerate(self._solids):
+            candidates = np.flatnonzero((labels == 0) & solid.in_box(points))
+            labels[candidates[solid.holds(points[candidates])]] = index + 1
+        return labels
+
+    def segment_distance(self, index: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Unsigned distance to segment ``index``'s surface."""
+        return np.sqrt(self._solids[index].closest(points)[0])
+
+    def nearest(self, points: Float[np.ndarray, "n 3"]) -> Nearest:
+        """The closest point over the surfaces of all segments."""
+        bounds = np.stack([solid.squared_distance_to_box(points) for solid in self._solids])
+        likely = bounds.argmin(axis=0)
+        squared, place = np.full(len(points), np.inf), np.empty_like(points)
+        face, owner = np.empty(len(points), dtype=np.int64), np.empty(len(points), dtype=np.int64)
+        first_faces = np.cumsum([0, *(len(solid.faces) for solid in self._solids)])
+        # first the segment whose box is nearest, then those whose boxes are nearer than what it gave: one to two each
+        for again in (False, True):
+            for index, solid in enumerate(self._solids):
+                rows = np.flatnonzero((likely != index) & (bounds[index] < squared) if again else likely == index)
+                found, faces, places = solid.closest(points[rows])
+                nearer = found < squared[rows]
+                kept = rows[nearer]
+                squared[kept], place[kept], owner[kept] = found[nearer], places[nearer], index
+                face[kept] = first_faces[index] + faces[nearer]
+        return Nearest(np.sqrt(squared), place, face, owner)
+
+    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> Hits:
+        """Where rays ``t * direction`` from the origin first meet any surface, t > 0; directions have z = 1."""
+        hits = Hits.none(len(directions))
+        for solid in self._solids:
+            hits.nearer(*solid.first_hit(directions))
+        return hits
+
+    def face_normals(self, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        """Unit normals of faces of ``mesh.merged()``."""
+        vertices, faces, _ = self._merged
+        a, b, c = (vertices[faces[face, i]] for i in range(3))
+        normal = np.cross(b - a, c - a)
+        return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+
+
+def signed_distance_and_direction(
+    solids: Solids,
+    points: Float[np.ndarray, "n 3"],
+    labels: UInt8[np.ndarray, " n"],
+    nearest: Nearest | None = None,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Distance (negative where ``labels`` is not 0) and unit direction to the closest surface point.
+
+    ``nearest`` is ``solids.nearest(points)`` where the caller has it already. A point on the surface has no direction
+    of its own and takes the face's normal.
+    """
+    nearest = solids.nearest(points) if nearest is None else nearest
+    offset = nearest.point - points
+    direction = offset / np.maximum(nearest.distance, 1e-30)[:, None]
+    on_surface = np.flatnonzero(nearest.distance < 1e-9 * np.abs(solids.mesh.bounds).max())
+    direction[on_surface] = solids.face_normals(nearest.face[on_surface])
+    return np.where(labels > 0, -nearest.distance, nearest.distance), direction
+
+
+def label_grid(
+    mesh: SegmentedMesh, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
+) -> UInt8[np.ndarray, "nx ny nz"]:
+    """Exact labels on the product grid of three ascending coordinate arrays; the first segment wins an overlap.
+
+    Signed crossings are counted along columns instead of testing every node, see ``winding``: a closed segment has no
+    cracks, and a node exactly on a surface has the label of the node just above it.
+    """
+    labels = np.zeros((len(x), len(y), len(z)), dtype=np.uint8)
+    for index, segment in enumerate(mesh.segments):
+        lows = [int(np.searchsorted(axis, low)) for axis, low in zip((x, y, z), segment.bounds[0], strict=True)]
+        highs = [
+            int(np.searchsorted(axis, high, "right")) for axis, high in zip((x, y, z), segment.bounds[1], strict=True)
+        ]
+        if any(low >= high for low, high in zip(lows, highs, strict=True)):
+            continue
+        box = tuple(slice(low, high) for low, high in zip(lows, highs, strict=True))
+        block = labels[box]
+        has_holes = not segment.solid and segment.edge_imbalance() != (0, 0)
+        inside = (_winding_nodes if has_holes else winding_grid)(segment, x[box[0]], y[box[1]], z[box[2]])
+        block[(block == 0) & inside] = index + 1
+    return labels
+
+
+def _winding_nodes(
+    segment: Segment, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
+) -> Bool[np.ndarray, "nx ny nz"]:
+    """``winding_grid`` for a mesh with holes, node by node: a column may enter it and never leave."""
+    nodes = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    return _Solid(segment).holds(nodes).reshape(len(x), len(y), len(z))

@@ -1,0 +1,48 @@
+"""Rigid transforms. Notation: ``T_a_b`` maps b-coordinates to a-coordinates."""
+
+import numpy as np
+from jaxtyping import Float
+
+
+def rigid(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """Homogeneous transform from a rotation and a translation."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, translation
+    return transform
+
+
+def inverse_rigid(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Inverse of a rigid transform."""
+    rotation = transform[:3, :3].T
+    return rigid(rotation, -rotation @ transform[:3, 3])
+
+
+def transform_points(
+    transform: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*n 3"]
+) -> Float[np.ndarray, "*n 3"]:
+    """Map points by a homogeneous transform."""
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def rotation_along(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """A rotation whose third column is ``axis``."""
+    z = axis / np.linalg.norm(axis)
+    helper = np.eye(3)[np.argmin(np.abs(z))]
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def look_at(
+    eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"], roll_rad: float = 0.0
+) -> Float[np.ndarray, "4 4"]:
+    """``T_world_camera`` at ``eye``, optical axis through ``target``, image up along ``up`` before the roll."""
+    z = target - eye
+    z = z / np.linalg.norm(z)
+    x = np.cross(z, up)
+    if np.linalg.norm(x) < 1e-6 * np.linalg.norm(up):  # looking along `up`: any horizon is as good
+        x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x = x / np.linalg.norm(x)
+    y = np.cross(z, x)
+    cosine, sine = np.cos(roll_rad), np.sin(roll_rad)
+    return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)

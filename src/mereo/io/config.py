@@ -1,0 +1,56 @@
+"""Settings of reading a frame and of writing results; light, so that the command line may import them."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from mereo.geometry.conventions import CloudAxes
+
+Format = Literal["glb", "ply", "obj", "stl", "npz", "vti", "nifti", "seg.nrrd", "points", "json"]
+
+
+@dataclass(frozen=True)
+class FilesConfig:
+    """Which files a reconstruction becomes; where and in which unit: docs/design/0012-files-out.md.
+
+    Attributes:
+        formats: surfaces as glb, ply, obj, stl; labels as npz, vti (ParaView), nifti, seg.nrrd (3D Slicer); points,
+            the observed ones with their segments; json, the figures; or all.
+        millimetres: write ply, obj, stl, vti and points.ply, which have no unit, in millimetres and not in the input's.
+    """
+
+    formats: tuple[Format | Literal["all"], ...] = ("glb", "npz", "json")
+    millimetres: bool = False
+
+
+DEFAULT_FILES = FilesConfig()
+
+
+@dataclass(frozen=True)
+class InputConfig:
+    """How a frame is read.
+
+    Attributes:
+        intrinsics: the depth camera, JSON or YAML; recordings have their own.
+        depth_scale: pixel value of one metre; by default what the intrinsics say, else 1000 (floats: 1).
+        mask: image that is not 0 on the object.
+        frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
+        drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
+        unit_m: metres per unit of a point cloud: 0.001 for millimetres; by default 1 (ZDF: 0.001).
+        topic: of a ROS recording; by default its first depth image topic, else its first cloud topic.
+        frame_index: which frame of a ROS recording, from 0, or of an intrinsics file that describes many.
+    """
+
+    intrinsics: Path | None = None
+    depth_scale: float | None = None
+    mask: Path | None = None
+    frame: CloudAxes = "camera"
+    drop_invalid: bool = False
+    unit_m: float | None = None
+    topic: str | None = None
+    frame_index: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.unit_m is not None and not 0 < self.unit_m < math.inf:
+            raise ValueError(f"the unit is {self.unit_m} m; it must be positive: give 0.001 for millimetres")

@@ -1,0 +1,24 @@
+"""Errors of reading: whatever a parsing library raises becomes one sentence."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def readable(path: Path, kind: str) -> Iterator[None]:
+    """Refuse missing and empty files, and turn a library's exception into one sentence."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; a {kind} is needed: check the path")
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory; a {kind} is needed: name a file in it")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path} is empty (0 bytes); a {kind} is needed: export or download it again")
+    try:
+        yield
+    except (MemoryError, ImportError):
+        raise
+    except Exception as error:
+        # a library's text may be several sentences: its first line is the reason
+        detail = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
+        raise ValueError(f"{path} cannot be read as a {kind} ({detail}): export or download it again") from error

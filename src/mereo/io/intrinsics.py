@@ -1,0 +1,237 @@
+"""Intrinsics of depth cameras as other programs write them: ROS, RealSense, Open3D, BOP, nerfstudio.
+
+Three conventions differ between them and are settled here:
+
+- Pixel centres: OpenCV, ROS, RealSense, Open3D and BOP put the centre of the first pixel at 0, we and nerfstudio put it
+  at 0.5 (see ``mereo.geometry.camera``). 0.5 is therefore added to the principal point, unless the file is
+  nerfstudio's or says ``"pixel_center": 0.5``.
+- Depth scale: ours is **units per metre**, so metres = value / depth_scale (1000 for millimetres, 5000 for TUM). BOP's
+  multiplies and gives millimetres (0.1, 1), RealSense's multiplies and gives metres (0.001, 0.00025). They are orders
+  of magnitude apart, so the number itself tells which it is.
+- Lens distortion: a pinhole camera has none. It is ignored with a warning that says how much it matters.
+"""
+
+import json
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+
+from mereo.geometry.camera import Camera
+from mereo.io.errors import readable
+
+NAMED = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
+"""Focal lengths and principal point: plain, RealSense, nerfstudio."""
+
+MATRICES = ("intrinsic_matrix", "K", "k", "cam_K", "camera_matrix")
+"""3 x 3, or 9 numbers row by row: ROS 1, ROS 2, BOP, ROS's calibrator; Open3D's first one is column by column."""
+
+NESTED = ("intrinsic", "intrinsics", "depth_intrinsics")
+"""Where files that hold more than intrinsics keep them."""
+
+Fields = dict[str, Any]
+
+
+class CameraWarning(UserWarning):
+    """Something about a camera is not used; what is measured with it may be off."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """What a file says about a depth camera.
+
+    Attributes:
+        camera: the pinhole.
+        depth_scale: pixel value of one metre, or None where the file does not say.
+    """
+
+    camera: Camera
+    depth_scale: float | None = None
+
+
+def read_camera(path: str | Path, size: tuple[int, int] | None = None) -> Camera:
+    """The pinhole of ``read_intrinsics``."""
+    return read_intrinsics(path, size).camera
+
+
+def read_intrinsics(
+    path: str | Path, size: tuple[int, int] | None = None, image: str | Path | None = None, index: int | None = None
+) -> Intrinsics:
+    """Pinhole intrinsics, and the depth scale where it is stated, from JSON or ROS YAML.
+
+    Understood: ``fx fy cx cy``, RealSense's ``fx fy ppx ppy``, nerfstudio's ``fl_x fl_y cx cy w h``, a matrix
+    (``MATRICES``), ROS CameraInfo as YAML or JSON, and files of many frames: BOP's scene_camera.json, and
+    transforms.json with intrinsics for each frame. ``width`` and ``height`` may be called ``image_width`` and
+    ``image_height``.
+
+    Args:
+        path: the file.
+        size: (width, height) in pixels where the file does not say.
+        image: the depth image, whose name picks the frame of a file with many.
+        index: or the frame itself: BOP's number, or the place in nerfstudio's list from 0.
+
+    Raises ``FileNotFoundError`` or ``ValueError``. Warns with ``CameraWarning`` where it states lens distortion.
+    """
+    path = Path(path)
+    with readable(path, "camera intrinsics file"):
+        text = path.read_text(encoding="utf-8-sig")
+        fields = json.loads(text) if path.suffix.lower() == ".json" else _yaml(text)
+        if not isinstance(fields, dict):
+            raise ValueError("it is not an object with named fields")
+        fields = _frame(fields, None if image is None else Path(image).stem, index)
+        for key in NESTED:
+            fields = {**fields, **fields[key]} if isinstance(fields.get(key), dict) else fields
+        found = Intrinsics(camera_from_fields(fields, size), _depth_scale(fields))
+        warn_of_distortion(found.camera, fields, str(path))
+    return found
+
+
+def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> Camera:
+    """The pinhole of these fields; ``ValueError`` says which are missing."""
+    focal_x, focal_y, center_x, center_y = _pinhole(fields)
+    width, height = _image_size(fields, size)
+    shift = 0.5 - float(fields.get("pixel_center", 0.5 if "fl_x" in fields else 0.0))
+    return Camera(width, height, focal_x, focal_y, center_x + shift, center_y + shift)
+
+
+def _yaml(text: str) -> object:
+    """The first document; OpenCV's header and type tags are not YAML to others."""
+    plain = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
+    return next(iter(yaml.safe_load_all(plain.removeprefix("\n---"))), None)
+
+
+# --- files of many frames --------------------------------------------------------------------------------------------
+
+
+def _frame(fields: Fields, stem: str | None, index: int | None) -> Fields:
+    """The fields of one frame; ``fields`` itself where it describes one camera."""
+    if _states_a_camera(fields):
+        return fields
+    frames = fields.get("frames")
+    if isinstance(frames, list) and any(map(_states_a_camera, frames)):
+        names = [Path(str(f.get("depth_file_path", f.get("file_path", "")))).stem for f in frames]
+        chosen = index if index is not None else names.index(stem) if stem in names else None
+        return {**fields, **frames[_one_of(chosen, len(frames), list(range(len(frames))))]}
+    if fields and all(key.isdecimal() for key in fields) and all(map(_states_a_camera, fields.values())):
+        numbers = {int(key): value for key, value in fields.items()}
+        number = re.search(r"\d+$", stem or "")
+        chosen = index if index is not None else int(number.group()) if number else None
+        return dict(numbers[_one_of(chosen, len(numbers), list(numbers))])
+    return fields
+
+
+def _one_of(chosen: int | None, count: int, known: list[int]) -> int:
+    if chosen is None and count == 1:
+        return known[0]
+    if chosen not in known:
+        wanted = "no frame is named" if chosen is None else f"frame {chosen} is not there"
+        raise ValueError(
+            f"it has {count} frames from {min(known)} to {max(known)} and {wanted}; give one with --frame-index"
+        )
+    return chosen
+
+
+def _states_a_camera(fields: object) -> bool:
+    return isinstance(fields, dict) and (
+        any(all(name in fields for name in names) for names in NAMED)
+        or any(key in fields for key in MATRICES)
+        or any(isinstance(fields.get(key), dict) for key in NESTED)
+    )
+
+
+# --- fields ----------------------------------------------------------------------------------------------------------
+
+
+def _pinhole(fields: Fields) -> tuple[float, float, float, float]:
+    for names in NAMED:
+        if all(name in fields for name in names):
+            focal_x, focal_y, center_x, center_y = (float(fields[name]) for name in names)
+            return focal_x, focal_y, center_x, center_y
+    key = next((key for key in MATRICES if fields.get(key) is not None), None)
+    if key is None:
+        raise ValueError("it has neither fx, fy, cx, cy nor intrinsic_matrix, K, cam_K or camera_matrix")
+    values = fields[key]
+    matrix = np.asarray(values["data"] if isinstance(values, dict) else values, dtype=np.float64)
+    if matrix.size != 9:
+        raise ValueError(f"its matrix has {matrix.size} numbers instead of 9")
+    column_major = key == "intrinsic_matrix" and matrix.ndim == 1
+    matrix = matrix.reshape(3, 3).T if column_major else matrix.reshape(3, 3)
+    if matrix[2, 2] != 1 or np.any(matrix[2, :2]):
+        raise ValueError(f"the last row of its matrix is {matrix[2].tolist()} instead of 0, 0, 1")
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+
+
+def _image_size(fields: Fields, size: tuple[int, int] | None) -> tuple[int, int]:
+    for names in (("width", "height"), ("image_width", "image_height"), ("w", "h")):
+        if all(fields.get(name) is not None for name in names):
+            width, height = (int(fields[name]) for name in names)
+            return width, height
+    if size is None:
+        raise ValueError("it has no width and height")
+    return size
+
+
+def _depth_scale(fields: Fields) -> float | None:
+    """Pixel value of one metre, whatever the file means by its number (the module's note)."""
+    if "depth_units" in fields:  # RealSense's option: metres of one unit
+        value, per_metre = float(fields["depth_units"]), 1.0
+    elif "depth_scale" in fields:
+        value = float(fields["depth_scale"])
+        if value >= 100:
+            return value
+        per_metre = 1.0 if value < 0.01 else 1000.0
+    else:
+        return None
+    if not 0 < value <= 10:
+        raise ValueError(
+            f"its depth scale is {value:g}; units per metre (1000), metres per unit (0.001) or BOP's millimetres per "
+            "unit (0.1) are known; correct it there"
+        )
+    return per_metre / value
+
+
+# --- lens distortion -------------------------------------------------------------------------------------------------
+
+
+def warn_of_distortion(camera: Camera, fields: Fields, source: str) -> None:
+    """One ``CameraWarning`` where coefficients are not zero: the image is taken as rectified."""
+    coefficients, model = _coefficients(fields)
+    if not coefficients.any():
+        return
+    fisheye = any(word in model.lower() for word in ("fisheye", "equidistant", "kannala"))
+    amount = "a fisheye lens" if fisheye else f"up to {_shift_px(camera, coefficients):.2g} pixels in the corners"
+    warnings.warn(
+        f"{source} states lens distortion ({amount}), which is ignored: rectify the depth image and give the "
+        "intrinsics of the rectified one (ROS: the matrix P), or set the coefficients to 0 where that is done already",
+        CameraWarning,
+        stacklevel=4,
+    )
+
+
+def _coefficients(fields: Fields) -> tuple[Float[np.ndarray, " n"], str]:
+    """k1, k2, p1, p2, k3 ... as OpenCV orders them, and the model's name."""
+    model = str(fields.get("distortion_model", fields.get("camera_model", fields.get("model", ""))))
+    for key in ("D", "d", "distortion_coefficients", "coeffs", "distortion"):
+        values = fields.get(key)
+        values = values.get("data") if isinstance(values, dict) else values
+        if isinstance(values, list | tuple | np.ndarray) and len(values):
+            return np.asarray(values, dtype=np.float64).reshape(-1), model
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    return np.array([float(fields.get(name, 0.0)) for name in names]), model
+
+
+def _shift_px(camera: Camera, coefficients: Float[np.ndarray, " n"]) -> float:
+    """How far the lens moves the farthest corner (OpenCV's Brown-Conrady or rational model)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients[:8], (0, 8 - len(coefficients[:8])))
+    u, v = np.array([0, camera.width] * 2), np.array([0, 0, camera.height, camera.height])
+    x, y = (u - camera.center_x_px) / camera.focal_x_px, (v - camera.center_y_px) / camera.focal_y_px
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    moved_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    moved_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return float(np.hypot(camera.focal_x_px * (moved_x - x), camera.focal_y_px * (moved_y - y)).max())

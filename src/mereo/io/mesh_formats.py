@@ -1,0 +1,164 @@
+"""Segmented meshes from files: one file with named parts, several files, or a directory with one file per segment."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.io.errors import readable
+
+VIEWER_ROOT = "camera_frame"
+"""Name of the root node of our own GLB files; below it, vertices are in the input's camera frame."""
+
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf")
+
+
+def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
+    """The segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order.
+
+    A file with several named parts (GLB nodes, OBJ objects or groups, 3MF objects) gives one segment each; a file with
+    one part gives one segment called after its GLB node, or else after the file. A directory stands for the mesh files
+    in it, by name.
+    Node transforms are applied, except the root of GLB files written by mereo: those come back in the camera frame.
+    Vertices at the same position are merged, because exporters split them at normals and texture seams, which would
+    open a closed mesh. ``SegmentedMesh.check`` is left to the caller.
+
+    Raises:
+        FileNotFoundError, ValueError: a file is missing, of another format, damaged or without faces, or two segments
+            have the same name.
+        ImportError: a 3MF file, without the extra `cad`.
+    """
+    files = [file for path in paths for file in _mesh_files(Path(path))]
+    parts = [part for file in files for part in _parts(file)]
+    segments = (
+        Segment(name, color or PALETTE[index % len(PALETTE)], vertices, faces)
+        for index, (name, color, vertices, faces) in enumerate(parts)
+    )
+    return SegmentedMesh(tuple(segments))
+
+
+def _mesh_files(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in MESH_SUFFIXES)
+    if not files:
+        raise ValueError(f"{path} has no mesh files; one of {', '.join(MESH_SUFFIXES)} per segment is needed: add them")
+    return files
+
+
+Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
+"""Name, colour if known, vertices, faces."""
+
+
+def _parts(path: Path) -> list[Part]:
+    if path.exists() and path.suffix.lower() not in MESH_SUFFIXES:
+        known = ", ".join(MESH_SUFFIXES)
+        raise ValueError(f"{path} has the suffix {path.suffix!r}; a mesh is one of {known}: convert or rename it")
+    if path.suffix.lower() == ".3mf" and find_spec("lxml") is None:
+        raise ImportError(f"{path} needs lxml, which reads 3MF files and is not installed: pip install 'mereo[cad]'")
+    with readable(path, "mesh"):
+        parts = _obj_parts(path) if path.suffix.lower() == ".obj" else _scene_parts(path)
+        if not parts:
+            raise ValueError("it has no faces")
+    return parts
+
+
+def _obj_parts(path: Path) -> list[Part]:
+    """Own parser, because trimesh gives the parts of an OBJ file in no stable order. Polygons become fans."""
+    positions: list[list[float]] = []
+    faces: list[list[int]] = []
+    owners: list[tuple[str, str]] = []
+    name = {"o": "", "g": ""}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        kind, *cells = line.split() or [""]
+        if kind == "v":
+            positions.append([float(cell) for cell in cells[:3]])
+        elif kind in name:
+            name[kind] = " ".join(cells)
+        elif kind == "f":
+            corners = [_obj_index(cell, len(positions)) for cell in cells]
+            faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
+            owners += [(name["o"], name["g"])] * (len(corners) - 2)
+    return _split_parts(np.asarray(positions), np.asarray(faces, dtype=np.int64), owners, path.stem)
+
+
+def _obj_index(cell: str, count: int) -> int:
+    """``vertex/texture/normal`` counted from 1, or from the end when negative."""
+    index = int(cell.split("/")[0])
+    index = index - 1 if index > 0 else count + index
+    if not 0 <= index < count:
+        raise ValueError(f"a face refers to vertex {cell} of {count}")
+    return index
+
+
+def _split_parts(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], owners: list[tuple[str, str]], stem: str
+) -> list[Part]:
+    """One part per object, or per group where there is only one object; unused vertices are left out."""
+    level = 0 if len({key[0] for key in owners}) > 1 else 1
+    labels = [key[level] or key[0] for key in owners]
+    names = list(dict.fromkeys(labels))
+    index = np.asarray([names.index(label) for label in labels], dtype=np.int64)
+    parts: list[Part] = []
+    for i, name in enumerate(names):
+        used, local = np.unique(faces[index == i], return_inverse=True)
+        parts.append(
+            (name if name and len(names) > 1 else stem, None, *merge_positions(vertices[used], local.reshape(-1, 3)))
+        )
+    return parts
+
+
+def _scene_parts(path: Path) -> list[Part]:
+    scene: Any = trimesh.load_scene(path, process=False)
+    # the graph's nodes come in no order; the file's order makes the labels
+    order = {key: index for index, key in enumerate(scene.geometry)}
+    nodes = [node for node in scene.graph.nodes_geometry if _has_faces(scene, node)]
+    nodes.sort(key=lambda node: (order[scene.graph[node][1]], node))
+    return [_part(scene, node, path.stem if len(nodes) == 1 else "") for node in nodes]
+
+
+def _has_faces(scene: Any, node: str) -> bool:
+    return len(getattr(scene.geometry[scene.graph[node][1]], "faces", ())) > 0
+
+
+def _part(scene: Any, node: str, stem: str) -> Part:
+    base = VIEWER_ROOT if VIEWER_ROOT in scene.graph.nodes else scene.graph.base_frame
+    transform, key = scene.graph.get(node, frame_from=base)
+    geometry = scene.geometry[key]
+    vertices = np.asarray(geometry.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
+    faces = np.asarray(geometry.faces, dtype=np.int64)
+    if np.linalg.det(transform[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    # a file without names gets its own name as the node's
+    unnamed = node.startswith("geometry_") or Path(node).stem == stem
+    return (stem if stem and unnamed else node, _color(geometry), *merge_positions(vertices, faces))
+
+
+def _color(geometry: Any) -> Color | None:
+    """The exact colour of our own files, else a material's or uniform vertex colour, else none."""
+    own = geometry.metadata.get("color")
+    if own is not None:
+        return int(own[0]), int(own[1]), int(own[2])
+    if not geometry.visual.defined or geometry.visual.kind == "texture":
+        return None
+    red, green, blue = (int(value) for value in geometry.visual.main_color[:3])
+    return red, green, blue
+
+
+def merge_positions(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """Merge vertices at exactly the same position, in order of first use, and drop the faces this collapses."""
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    if len(first) == len(vertices):
+        return vertices, faces
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    merged = rank[inverse.reshape(-1)][faces]
+    proper = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
+    return vertices[first[order]], merged[proper]

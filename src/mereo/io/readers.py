@@ -1,0 +1,156 @@
+"""Readers: point clouds, depth images, masks, intrinsics and segmented meshes from files.
+
+Every reader raises ``FileNotFoundError`` or a ``ValueError`` of one sentence (value, rule, cure), whatever the parsing
+library raised. Nothing is repaired silently: missing points are refused unless the caller asks to drop them. Depth
+scales and pixel centres are explained in ``mereo.io.intrinsics``.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from PIL import Image
+
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.io.depth_formats import DEPTH_READERS, metres, read_raw_depth
+from mereo.io.errors import readable
+from mereo.io.intrinsics import Intrinsics, read_camera, read_intrinsics
+from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.point_cloud_formats import CLOUD_READERS
+
+__all__ = [
+    "Intrinsics",
+    "read_camera",
+    "read_depth_image",
+    "read_intrinsics",
+    "read_mask",
+    "read_point_cloud",
+    "read_segmented_mesh",
+]
+
+PLAUSIBLE_DEPTH_M = (0.05, 20.0)
+
+
+# --- point clouds ----------------------------------------------------------------------------------------------------
+
+
+def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud:
+    """The points of a PLY, PCD, XYZ/TXT/PTS/ASC/CSV, NPY, NPZ or ZDF file, in the file's units and frame.
+
+    Args:
+        path: the file; its suffix names the format. Arrays are [n, 3] or organized [h, w, 3]; text has x, y, z in its
+            first three columns or in the columns its header calls x, y, z; NPZ holds ``points`` or one such array; ZDF
+            is Zivid's, in millimetres.
+        drop_invalid: leave out points that are NaN or infinite, and points at exactly (0, 0, 0): sensors mark missing
+            measurements with either.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is of another format, empty, truncated or not numeric, or has invalid points and
+            ``drop_invalid`` is false.
+        ImportError: a ZDF file, without the extra `sensors`.
+    """
+    path = Path(path)
+    reader = CLOUD_READERS.get(path.suffix.lower())
+    if reader is None and path.exists():
+        known = ", ".join(CLOUD_READERS)
+        raise ValueError(
+            f"{path} has the suffix {path.suffix!r}; a point cloud is one of {known}: convert or rename it"
+        )
+    with readable(path, "point cloud"):
+        assert reader is not None
+        points = np.asarray(reader(path), dtype=np.float64).reshape(-1, 3)
+    return PointCloud(valid_points(points, path, drop_invalid))
+
+
+def valid_points(points: Float[np.ndarray, "n 3"], path: str | Path, drop_invalid: bool) -> Float[np.ndarray, "m 3"]:
+    """The points that are measurements; ``path`` says where they come from. Raises as ``read_point_cloud`` does."""
+    if len(points) == 0:
+        raise ValueError(f"{path} holds 0 points; the object must be visible: check the export")
+    finite = np.isfinite(points).all(axis=1)
+    usable = finite & (points != 0).any(axis=1)
+    lost = len(points) - int(usable.sum())
+    if lost == len(points):
+        raise ValueError(
+            f"all {lost} points of {path} are NaN, infinite or zero; the object must be visible: record it again"
+        )
+    if lost and not drop_invalid:
+        kind = "NaN or infinite" if not finite.all() else "exactly (0, 0, 0)"
+        raise ValueError(
+            f"{path} has {lost} of {len(points)} points without a measurement ({kind}); all must be finite positions: "
+            "leave them out with --drop-invalid"
+        )
+    return points[usable]
+
+
+# --- depth images ----------------------------------------------------------------------------------------------------
+
+
+def read_depth_image(
+    path: str | Path,
+    camera: Camera,
+    depth_scale: float | None = None,
+    mask_path: str | Path | None = None,
+    plausible_m: tuple[float, float] = PLAUSIBLE_DEPTH_M,
+) -> DepthImage:
+    """A PNG, TIFF, EXR or NPY image as depth in metres; 0 where nothing was measured or the mask is 0.
+
+    Args:
+        path: the image, 16-bit or floating; 0 means no measurement, and in floating ones NaN and infinity do too.
+        camera: intrinsics of the same size, see ``read_camera``.
+        depth_scale: pixel value of one metre, so that metres = value / depth_scale; by default 1000 for integers and 1
+            for floats (``mereo.io.intrinsics`` on BOP and RealSense).
+        mask_path: image of the same size, not 0 on the object.
+        plausible_m: the median depth must lie in this range, because a wrong unit is otherwise invisible.
+
+    Raises:
+        FileNotFoundError, ValueError: the file is missing, damaged, of another kind or size, without any measured
+            pixel, or its median depth is not plausible.
+        ImportError: an EXR file, without the extra `sensors`.
+    """
+    path = Path(path)
+    if path.exists() and path.suffix.lower() not in DEPTH_READERS:
+        known = ", ".join(DEPTH_READERS)
+        raise ValueError(
+            f"{path} has the suffix {path.suffix!r}; a depth image is one of {known}: convert or rename it"
+        )
+    with readable(path, "depth image"):
+        raw = read_raw_depth(path)
+    return usable_depth(DepthImage(metres(raw, depth_scale), camera), path, mask_path, plausible_m)
+
+
+def usable_depth(
+    image: DepthImage,
+    path: str | Path,
+    mask_path: str | Path | None = None,
+    plausible_m: tuple[float, float] = PLAUSIBLE_DEPTH_M,
+) -> DepthImage:
+    """A depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does."""
+    depth = image.depth
+    if mask_path is not None:
+        depth = np.where(read_mask(mask_path, (image.camera.width, image.camera.height)), depth, 0.0)
+    if not (depth > 0).any():
+        where = "inside the mask" if image.valid.any() else "in the image"
+        raise ValueError(f"{path} measures 0 pixels {where}; the object must be visible: check the image and the mask")
+    median_m = float(np.median(depth[depth > 0]))
+    if not plausible_m[0] <= median_m <= plausible_m[1]:
+        raise ValueError(
+            f"the median depth of {path} is {median_m:.4g} m; it must be between {plausible_m[0]:g} and "
+            f"{plausible_m[1]:g} m: give the pixel value of one metre with --depth-scale (1000 for millimetres)"
+        )
+    return DepthImage(depth, image.camera)
+
+
+def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
+    """An image's pixels that are not 0 (in any channel but alpha); ``size`` is the expected (width, height)."""
+    path = Path(path)
+    with readable(path, "mask image"), Image.open(path) as image:
+        # a 1-bit or palette image is taken by what it shows, anything else by its stored values
+        pixels = np.asarray(image.convert("RGB") if image.mode in ("1", "P", "RGBA", "LA", "CMYK") else image)
+    mask = np.asarray(pixels.reshape(*pixels.shape[:2], -1).any(axis=-1))
+    if size is not None and mask.shape != (size[1], size[0]):
+        raise ValueError(
+            f"the mask {path} is {mask.shape[1]} x {mask.shape[0]} pixels but the depth image is "
+            f"{size[0]} x {size[1]}; they must agree: export the mask at the depth image's size"
+        )
+    return mask

@@ -1,0 +1,236 @@
+"""ROS recordings: depth images or point clouds, one message at a time, from ROS 1 bags, ROS 2 bags and MCAP files.
+
+A message is only decoded when it is asked for, so that a reader may skip what comes too fast, and a broken message
+stops nothing but itself. Depth follows ROS REP 118: 16UC1 in millimetres with 0, or 32FC1 in metres with NaN, where
+nothing was measured; compressed depth that of ROS's compressed_depth_image_transport.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from io import BytesIO
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.io.depth_formats import metres
+from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
+
+IMAGE, CLOUD, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+FRAMES = (IMAGE, COMPRESSED, CLOUD)
+
+COMPRESSED_DEPTH, COMPRESSED_HEADER = "compressedDepth", 12
+"""Of a compressed image's format, where it is depth; and the bytes before its PNG: a number and two quantizations."""
+
+DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+
+FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""sensor_msgs/PointField: datatype to numpy."""
+
+Content = DepthImage | Float[np.ndarray, "n 3"]
+"""Depth in metres, or points in metres with NaN where nothing was measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """One message.
+
+    Attributes:
+        topic: where it was published.
+        stamp_ns: when it was recorded, in nanoseconds.
+        read: decodes it; raises ``ValueError`` where its content is broken or not a depth.
+    """
+
+    topic: str
+    stamp_ns: int
+    read: Callable[[], Content]
+
+
+def is_recording(path: Path) -> bool:
+    """Whether this is a bag: .bag, .mcap, .db3, or the directory of a ROS 2 bag."""
+    return path.suffix.lower() in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
+
+
+def recorded_frames(
+    path: str | Path,
+    topic: str | None = None,
+    camera: Camera | None = None,
+    depth_scale: float | None = None,
+) -> Iterator[RecordedFrame]:
+    """The frames of one topic in the order of recording.
+
+    Args:
+        path: the bag.
+        topic: a depth image or point cloud topic; by default the first depth image topic by name, else the first of
+            clouds.
+        camera: by default the first CameraInfo of the topic nearest by name, for ``image_rect`` topics with its matrix
+            P. It is taken to hold for the whole recording.
+        depth_scale: value of one metre in integer images; by default 1000.
+
+    Raises ``ImportError`` without the extra `sensors`, ``FileNotFoundError``, and ``ValueError`` where the bag cannot
+    be read, has no such topic, or no CameraInfo.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; a ROS bag is needed: check the path")
+    if find_spec("rosbags") is None:
+        raise ImportError(f"{path} needs rosbags, which is not installed: pip install 'mereo[sensors]'")
+    with closing(_open(path)) as reader:
+        topic = topic or _depth_topic(reader, path)
+        connections = [c for c in reader.connections if c.topic == topic and c.msgtype in FRAMES]
+        if not connections:
+            known = ", ".join(sorted({c.topic for c in reader.connections if c.msgtype in FRAMES})) or "none"
+            raise ValueError(f"{path} has no images or clouds on topic {topic!r}; those it has are on: {known}")
+        decode: Callable[[Any], Content] = _cloud_points
+        if connections[0].msgtype != CLOUD:
+            image = _depth_image if connections[0].msgtype == IMAGE else _compressed_depth
+            decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=depth_scale)
+        store, ros2 = reader.typestore, reader.is2
+        for connection, stamp_ns, data in reader.messages(connections):
+            message = partial(store.deserialize_cdr if ros2 else store.deserialize_ros1, data, connection.msgtype)
+            yield RecordedFrame(topic, stamp_ns, partial(_read, decode, message, f"{path}, {topic} at {stamp_ns} ns"))
+
+
+def recorded_frame(
+    path: str | Path,
+    index: int = 0,
+    topic: str | None = None,
+    camera: Camera | None = None,
+    depth_scale: float | None = None,
+) -> RecordedFrame:
+    """Frame ``index`` (from 0) of ``recorded_frames``; ``ValueError`` where the recording is shorter."""
+    if index < 0:
+        raise ValueError(f"the frame index is {index}; frames count from 0: give 0 or more with --frame-index")
+    with closing(recorded_frames(path, topic, camera, depth_scale)) as frames:  # type: ignore[type-var]
+        found = next(islice(frames, index, None), None)
+    if found is None:
+        count = sum(1 for _ in recorded_frames(path, topic, camera, depth_scale))
+        raise ValueError(f"{path} has {count} frames; frame {index} is asked for: give a lower --frame-index")
+    return found
+
+
+def _open(path: Path) -> Any:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        # older ROS 2 bags do not hold their message definitions; those used here are the same in all distributions
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+    except Exception as error:  # a damaged bag raises whatever its storage format does
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
+        raise ValueError(f"{path} cannot be read as a ROS bag ({reason}): record or copy it again") from error
+    return reader
+
+
+def _depth_topic(reader: Any, path: Path) -> str:
+    """The first image topic whose first message is a depth image, else a compressed one, else the first of clouds."""
+    images, compressed, clouds = (
+        sorted({c.topic for c in reader.connections if c.msgtype == kind and c.msgcount}) for kind in FRAMES
+    )
+    for topic in images:
+        if _first(reader, topic).encoding in DEPTH_ENCODINGS:
+            return topic
+    for topic in compressed:
+        if COMPRESSED_DEPTH in _first(reader, topic).format:
+            return topic
+    if not clouds:
+        have = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in reader.connections})) or "nothing"
+        raise ValueError(
+            f"{path} has neither depth images ({', '.join(DEPTH_ENCODINGS)}) nor point clouds, only {have}: record the "
+            "depth topic and its camera_info"
+        )
+    return clouds[0]
+
+
+def _first(reader: Any, topic: str) -> Any:
+    connections = [c for c in reader.connections if c.topic == topic]
+    connection, _, data = next(iter(reader.messages(connections)))
+    return reader.deserialize(data, connection.msgtype)
+
+
+def _camera(reader: Any, topic: str, path: Path) -> Camera:
+    """From the CameraInfo topic that shares the most leading names with ``topic``."""
+    infos = sorted({c.topic for c in reader.connections if c.msgtype == INFO and c.msgcount})
+    if not infos:
+        raise ValueError(f"{path} has no CameraInfo; the intrinsics of {topic} are needed: give --intrinsics FILE")
+    names = topic.split("/")
+
+    def shared(info: str) -> int:
+        return next((i for i, (a, b) in enumerate(zip(info.split("/"), names, strict=False)) if a != b), len(names))
+
+    info = _first(reader, max(infos, key=shared))
+    matrix = getattr(info, "k", None) if hasattr(info, "k") else info.K
+    fields: dict[str, Any] = {"width": info.width, "height": info.height, "K": np.asarray(matrix)}
+    if "image_rect" in topic:
+        projection = np.asarray(info.p if hasattr(info, "p") else info.P).reshape(3, 4)
+        return camera_from_fields({**fields, "K": projection[:, :3]})
+    camera = camera_from_fields(fields)
+    coefficients = np.asarray(info.d if hasattr(info, "d") else info.D)
+    warn_of_distortion(camera, {"d": coefficients, "distortion_model": info.distortion_model}, f"{path}, {topic}")
+    return camera
+
+
+# --- messages --------------------------------------------------------------------------------------------------------
+
+
+def _read(decode: Callable[[Any], Content], message: Callable[[], Any], source: str) -> Content:
+    try:
+        return decode(message())
+    except Exception as error:  # whatever a broken message makes of the parser
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
+        raise ValueError(f"{source} cannot be read ({reason}): take another frame") from error
+
+
+def _depth_image(message: Any, camera: Camera, depth_scale: float | None) -> DepthImage:
+    kind = DEPTH_ENCODINGS.get(message.encoding)
+    if kind is None:
+        raise ValueError(f"its encoding is {message.encoding!r}, not one of {', '.join(DEPTH_ENCODINGS)}")
+    value = np.dtype(f"{'>' if message.is_bigendian else '<'}{kind}")
+    rows = np.asarray(message.data, dtype=np.uint8)[: message.height * message.step].reshape(message.height, -1)
+    raw = np.ascontiguousarray(rows[:, : message.width * value.itemsize]).view(value).astype(kind)
+    return DepthImage(metres(raw, depth_scale if kind == "u2" else None), camera)
+
+
+def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -> DepthImage:
+    """16UC1 as it is; 32FC1 as inverse depth in 16 bits, ``a / (value - b)`` metres, 0 where nothing was measured."""
+    encoding, _, codec = (part.strip() for part in message.format.partition(";"))
+    if not codec.startswith(COMPRESSED_DEPTH) or encoding not in DEPTH_ENCODINGS or codec.endswith("rvl"):
+        raise ValueError(
+            f"its format is {message.format!r}, not PNG-compressed depth ('16UC1; compressedDepth png' or 32FC1)"
+        )
+    data = np.asarray(message.data, dtype=np.uint8).tobytes()
+    with Image.open(BytesIO(data[COMPRESSED_HEADER:]), formats=("PNG",)) as image:
+        raw = np.asarray(image).astype(np.uint16)
+    if DEPTH_ENCODINGS[encoding] == "u2":
+        return DepthImage(metres(raw, depth_scale), camera)
+    a, b = np.frombuffer(data[4:COMPRESSED_HEADER], "<f4").astype(np.float64)
+    with np.errstate(divide="ignore"):
+        depth = np.where(raw > 0, a / (raw - b), 0.0)
+    return DepthImage(depth, camera)
+
+
+def _cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
+    end = ">" if message.is_bigendian else "<"
+    axes = {f.name: (f"{end}{FIELD_TYPES[f.datatype]}", f.offset) for f in message.fields if f.name in ("x", "y", "z")}
+    if len(axes) != 3:
+        raise ValueError(f"its fields are {', '.join(f.name for f in message.fields)}, without x, y and z")
+    point = np.dtype(
+        {
+            "names": list(axes),
+            "formats": [kind for kind, _ in axes.values()],
+            "offsets": [offset for _, offset in axes.values()],
+            "itemsize": message.point_step,
+        }
+    )
+    rows = np.asarray(message.data, dtype=np.uint8)[: message.height * message.row_step].reshape(message.height, -1)
+    points = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(point).reshape(-1)
+    return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1)

@@ -1,0 +1,136 @@
+"""The table of formats: what ``--formats`` writes, and with which function."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.atomic_files import write_json
+from mereo.io.config import FilesConfig, Format
+from mereo.io.writers.glb import write_segments_glb
+from mereo.io.writers.medical import MM_PER_M, nibabel, write_labels_nifti, write_labels_seg_nrrd
+from mereo.io.writers.obj import write_segments_obj
+from mereo.io.writers.ply import write_points_ply, write_segments_ply
+from mereo.io.writers.points import write_points_npz
+from mereo.io.writers.stl import write_segments_stl
+from mereo.io.writers.volumes import write_labels_npz, write_labels_vti
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """What there is to write, in the input's frame and unit.
+
+    Attributes:
+        surfaces, labels: of a reconstruction.
+        observed: the input's points with their segments; needed for the format "points" only.
+        frame_rotation: from the input's frame to glTF's (y up).
+        unit_m: metres per unit of the input.
+        factor: of positions in files that have no unit of their own.
+        summary: what the JSON file holds.
+    """
+
+    surfaces: SegmentedMesh
+    labels: LabelGrid
+    observed: SegmentedCloud | None
+    frame_rotation: Float[np.ndarray, "3 3"]
+    unit_m: float
+    factor: float
+    summary: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        surfaces: SegmentedMesh,
+        labels: LabelGrid,
+        observed: SegmentedCloud | None,
+        frame_rotation: Float[np.ndarray, "3 3"],
+        files: FilesConfig,
+        unit_m: float = 1.0,
+    ) -> "Results":
+        factor = MM_PER_M * unit_m if files.millimetres else 1.0
+        return cls(surfaces, labels, observed, frame_rotation, unit_m, factor)
+
+    @property
+    def scaled_surfaces(self) -> SegmentedMesh:
+        return self.surfaces.transformed(np.diag([self.factor] * 3 + [1.0]))
+
+    @property
+    def scaled_labels(self) -> LabelGrid:
+        return replace(self.labels, origin=self.labels.origin * self.factor, spacing=self.labels.spacing * self.factor)
+
+
+@dataclass(frozen=True)
+class Writer:
+    """One format.
+
+    Attributes:
+        file: name of the file or folder; of the main one where there are two.
+        write: makes it at this path.
+        require: raises ``ImportError`` where an extra is missing.
+    """
+
+    file: str
+    write: Callable[[Path, Results], None]
+    require: Callable[[], object] | None = None
+
+
+def _glb(path: Path, results: Results) -> None:
+    write_segments_glb(path, results.surfaces, results.frame_rotation, results.unit_m)
+
+
+def _npz(path: Path, results: Results) -> None:
+    grid = results.labels
+    write_labels_npz(path, grid.labels, grid.origin, grid.spacing, grid.names)
+
+
+def _points(path: Path, results: Results) -> None:
+    cloud = results.observed
+    if cloud is None:
+        raise ValueError("the observed points have no labels; the format 'points' needs them: pass label_points=True")
+    write_points_npz(path.with_suffix(".npz"), cloud)
+    write_points_ply(path, replace(cloud, points=cloud.points * results.factor))
+
+
+WRITERS: dict[Format, Writer] = {
+    "glb": Writer("segments.glb", _glb),
+    "ply": Writer("segments.ply", lambda path, r: write_segments_ply(path, r.scaled_surfaces)),
+    "obj": Writer("segments.obj", lambda path, r: write_segments_obj(path, r.scaled_surfaces)),
+    "stl": Writer("stl", lambda path, r: write_segments_stl(path, r.scaled_surfaces)),
+    "npz": Writer("labels.npz", _npz),
+    "vti": Writer("labels.vti", lambda path, r: write_labels_vti(path, r.scaled_labels, r.surfaces.colors)),
+    "nifti": Writer(
+        "labels.nii.gz", lambda path, r: write_labels_nifti(path, r.labels, r.surfaces.colors, r.unit_m), nibabel
+    ),
+    "seg.nrrd": Writer(
+        "labels.seg.nrrd", lambda path, r: write_labels_seg_nrrd(path, r.labels, r.surfaces.colors, r.unit_m)
+    ),
+    "points": Writer("points.ply", _points),
+    "json": Writer("summary.json", lambda path, r: write_json(path, dict(r.summary))),
+}
+
+
+def chosen_formats(names: Iterable[str]) -> tuple[Format, ...]:
+    """The formats that these names mean, in the table's order; "all" means every one.
+
+    Raises ``ValueError`` for an unknown name and ``ImportError`` for a format whose extra is not installed, so that
+    nobody waits for a reconstruction that cannot be written.
+    """
+    wanted = set(names)
+    if unknown := sorted(wanted - {"all", *get_args(Format)}):
+        raise ValueError(f"there is no format {unknown[0]!r}; the formats are {', '.join(WRITERS)} and all: choose one")
+    chosen = tuple(name for name in WRITERS if name in wanted or "all" in wanted)
+    for name in chosen:
+        if require := WRITERS[name].require:
+            require()
+    return chosen
+
+
+def write_formats(directory: Path, formats: Iterable[Format], results: Results) -> None:
+    """Each of the formats into an existing directory."""
+    for name in formats:
+        WRITERS[name].write(directory / WRITERS[name].file, results)

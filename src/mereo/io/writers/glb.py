@@ -1,0 +1,113 @@
+"""GLB: binary glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html), metres and y up."""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.io.atomic_files import atomic_file
+from mereo.io.mesh_formats import VIEWER_ROOT
+from mereo.io.writers.segment_table import with_faces
+
+OUTER_OPACITY = 0.35
+"""Of segments with others nested in them, which viewers draw see-through."""
+
+GLTF_CAMERA_ROTATION = np.diag([1.0, -1.0, -1.0])
+"""Half a turn about x: from the camera frame (y down, z forward) to glTF (y up, z toward the viewer)."""
+
+
+def viewer_rotation(frame: CloudAxes) -> Float[np.ndarray, "3 3"]:
+    """From the input's axes to glTF's, which a scanner's already are."""
+    return GLTF_CAMERA_ROTATION if frame == "camera" else np.eye(3)
+
+
+def write_segments_glb(
+    path: str | Path,
+    surfaces: SegmentedMesh,
+    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
+    unit_m: float = 1.0,
+) -> None:
+    """One named, coloured, double-sided node per segment, below one root node that turns the frame for viewers.
+
+    Vertices stay as they are (rounded to float32, all that glTF holds). Segments without faces are left out; those
+    around a nested segment that was found are translucent.
+
+    Args:
+        path: the .glb file.
+        surfaces: segments in the input's frame and units.
+        frame_rotation: rotation of the root node, from the input's frame to glTF's (y up).
+        unit_m: metres per unit of the input, the scale of the root node, because glTF is in metres.
+
+    Raises ``ValueError`` where no segment has faces.
+    """
+    solid = with_faces(surfaces)
+    chunks: list[bytes] = []
+    document = _gltf_skeleton(solid, surfaces.opaque, np.asarray(frame_rotation) * unit_m)
+    for _, segment in solid:
+        _add_array(document, chunks, segment.vertices.astype("<f4"), "VEC3", 34962)
+        _add_array(document, chunks, segment.faces.astype("<u4").reshape(-1, 1), "SCALAR", 34963)
+    binary = b"".join(chunks)
+    document["buffers"] = [{"byteLength": len(binary)}]
+    text = json.dumps(document, ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 4)
+    with atomic_file(path) as partial, partial.open("wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+
+
+def _gltf_skeleton(
+    solid: list[tuple[int, Segment]], opaque: tuple[bool, ...], linear: Float[np.ndarray, "3 3"]
+) -> dict[str, Any]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    children = list(range(1, len(solid) + 1))
+    return {
+        "asset": {"version": "2.0", "generator": "mereo"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        # glTF matrices are column-major
+        "nodes": [{"name": VIEWER_ROOT, "matrix": matrix.T.ravel().tolist(), "children": children}]
+        + [{"name": segment.name, "mesh": index} for index, (_, segment) in enumerate(solid)],
+        "meshes": [_gltf_mesh(index, label, segment) for index, (label, segment) in enumerate(solid)],
+        "materials": [_gltf_material(segment, opaque[label - 1]) for label, segment in solid],
+        "accessors": [],
+        "bufferViews": [],
+    }
+
+
+def _gltf_mesh(index: int, label: int, segment: Segment) -> dict[str, Any]:
+    """``extras`` keep the label and the exact colour, which the material's linear factors only approximate."""
+    primitive = {"attributes": {"POSITION": 2 * index}, "indices": 2 * index + 1, "material": index}
+    return {"name": segment.name, "primitives": [primitive], "extras": {"label": label, "color": list(segment.color)}}
+
+
+def _gltf_material(segment: Segment, opaque: bool) -> dict[str, Any]:
+    """glTF colour factors are linear light, ours are sRGB (glTF 2.0, section 3.9.2)."""
+    srgb = np.asarray(segment.color) / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    color = [*linear.round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
+    surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
+    material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
+    return material if opaque else {**material, "alphaMode": "BLEND"}
+
+
+def _add_array(document: dict[str, Any], chunks: list[bytes], array: np.ndarray, kind: str, target: int) -> None:
+    """Append an accessor; all components are four bytes wide, so every view starts aligned."""
+    start = sum(len(chunk) for chunk in chunks)
+    chunks.append(array.tobytes())
+    view = len(document["bufferViews"])
+    document["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
+    accessor = {
+        "bufferView": view,
+        "componentType": 5126 if kind == "VEC3" else 5125,
+        "count": len(array),
+        "type": kind,
+    }
+    low, high = array.min(axis=0).tolist(), array.max(axis=0).tolist()
+    document["accessors"].append({**accessor, "min": low, "max": high})

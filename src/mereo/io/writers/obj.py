@@ -1,0 +1,43 @@
+"""Wavefront OBJ with its material library: text that every modelling program reads. It has no unit."""
+
+from pathlib import Path
+
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.io.atomic_files import atomic_file
+from mereo.io.writers.glb import OUTER_OPACITY
+from mereo.io.writers.segment_table import with_faces
+
+
+def write_segments_obj(path: str | Path, surfaces: SegmentedMesh) -> None:
+    """One object (``o``) per segment with a material of its colour; the materials go beside it, as ``STEM.mtl``.
+
+    Materials are called ``label_1``, ``label_2``, ...; objects have the segments' names. Positions are in the mesh's
+    frame and unit. Segments without faces are left out. Raises ``ValueError`` where no segment has faces.
+    """
+    path = Path(path)
+    library = path.with_suffix(".mtl")
+    found = with_faces(surfaces)
+    with atomic_file(library) as partial_library, atomic_file(path) as partial:
+        partial_library.write_text(_materials(found, surfaces.opaque), "utf-8")
+        with partial.open("w", encoding="utf-8", newline="\n") as file:
+            file.write(f"# written by mereo\nmtllib {library.name}\n")
+            first = 1  # OBJ counts vertices from 1, through all objects
+            for label, segment in found:
+                file.write(_object(label, segment, first))
+                first += len(segment.vertices)
+
+
+def _object(label: int, segment: Segment, first: int) -> str:
+    lines = [f"o {' '.join(segment.name.split())}", f"usemtl label_{label}"]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in segment.vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (segment.faces + first).tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def _materials(found: list[tuple[int, Segment]], opaque: tuple[bool, ...]) -> str:
+    """``Kd`` is the diffuse colour, ``d`` the opacity; programs take ``Kd`` as the colour on the screen (sRGB)."""
+    blocks = []
+    for label, segment in found:
+        color = " ".join(f"{value / 255:.6f}" for value in segment.color)
+        blocks.append(f"newmtl label_{label}\nKd {color}\nd {1.0 if opaque[label - 1] else OUTER_OPACITY}\n")
+    return "\n".join(blocks)

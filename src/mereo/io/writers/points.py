@@ -1,0 +1,25 @@
+"""The observed points with what the model says they are, for numpy; the PLY form is in ``ply``."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mereo.geometry.labels import SegmentedCloud
+from mereo.io.atomic_files import atomic_file
+
+
+def write_points_npz(path: str | Path, cloud: SegmentedCloud) -> None:
+    """Arrays ``points``, ``labels``, ``confidence``, ``occupancy``, ``names`` and ``colors``, see ``SegmentedCloud``.
+
+    ``names[k]`` and ``colors[k]`` are of label k + 1. Positions are in the cloud's frame and unit.
+    """
+    with atomic_file(path) as partial:
+        np.savez_compressed(
+            partial,
+            points=cloud.points,
+            labels=cloud.labels,
+            confidence=cloud.confidence,
+            occupancy=cloud.occupancy,
+            names=np.asarray(cloud.names),
+            colors=np.asarray(cloud.colors, dtype=np.uint8),
+        )

@@ -1,0 +1,42 @@
+"""STL, binary: one file for each segment, because a file holds one nameless surface. It has neither unit nor colour."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.io.atomic_files import new_directory
+from mereo.io.writers.segment_table import with_faces
+
+RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+"""50 bytes a triangle, without padding."""
+
+
+def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bool = False) -> None:
+    """A new directory with ``1-head.stl``, ``2-left-ear.stl``, ...: label and name of each segment that has faces.
+
+    Positions are float32, in the mesh's frame and unit. Raises ``ValueError`` where no segment has faces, and
+    ``FileExistsError`` for a directory with content unless ``force``.
+    """
+    found = with_faces(surfaces)
+    with new_directory(directory, force) as partial:
+        for label, segment in found:
+            (partial / stl_name(label, segment.name)).write_bytes(_binary(segment))
+
+
+def stl_name(label: int, name: str) -> str:
+    """A file name that every system takes: letters and digits of the segment's name; its label keeps it unique."""
+    words = re.sub(r"[^\w]+", "-", name).strip("-")
+    return f"{label}-{words}.stl" if words else f"{label}.stl"
+
+
+def _binary(segment: Segment) -> bytes:
+    corners = segment.vertices[segment.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    triangles = np.zeros(len(corners), RECORD)
+    triangles["normal"] = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    triangles["corners"] = corners
+    # the header must not begin with "solid", which is how text files begin
+    return b"written by mereo".ljust(80) + np.uint32(len(corners)).astype("<u4").tobytes() + triangles.tobytes()

@@ -1,0 +1,90 @@
+"""Label grids for numpy (NPZ) and for ParaView and VTK (VTI), in the grid's frame and unit.
+
+The VTI is written by hand: it is a page of XML around one compressed array, and VTK itself is 100 MB.
+Its format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html
+"""
+
+import base64
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mereo.geometry.labels import LabelGrid
+from mereo.geometry.mesh import Color
+from mereo.io.atomic_files import atomic_file
+
+VTI = """<?xml version="1.0"?>
+<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64" \
+compressor="vtkZLibDataCompressor">
+  <ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{spacing}" Direction="1 0 0 0 1 0 0 0 1">
+    <FieldData>
+      <Array type="String" Name="segment_names" NumberOfTuples="{count}" format="ascii">{names}</Array>
+      <DataArray type="UInt8" Name="segment_colors" NumberOfComponents="3" NumberOfTuples="{count}" format="ascii">\
+{colors}</DataArray>
+    </FieldData>
+    <Piece Extent="{extent}">
+      <PointData Scalars="label">
+        <DataArray type="UInt8" Name="label" format="binary">{labels}</DataArray>
+      </PointData>
+    </Piece>
+  </ImageData>
+</VTKFile>
+"""
+
+
+def write_labels_npz(
+    path: str | Path,
+    labels: UInt8[np.ndarray, "x y z"],
+    origin: Float[np.ndarray, "3"],
+    spacing: Float[np.ndarray, "3"],
+    names: Sequence[str],
+) -> None:
+    """A label grid: voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units.
+
+    ``names[k]`` is the segment of label k + 1; label 0 is empty space.
+    """
+    if labels.size and int(labels.max()) > len(names):
+        raise ValueError(f"label {int(labels.max())} has no name among {len(names)}; name every segment")
+    with atomic_file(path) as partial:
+        np.savez_compressed(
+            partial,
+            labels=labels,
+            origin=np.asarray(origin, dtype=np.float64),
+            spacing=np.asarray(spacing, dtype=np.float64),
+            names=np.asarray(names),
+        )
+
+
+def write_labels_vti(path: str | Path, grid: LabelGrid, colors: Sequence[Color]) -> None:
+    """VTK image data: the point array ``label`` at voxel centres; field data ``segment_names``, ``segment_colors``.
+
+    ``segment_names[k]`` is the segment of label k + 1; label 0 is empty space. Coordinates are in the grid's frame and
+    unit.
+    """
+    codes = (str(code) for name in grid.names for code in (*name.encode("utf-8"), 0))
+    text = VTI.format(
+        extent=" ".join(f"0 {n - 1}" for n in grid.labels.shape),
+        origin=_numbers(grid.origin),
+        spacing=_numbers(grid.spacing),
+        count=len(grid.names),
+        names=" ".join(codes),
+        colors=" ".join(str(value) for color in colors for value in color),
+        labels=_compressed(grid.labels),
+    )
+    with atomic_file(path) as partial:
+        partial.write_text(text, "utf-8")
+
+
+def _numbers(values: Float[np.ndarray, "3"]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _compressed(labels: UInt8[np.ndarray, "x y z"]) -> str:
+    """One zlib block, x running fastest. The head says: blocks, bytes of each, bytes of a partial one, packed bytes."""
+    packed = zlib.compress(labels.tobytes(order="F"))
+    head = struct.pack("<4Q", 1, labels.size, 0, len(packed))
+    return base64.b64encode(head).decode() + base64.b64encode(packed).decode()

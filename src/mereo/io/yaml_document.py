@@ -1,0 +1,180 @@
+"""A YAML file with its line numbers: what is wrong in it is said as file, line, value, rule and cure."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import (
+    BaseModel,
+    ValidationError,
+)
+from pydantic_core import ErrorDetails
+
+Model = TypeVar("Model", bound=BaseModel)
+
+Place = Sequence[int | str]
+"""Keys and indices from the top of the document, for example ("deformations", 0, "angle")."""
+
+
+class Document:
+    """A YAML mapping.
+
+    Attributes:
+        path: the file.
+        text: its content.
+        data: the mapping, as Python values.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read a file. Raises ``FileNotFoundError``, or ``ValueError`` where it is no YAML mapping."""
+        self.path = path
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist; a scene file is needed: check the path")
+        try:
+            self.text = path.read_text(encoding="utf-8")
+            # two passes, because only nodes know their lines and only values their types
+            root = yaml.compose(self.text, Loader=yaml.SafeLoader)
+            self.data: Any = yaml.safe_load(self.text)
+        except UnicodeDecodeError:
+            raise ValueError(f"{path} is not text in UTF-8; a YAML file is needed: save it as UTF-8") from None
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            place = f"{path}:{mark.line + 1}" if mark else str(path)
+            raise ValueError(f"{place}: this is not YAML ({error.problem}): correct the line, or its indent") from None
+        except yaml.YAMLError as error:
+            raise ValueError(f"{path}: this is not YAML ({error}): save it as plain text") from None
+        if not isinstance(root, yaml.MappingNode):
+            raise ValueError(f"{path} holds no `key: value` lines; a scene file starts with `name:`: write one anew")
+        self._root: yaml.Node = root
+        self._refuse_repeated(root)
+
+    def _refuse_repeated(self, node: yaml.Node) -> None:
+        """YAML takes the last of two equal keys in silence."""
+        if isinstance(node, yaml.SequenceNode):
+            for item in node.value:
+                self._refuse_repeated(item)
+        elif isinstance(node, yaml.MappingNode):
+            seen: set[str] = set()
+            for key, value in node.value:
+                if key.value in seen:
+                    line = key.start_mark.line + 1
+                    raise ValueError(f"{self.path}:{line}: the key `{key.value}` is given twice: remove one of them")
+                seen.add(key.value)
+                self._refuse_repeated(value)
+
+    def pair(self, place: Place) -> tuple[yaml.Node, yaml.Node]:
+        """The key's and the value's node at a place, or of the innermost block around it that is there.
+
+        For the items of a list both are the item. A name in ``place`` that no key has, such as the tag that pydantic
+        puts between an item and its keys, is passed over.
+        """
+        key = value = self._root
+        for step in place:
+            if isinstance(value, yaml.SequenceNode) and isinstance(step, int) and step < len(value.value):
+                key = value = value.value[step]
+            elif isinstance(value, yaml.MappingNode):
+                key, value = next(((k, v) for k, v in value.value if k.value == str(step)), (key, value))
+        return key, value
+
+    def at(self, place: Place) -> str:
+        """``file:line`` of a place, or of the innermost block around it."""
+        return f"{self.path}:{self.pair(place)[0].start_mark.line + 1}"
+
+    @contextmanager
+    def named_at(self, place: Place) -> Iterator[None]:
+        """Errors on what a place names, such as a file, begin with the place's line."""
+        try:
+            yield
+        except (ValueError, FileNotFoundError) as error:
+            raise type(error)(f"{self.at(place)}: {error}") from error
+
+    def error(self, place: Place, message: str) -> ValueError:
+        """An error at a place, to be raised."""
+        return ValueError(f"{self.at(place)}: {message}")
+
+    def validated(self, model: type[Model]) -> Model:
+        """The document as the fields of ``model``; ``ValueError`` says what is wrong first, from the top."""
+        try:
+            return model.model_validate(self.data)
+        except ValidationError as error:
+            problems = error.errors()
+        # a misspelt key is also a missing one, and the spelling is what to correct
+        problems.sort(key=lambda p: (self.pair(p["loc"])[0].start_mark.line, p["type"] == "missing"))
+        if any(problem["type"] == "extra_forbidden" for problem in problems):
+            problems.sort(key=lambda problem: problem["type"] != "extra_forbidden")
+        more = f" ({len(problems) - 1} more below)" if len(problems) > 1 else ""
+        raise self.error(problems[0]["loc"], self._sentence(problems[0], model) + more)
+
+    def _sentence(self, problem: ErrorDetails, model: type[BaseModel]) -> str:
+        """Value, rule and cure."""
+        place, kind = problem["loc"], problem["type"]
+        key, value = str(place[-1]) if place else "the file", problem["input"]
+        context = problem.get("ctx", {})
+        rule = problem["msg"].removeprefix("Value error, ").replace("Input should", "it must").replace("should", "must")
+        if kind == "missing" and isinstance(place[-1], int):
+            return f"`{_key_of(place)}` has too few entries; it must have more than {place[-1]}: add the others"
+        if kind == "missing":
+            return f"`{key}` is missing; it must be given: add a line `{key}: ...`"
+        if kind == "extra_forbidden":
+            return f"the key `{key}` means nothing here: {similar(key, self._known_keys(place, model))}"
+        if kind == "union_tag_not_found":
+            return f"`type` is missing; it must be one of {', '.join(_types(model))}: add it"
+        if kind == "union_tag_invalid":
+            tags = [tag.strip(" '") for tag in str(context.get("expected_tags", "")).split(",")]
+            return f"the type {context.get('tag')!r} is unknown: {similar(str(context.get('tag')), tags)}"
+        if kind == "string_pattern_mismatch":
+            rule = f"it must match {context.get('pattern')}: letters, digits, dots, dashes"
+        if not place or isinstance(value, dict):
+            return f"{rule}: correct this block"
+        if kind == "model_attributes_type":
+            rule = f"it must be a block of keys, such as `type: {_types(model)[0]}`"
+        return f"`{_key_of(place)}` is {value!r}; {rule}: correct it"
+
+    def _known_keys(self, place: Place, model: type[BaseModel]) -> list[str]:
+        """The keys that are allowed where an unknown one is, found by asking the models for a block like that."""
+        fields = _fields_at(place[:-1], model)
+        used = self.pair(place[:-1])[1]
+        have = {k.value for k, _ in used.value} if isinstance(used, yaml.MappingNode) else set()
+        return [name for name in fields if name not in have] or list(fields)
+
+
+def _key_of(place: Place) -> str:
+    """``angle`` of ("deformations", 0, "bend", "angle", 1): the innermost key."""
+    keys = [step for step in place if isinstance(step, str) and step != "[key]"]
+    return keys[-1] if keys else "value"
+
+
+def _types(model: type[BaseModel]) -> list[str]:
+    """The types of deformation, from the schema."""
+    schema = model.model_json_schema()
+    return list(schema["properties"]["deformations"]["anyOf"][0]["items"]["discriminator"]["mapping"])
+
+
+def _fields_at(place: Place, model: type[BaseModel]) -> list[str]:
+    """Names of the fields of the block at ``place``, from the model's JSON schema."""
+    schema = model.model_json_schema()
+    block: dict[str, Any] = schema
+    for step in place:
+        block = _inner(schema, block, step)
+    return list(block.get("properties", {}))
+
+
+def _inner(schema: dict[str, Any], block: dict[str, Any], step: int | str) -> dict[str, Any]:
+    """The schema of one step further in: of a key, a list's item, or the item of a named type."""
+    inner: dict[str, Any] = block["items"] if isinstance(step, int) else block.get("properties", {}).get(step, block)
+    if "discriminator" in block and isinstance(step, str):
+        inner = {"$ref": block["discriminator"]["mapping"][step]}
+    inner = next((option for option in inner.get("anyOf", ()) if option.get("type") != "null"), inner)
+    if "$ref" in inner:
+        found: dict[str, Any] = schema["$defs"][inner["$ref"].rpartition("/")[2]]
+        return found
+    return inner
+
+
+def similar(word: str, known: list[str]) -> str:
+    """ "did you mean ...?" for a misspelt word, else what is known."""
+    close = get_close_matches(word, known, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"

@@ -1,0 +1,232 @@
+"""The occupancy predictor's decoder (paper, section 3.1) with optional local features at the query.
+
+Every layer that reads the latent vector is split, ``W [z; x] = W_z z + W_x x``: the latent half is computed once per
+cloud and broadcast over its queries, which is exact and removes the (queries x 1084) buffers.
+
+Notation: b clouds, q queries, k neighbours, z latent channels, h hidden channels.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mereo.models.config import NetworkConfig
+from mereo.models.device import exact
+from mereo.models.encoders.encoding import Encoding, Level
+from mereo.models.ops.neighbors import gather, nearest
+from mereo.models.rigid_alignment import Alignment
+from mereo.models.template_lookup import RestLookup
+
+
+@dataclass(frozen=True, eq=False)
+class Code:
+    """All that a query needs to know of a cloud; computed once.
+
+    Attributes:
+        latent1, latent2: the latent half of the first layer and of the layer after the skip connection.
+        levels: set-abstraction centres with features projected for attention; empty without local features.
+        cloud: the observed points, farthest-point order, normalized, in the camera frame.
+        viewpoint: the camera's position in normalized coordinates.
+        alignment: from the camera frame to the frame in which the levels are; None where it is the same.
+    """
+
+    latent1: Float[Tensor, "b h"]
+    latent2: Float[Tensor, "b h"]
+    levels: tuple[Level, ...]
+    cloud: Float[Tensor, "b n 3"]
+    viewpoint: Float[Tensor, "b 3"]
+    alignment: Alignment | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Raw outputs at each query: class logits (0 is empty), signed distance, direction (not yet unit length).
+
+    ``rest`` are rest coordinates (``rest_pose``), meant inside the object; None where the network predicts none.
+    """
+
+    logits: Float[Tensor, "b q c"]
+    distance: Float[Tensor, "b q"]
+    direction: Float[Tensor, "b q 3"]
+    rest: Float[Tensor, "b q 3"] | None = None
+
+
+class FrequencyEncoding(nn.Module):
+    """``sin(2^e pi x), cos(2^e pi x)`` for every exponent e (paper, equation 2, with negative exponents)."""
+
+    def __init__(self, lowest: int, highest: int) -> None:
+        super().__init__()
+        frequency = torch.pi * 2.0 ** torch.arange(lowest, highest + 1)
+        self.frequency: Tensor
+        self.register_buffer("frequency", frequency, persistent=False)
+        self.channels = 6 * len(frequency)
+
+    def forward(self, points: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q e"]:
+        phase = (points[..., None] * self.frequency).flatten(-2)
+        return torch.cat([phase.sin(), phase.cos()], dim=-1)
+
+
+class LocalAttention(nn.Module):
+    """Attention of a query over its nearest set-abstraction centres of one level.
+
+    ``h_k = relu(A f_k + B (x - c_k))``, weights softmax_k(w h_k) for each of four heads, answer sum_k w_k h_k.
+    ``A f_k`` is computed once per centre, so a neighbour costs the query only a gather and the small product with B.
+    """
+
+    HEADS = 4
+
+    def __init__(self, channels: int, width: int, neighbors: int) -> None:
+        super().__init__()
+        self.neighbors = neighbors
+        self.project = nn.Linear(channels, width)
+        self.offset = nn.Linear(4, width, bias=False)
+        self.score = nn.Linear(width, self.HEADS)
+
+    def forward(self, level: Level, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q w"]:
+        """``level.features`` are already projected."""
+        index = nearest(queries, level.centers, self.neighbors)
+        offset = queries[:, :, None] - gather(level.centers, index)
+        offset = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], dim=-1)
+        hidden = torch.relu(gather(level.features, index) + self.offset(offset))
+        weight = self.score(hidden).softmax(dim=2)
+        heads = hidden.unflatten(-1, (self.HEADS, -1))
+        return (weight[..., None] * heads).sum(dim=2).flatten(-2)
+
+
+def line_of_sight(
+    queries: Float[Tensor, "b q 3"], cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], count: int
+) -> Float[Tensor, "b q f"]:
+    """Free-space evidence: lateral offset and depth difference to the observed points nearest in the image.
+
+    A query in front of them is in seen empty space; one behind is hidden; one with none nearby is outside the
+    silhouette. Both the plain values and eight times them, clipped to [-1, 1], so that near is resolved finely.
+    """
+    rays, seen = queries - viewpoint[:, None], cloud - viewpoint[:, None]
+    query_depth, seen_depth = rays[..., 2:].clamp(min=1e-3), seen[..., 2:].clamp(min=1e-3)
+    query_image, seen_image = rays[..., :2] / query_depth, seen[..., :2] / seen_depth
+    index = nearest(query_image, seen_image, count)
+    lateral = (gather(seen_image, index) - query_image[:, :, None]) * query_depth[:, :, None]
+    depth = gather(seen_depth, index) - query_depth[:, :, None]
+    evidence = torch.cat([lateral, depth], dim=-1).flatten(-2)
+    return torch.cat([evidence.clamp(-3.0, 3.0), (8.0 * evidence).clamp(-1.0, 1.0)], dim=-1)
+
+
+class ConditionedMLP(nn.Module):
+    """Code and query points -> features: the decoder's layers, whatever is asked of them.
+
+    Queries are in the camera frame; the levels of the code may be in an aligned one.
+    """
+
+    def __init__(self, config: NetworkConfig, outputs: int, lookup: RestLookup | None = None) -> None:
+        super().__init__()
+        self.config, self.lookup = config, lookup
+        self.encode = FrequencyEncoding(config.lowest_exponent, config.highest_exponent)
+        query, width = self.encode.channels if config.encode_positions else 3, config.width
+        self.latent1 = nn.Linear(config.latent, width, bias=False)
+        self.latent2 = nn.Linear(config.latent, width, bias=False)
+        self.query1 = nn.Linear(query, width, bias=False)
+        self.query2 = nn.Linear(query, width, bias=False)
+        self.hidden = nn.ModuleList(nn.Linear(width, width, bias=False) for _ in range(config.depth - 1))
+        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for _ in range(config.depth))
+        self.local = nn.ModuleList()
+        if config.local_neighbors:
+            self.local.extend(
+                LocalAttention(channels, config.local_width, config.local_neighbors) for channels in config.level_widths
+            )
+            self.local1 = nn.Linear(len(self.local) * config.local_width, width, bias=False)
+        if config.sight_neighbors:
+            self.sight1 = nn.Linear(6 * config.sight_neighbors, width, bias=False)
+        self.head = nn.Linear(width, outputs)
+
+    def summands(self, number: int) -> list[nn.Linear]:
+        """The layers whose sum is normalized in layer ``number``, counted from 0."""
+        if number == 0:
+            extra = ("local1",) * bool(self.config.local_neighbors) + ("sight1",) * bool(self.config.sight_neighbors)
+            return [self.latent1, self.query1, *(getattr(self, name) for name in extra)]
+        summands: list[nn.Linear] = [self.hidden[number - 1]]  # type: ignore[list-item]
+        if number == self.config.skip_after:
+            summands += [self.latent2, self.query2, *(() if self.lookup is None else (self.lookup.read,))]
+        return summands
+
+    def prepare(
+        self,
+        encoding: Encoding,
+        cloud: Float[Tensor, "b n 3"],
+        viewpoint: Float[Tensor, "b 3"],
+        alignment: Alignment | None = None,
+    ) -> Code:
+        """The part of the work that does not depend on the queries."""
+        with exact(cloud):  # pooled features have much in common, and the rest is what counts
+            levels = tuple(
+                Level(level.centers, attention.project(level.features.float()))  # type: ignore[operator]
+                for level, attention in zip(encoding.levels, self.local, strict=False)
+            )
+            latent = encoding.latent.float()
+            return Code(self.latent1(latent), self.latent2(latent), levels, cloud, viewpoint, alignment)
+
+    def features(
+        self, code: Code, queries: Float[Tensor, "b q 3"]
+    ) -> tuple[Float[Tensor, "b q f"], Float[Tensor, "b q 3"] | None]:
+        """The last layer's outputs, and the rest coordinates of the lookup on the way, if there is one."""
+        placed = queries if code.alignment is None else code.alignment.apply(queries)
+        encoded = self.encode(placed) if self.config.encode_positions else placed
+        with exact(queries):  # up to the first normalization
+            rows = [encoded]
+            if self.config.local_neighbors:
+                rows += [layer(level, placed) for layer, level in zip(self.local, code.levels, strict=True)]
+            if self.config.sight_neighbors:
+                rows.append(line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors))
+            hidden = self._activate(0, joint_linear(self.summands(0)[1:], rows, code.latent1))
+        rest = None
+        for number in range(1, len(self.norms)):
+            rows, latent = [hidden], None
+            if number == self.config.skip_after:
+                rows, latent = [hidden, encoded], code.latent2
+                if self.lookup is not None:
+                    rest, seen = self.lookup(hidden, placed)
+                    rows.append(seen)
+            layers = [layer for layer in self.summands(number) if layer is not self.latent2]
+            hidden = self._activate(number, joint_linear(layers, rows, latent))
+        return self.head(hidden).float(), rest
+
+    def _activate(self, number: int, hidden: Float[Tensor, "b q h"]) -> Float[Tensor, "b q h"]:
+        """Normalization, ReLU and dropout of layer ``number``, counted from 0."""
+        hidden = self.norms[number](hidden.flatten(0, 1)).relu_().unflatten(0, hidden.shape[:2])
+        return nn.functional.dropout(hidden, self.config.dropout, self.training)
+
+
+def joint_linear(
+    layers: Sequence[nn.Linear], rows: Sequence[Float[Tensor, "b q _"]], latent: Float[Tensor, "b h"] | None
+) -> Float[Tensor, "b q h"]:
+    """``sum_i W_i x_i`` (+ the cloud's ``latent``) as one product of joined rows: the sum is written once.
+
+    ``rows`` may be fewer, and wider, than ``layers``, as long as the channels match in order.
+    """
+    weight = torch.cat([layer.weight for layer in layers], dim=1) if len(layers) > 1 else layers[0].weight
+    joined = torch.cat(list(rows), dim=-1) if len(rows) > 1 else rows[0]
+    bias = layers[0].bias
+    if latent is None:
+        return nn.functional.linear(joined, weight, bias)
+    shift = latent if bias is None else latent + bias
+    if len(shift) == 1:
+        return nn.functional.linear(joined, weight, shift[0])
+    return nn.functional.linear(joined, weight) + shift[:, None]
+
+
+class Decoder(ConditionedMLP):
+    """Code and query points -> class logits, signed distance, direction."""
+
+    def __init__(self, config: NetworkConfig, classes: int) -> None:
+        lookup = RestLookup(config.width, classes - 1) if config.rest_template else None
+        super().__init__(config, classes + 4, lookup)
+        self.classes = classes
+
+    def forward(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Prediction:
+        features, rest = self.features(code, queries)
+        logits, distance, direction = features.split([self.classes, 1, 3], dim=-1)
+        if code.alignment is not None:
+            direction = code.alignment.turn_back(direction)
+        return Prediction(logits, distance[..., 0], direction, rest)

@@ -1,0 +1,115 @@
+"""What this machine offers: device, precision, and an allocator setting that matters."""
+
+import ctypes
+import shutil
+import sys
+import time
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from mereo.models.config import Device, Precision
+
+
+def pick_device(rank: int = 0) -> torch.device:
+    """A CUDA device where there is one, else the CPU."""
+    if torch.cuda.is_available():
+        return torch.device("cuda", rank % torch.cuda.device_count())
+    return torch.device("cpu")
+
+
+def find_device(device: Device) -> torch.device:
+    """The device that was asked for; ``ValueError`` for CUDA where torch sees none."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("the device is cuda, but torch sees no CUDA device; leave out --device to use the CPU")
+    return torch.device("cpu") if device == "cpu" else pick_device()
+
+
+@cache
+def bfloat16_gain() -> float:
+    """How many times faster this CPU multiplies matrices of the network's size in bfloat16 than in float32.
+
+    Measured once, in about 10 ms, because what a CPU says of itself does not tell: AVX-512's bfloat16 instructions
+    double the rate on AMD's Zen 4 and change nothing on Intel's Xeons, where AMX makes it five times.
+    """
+    # not random numbers: drawing them would change the caller's
+    pairs = [(torch.ones(2048, 256, dtype=d), torch.ones(256, 256, dtype=d)) for d in (torch.float32, torch.bfloat16)]
+    rounds = [[_seconds(*pair) for pair in pairs] for _ in range(8)]  # in turn, so that a busy moment meets both
+    single, half = map(min, zip(*rounds, strict=True))
+    return single / half
+
+
+def _seconds(a: Tensor, b: Tensor) -> float:
+    start = time.perf_counter()
+    torch.mm(a, b)
+    return time.perf_counter() - start
+
+
+BFLOAT16_PAYS = 1.5
+"""From this gain in products on, a training step is faster too: the rest of it stays in float32."""
+
+
+def pick_precision(precision: Precision, device: torch.device) -> torch.dtype | None:
+    """The autocast type, or None for float32; auto takes bfloat16 on CUDA and on CPUs that are much faster in it."""
+    if precision == "float32":
+        return None
+    if precision == "bfloat16" or device.type == "cuda" or bfloat16_gain() >= BFLOAT16_PAYS:
+        return torch.bfloat16
+    return None
+
+
+def exact(tensor: Tensor) -> AbstractContextManager[object]:
+    """Switches autocast off where bfloat16, with its eight bits, is too coarse.
+
+    A coordinate near 1 would be off by up to 0.004, more than sensor noise; and what all rows have in common, which
+    batch normalization takes away again, may be hundreds of times their spread, which rounding would then erase.
+    """
+    device = tensor.device.type
+    # where it is off already nothing is done, because an exported graph would keep the switch, which ONNX does not know
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+
+
+def compiling_pays(device: torch.device, steps: int) -> bool:
+    """Whether torch.compile earns its minute back: always on CUDA, on CPUs in long runs where a C++ compiler exists."""
+    if device.type == "cuda":
+        return True
+    return steps >= 1000 and shutil.which("g++") is not None
+
+
+def keep_freed_memory() -> None:
+    """Tell glibc to reuse large freed blocks instead of returning them to the system.
+
+    A training step frees and allocates the same hundreds of megabytes; returning them costs a page fault for each 4 kB,
+    measured as half of the time of a float32 CPU step. Does nothing where the C library is not glibc.
+    """
+    if sys.platform != "linux":
+        return
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):
+        return
+    trim_threshold, mmap_max = -1, -4  # M_TRIM_THRESHOLD, M_MMAP_MAX in malloc.h
+    mallopt(mmap_max, 0)
+    mallopt(trim_threshold, 2**31 - 1)
+
+
+def cpu_features() -> dict[str, bool | None]:
+    """Instruction sets that decide the speed; None where this torch cannot tell."""
+    probes = {
+        "avx2": "_is_avx2_supported",
+        "avx512": "_is_avx512_supported",
+        "avx512_bf16": "_is_avx512_bf16_supported",
+        "amx": "_is_amx_tile_supported",
+    }
+    return {name: _ask_torch(function) for name, function in probes.items()}
+
+
+def _ask_torch(function: str) -> bool | None:
+    """The probes are private functions of torch: they come and go, and must never stop the report."""
+    probe = getattr(torch.cpu, function, None)
+    try:
+        return None if probe is None else bool(probe())
+    except (RuntimeError, AttributeError):
+        return None

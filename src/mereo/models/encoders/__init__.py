@@ -1,0 +1,1 @@
+"""Point cloud encoders: each maps a normalized cloud to an ``Encoding``."""

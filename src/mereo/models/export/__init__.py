@@ -1,0 +1,1 @@
+"""Networks as graphs, and the runner that travels with them."""

@@ -1,0 +1,235 @@
+"""Trained networks as graphs for other runtimes: ONNX, and torch.export's ``.pt2``.
+
+Two graphs, because a cloud is encoded once and queried often:
+
+    encoder   cloud [1, n, 3]                            -> code tensors
+    query     points [1, q, 3], code tensors, and with free-space evidence cloud and viewpoint [1, 3]
+                                                         -> logits [1, q, c], distance [1, q], direction [1, q, 3]
+
+All coordinates are normalized, the cloud in farthest-point order; ``mereo_onnx.py``, which goes beside ONNX graphs,
+does both in numpy. n and q are open: n from the network's own number of points up. See docs/design/0015-export.md.
+"""
+
+import logging
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.export import Dim, ExportedProgram
+
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.io.atomic_files import new_directory, write_json
+from mereo.models.decoder import Code
+from mereo.models.encoders.encoding import Level
+from mereo.models.model import DENSE_FACTOR, Model
+from mereo.models.network import Network
+from mereo.models.rigid_alignment import Alignment
+from mereo.models.weights import load_model
+
+FORMAT_VERSION = 1
+
+RUNNER = Path(__file__).with_name("mereo_onnx.py")
+
+EXAMPLE_QUERIES = 24
+"""Of the traced example; any number may follow."""
+
+FIXED_SIZE = ("latent1", "latent2", "rotation", "shift", "viewpoint")
+"""Code tensors whose size does not depend on the number of points."""
+
+UNBOUNDED = 2.0**60
+"""torch's upper bound of an open size is infinite or the largest integer."""
+
+ANSWERS = ("logits", "distance", "direction")
+
+Open = Dim.DYNAMIC
+"""A size that the graph leaves open; torch finds its bounds."""
+
+
+class EncoderGraph(nn.Module):
+    """Cloud -> code tensors by name."""
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, cloud: Float[Tensor, "1 n 3"]) -> dict[str, Tensor]:
+        unused = torch.zeros_like(cloud[:, 0])  # the viewpoint: only queries look along lines of sight
+        return code_tensors(self.network.encode(cloud, unused))
+
+
+class QueryGraph(nn.Module):
+    """Points and code tensors -> what ``Model.respond`` says."""
+
+    def __init__(self, model: Model) -> None:
+        super().__init__()
+        self.model, self.network = model, model.network
+
+    def forward(self, points: Float[Tensor, "1 q 3"], code: dict[str, Tensor]) -> dict[str, Tensor]:
+        answers = self.model.respond(self.network.query(code_of(code), points), points)
+        return dict(zip(ANSWERS, answers, strict=True))
+
+
+def code_tensors(code: Code) -> dict[str, Tensor]:
+    """What the encoder has computed; the cloud and the viewpoint are known without it."""
+    tensors = {"latent1": code.latent1, "latent2": code.latent2}
+    for number, level in enumerate(code.levels, start=1):
+        tensors |= {f"centers{number}": level.centers, f"features{number}": level.features}
+    if code.alignment is not None:
+        tensors |= {"rotation": code.alignment.rotation, "shift": code.alignment.shift}
+    return tensors
+
+
+def code_of(tensors: dict[str, Tensor]) -> Code:
+    """Inverse of ``code_tensors``. A network without lines of sight needs neither cloud nor viewpoint."""
+    levels: list[Level] = []
+    while (name := f"centers{len(levels) + 1}") in tensors:
+        levels.append(Level(tensors[name], tensors[name.replace("centers", "features")]))
+    alignment = Alignment(tensors["rotation"], tensors["shift"]) if "rotation" in tensors else None
+    nothing = torch.zeros(1, 1, 3)
+    cloud, viewpoint = tensors.get("cloud", nothing), tensors.get("viewpoint", nothing[:, 0])
+    return Code(tensors["latent1"], tensors["latent2"], tuple(levels), cloud, viewpoint, alignment)
+
+
+@dataclass(frozen=True, eq=False)
+class Graphs:
+    """Both graphs as torch programs.
+
+    Attributes:
+        encoder, query: the programs.
+        inputs: names of the query's inputs after ``points``, in order.
+        outputs: names of the encoder's outputs, in order.
+        most: points of a cloud that the encoder takes, from the network's number of points up; None is no limit.
+    """
+
+    encoder: ExportedProgram
+    query: ExportedProgram
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    most: int | None
+
+
+def export_graphs(model: Model) -> Graphs:
+    """Trace both graphs. Raises ``ValueError`` for an autodecoder."""
+    config = model.network.config
+    if config.encoder == "autodecoder":
+        raise ValueError(
+            "these weights are an autodecoder's, which finds the code of a cloud by gradient steps; a graph has none: "
+            "train with --network.encoder pointnet2 or point-transformer to export"
+        )
+    cloud = _example_points(config.points)
+    encoder, query = EncoderGraph(model.network).eval(), QueryGraph(model).eval()
+    with torch.no_grad(), _quiet():
+        traced = torch.export.export(encoder, (cloud,), dynamic_shapes=({1: Open},), strict=False)
+        code = encoder(cloud)
+        outputs = tuple(code)
+        if config.sight_neighbors:
+            code |= {"cloud": cloud, "viewpoint": torch.tensor([[0.1, -0.2, -8.0]])}
+        open_sizes = {name: None if name in FIXED_SIZE else {1: Open} for name in code}
+        points = _example_points(EXAMPLE_QUERIES)
+        asked = torch.export.export(query, (points, code), dynamic_shapes=({1: Open}, open_sizes), strict=False)
+    (bounds,) = traced.range_constraints.values()
+    most = None if float(bounds.upper) > UNBOUNDED else int(bounds.upper)
+    return Graphs(traced, asked, tuple(code), outputs, most)
+
+
+def _example_points(count: int) -> Float[Tensor, "1 n 3"]:
+    """Points on a sphere: the values do not matter, their number does not stay."""
+    points = torch.randn(1, count, 3, generator=torch.Generator().manual_seed(0))
+    return nn.functional.normalize(points, dim=-1)
+
+
+def write_onnx(graphs: Graphs, directory: Path) -> None:
+    """``encoder.onnx`` and ``query.onnx``. Raises ``ImportError`` without the extra `onnx`."""
+    _require_onnx()
+    from mereo.models.export.onnx_operators import DECOMPOSITIONS
+
+    inputs = {"encoder": ["cloud"], "query": ["points", *graphs.inputs]}
+    outputs = {"encoder": graphs.outputs, "query": ANSWERS}
+    for name, program in (("encoder", graphs.encoder), ("query", graphs.query)):
+        with torch.no_grad(), _quiet():
+            written = torch.onnx.export(
+                program.run_decompositions(DECOMPOSITIONS),
+                input_names=inputs[name],
+                output_names=list(outputs[name]),
+                dynamo=True,
+                external_data=False,
+                verbose=False,
+            )
+        assert written is not None
+        written.save(directory / f"{name}.onnx")
+
+
+def _require_onnx() -> None:
+    for package in ("onnx", "onnxscript"):
+        if find_spec(package) is None:
+            raise ImportError(f"{package} is needed to export to ONNX: pip install 'mereo[onnx]'")
+
+
+def write_torch(graphs: Graphs, directory: Path) -> None:
+    """``encoder.pt2`` and ``query.pt2``, for ``torch.export.load``."""
+    with _quiet():
+        torch.export.save(graphs.encoder, directory / "encoder.pt2")
+        torch.export.save(graphs.query, directory / "query.pt2")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """torch warns of its own internals and of packages that nobody needs here."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def describe(model: Model, graphs: Graphs) -> dict[str, Any]:
+    """``model.json``: what is needed beside the graphs."""
+    return {
+        "version": FORMAT_VERSION,
+        "names": model.names if model.segmented else ["object"],
+        "colors": model.colors if model.segmented else [model.colors[0]],
+        "nested": model.nested,
+        "loss": model.loss,
+        "encoder_outputs": graphs.outputs,
+        "query_inputs": graphs.inputs,
+        "points": model.network.config.points,
+        "most_points_of_the_graph": graphs.most,
+        "fewest_points_of_a_cloud": MIN_POINTS,
+        "dense_factor": DENSE_FACTOR,
+        "normalizer": "center and half of the longest side of the observed cloud's box",
+        "provenance": model.provenance,
+    }
+
+
+def export_weights(
+    weights: str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", force: bool = False
+) -> None:
+    """``mereo export``: a new directory with both graphs, ``model.json`` and, for ONNX, the runner.
+
+    Raises ``ValueError`` for an autodecoder, ``ImportError`` without the extra `onnx`, ``FileExistsError`` for a
+    directory with content unless ``force``.
+    """
+    if format == "onnx":
+        _require_onnx()
+    model = load_model(weights)
+    with new_directory(output, force) as directory:
+        graphs = export_graphs(model)
+        (write_onnx if format == "onnx" else write_torch)(graphs, directory)
+        write_json(directory / "model.json", describe(model, graphs))
+        if format == "onnx":
+            shutil.copyfile(RUNNER, directory / RUNNER.name)
+    print(f"wrote {output}: encoder and query for clouds of {model.network.config.points} points")
+    if format == "onnx":
+        print(f"try: python {Path(output) / RUNNER.name} frame.npy --points queries.npy -o out.npz")

@@ -1,0 +1,255 @@
+"""The trained model that a user holds.
+
+``Network`` works on normalized batches; ``Model`` takes clouds and points in the user's frame and units, and answers
+in them. The code of a cloud is computed once and then queried as often as one likes.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.geometry.mesh import Color
+from mereo.geometry.normalizer import Normalizer
+from mereo.models.batch_norm_fusion import fold_batch_norm
+from mereo.models.config import Precision
+from mereo.models.decoder import Code, Prediction
+from mereo.models.device import pick_precision
+from mereo.models.network import Network
+
+SURE_LOGIT = 20.0
+"""Lead of empty space where there can be nothing; trained networks reach about this in plainly empty space."""
+
+DENSE_FACTOR = 8
+"""Clouds this many times denser than the network's input are thinned at random first: ordering all is quadratic."""
+
+CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 4096, 65536
+"""Queries evaluated at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
+
+Vector = tuple[float, float, float]
+Box = tuple[Vector, Vector]
+"""Lower and upper corner."""
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedCloud:
+    """One observed cloud, ready to be queried.
+
+    Attributes:
+        code: the network's side.
+        normalizer: between the user's frame and the network's.
+        cloud: the points the network saw, in the user's frame and units.
+    """
+
+    code: Code
+    normalizer: Normalizer
+    cloud: Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the model says about each point, in the user's frame and units.
+
+    Attributes:
+        label: 0 for empty space, i + 1 for the model's segment i.
+        probability: of empty space and each segment; rows sum to one.
+        distance: to the nearest segment surface, negative inside; NaN from a model that was not trained on distances.
+        direction: unit vector towards it; NaN from a model that was not trained on directions.
+    """
+
+    label: UInt8[np.ndarray, " n"]
+    probability: Float[np.ndarray, "n c"]
+    distance: Float[np.ndarray, " n"]
+    direction: Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A trained network with everything needed to use it.
+
+    Attributes:
+        network: in evaluation mode; not to be changed once the model has been asked.
+        names, colors: of the segments; label i + 1 is names[i].
+        provenance: how it was trained: scene, seeds, dataset, recipe, versions.
+        loss: the terms it was trained with; what none of them taught is not answered.
+        domain: normalized box outside which everything is answered as empty: nothing was ever there in training, and
+            a network may say anything where it was never corrected. None means no limit.
+        nested: pairs of names (inner, outer), see ``SegmentedMesh``.
+        precision: of the products; float32 is exact, bfloat16 faster on GPUs and some CPUs (`mereo bench` says what it
+            costs), auto takes bfloat16 there.
+    """
+
+    network: Network
+    names: tuple[str, ...]
+    colors: tuple[Color, ...]
+    loss: str = "ce+l1"
+    provenance: dict[str, object] = field(default_factory=dict)
+    domain: Box | None = None
+    nested: tuple[tuple[str, str], ...] = ()
+    precision: Precision = "float32"
+
+    @property
+    def segmented(self) -> bool:
+        """Whether it tells segments apart; one trained on distances alone only knows inside from outside."""
+        return "ce" in self.loss
+
+    @cached_property
+    def inference(self) -> Network:
+        """What answers: the network without normalization layers, made at the first question."""
+        return fold_batch_norm(self.network)
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.network.parameters()).device
+
+    @property
+    def working_dtype(self) -> torch.dtype:
+        """Of the products on this machine: float32 or bfloat16."""
+        return pick_precision(self.precision, self.device) or torch.float32
+
+    @property
+    def working_precision(self) -> str:
+        """The name of ``working_dtype``."""
+        return str(self.working_dtype).removeprefix("torch.")
+
+    def encode(self, cloud: PointCloud | Float[np.ndarray, "n 3"]) -> EncodedCloud:
+        """Points in a camera frame (z forward), any unit, any density. Raises ``ValueError`` on unusable clouds."""
+        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
+        ordered, normalizer = self.normalized_cloud(cloud)
+        seen = ordered[0, : len(cloud)].numpy().astype(np.float64)
+        with self.answering():
+            viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32))
+            code = self.inference.encode(ordered.to(self.device), viewpoint.to(self.device))
+        return EncodedCloud(code, normalizer, normalizer.invert(seen))
+
+    def normalized_cloud(self, cloud: PointCloud) -> tuple[Float[Tensor, "1 n 3"], Normalizer]:
+        """What the network sees of a cloud, in farthest-point order; repeated where there are too few points.
+
+        Raises ``ValueError`` on unusable clouds.
+        """
+        points = checked_points(cloud)
+        normalizer = Normalizer.fit(points)
+        limit = self.network.config.points
+        normalized = normalizer.apply(thin(points, limit * DENSE_FACTOR)).astype(np.float32)
+        seen = normalized[farthest_point_order(normalized, limit)]
+        return torch.from_numpy(seen[np.arange(limit) % len(seen)][None]), normalizer
+
+    def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
+        """Segment, probabilities, signed distance and direction at each point."""
+
+        def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            logits, distance, direction = self.respond(prediction, queries)
+            return logits.softmax(dim=-1), distance, direction
+
+        probability, distance, direction = self._chunked(code, points, answer)
+        return Answer(
+            label=probability.argmax(axis=-1).astype(np.uint8),
+            probability=probability,
+            distance=distance / np.float32(code.normalizer.scale),
+            direction=direction,
+        )
+
+    def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+        """Class logits only: what surface extraction needs."""
+        return self._chunked(code, points, lambda *found: (self.class_logits(*found),))[0]
+
+    def rest(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"] | None:
+        """Where each point was at rest, in rest coordinates (see ``rest_pose``); None from a model without template."""
+        if self.network.decoder.lookup is None:
+            return None
+
+        def rest(prediction: Prediction, _: Tensor) -> tuple[Tensor]:
+            assert prediction.rest is not None
+            return (prediction.rest,)
+
+        return self._chunked(code, points, rest)[0].astype(np.float64)
+
+    def respond(
+        self, prediction: Prediction, queries: Float[Tensor, "b q 3"]
+    ) -> tuple[Float[Tensor, "b q c"], Float[Tensor, "b q"], Float[Tensor, "b q 3"]]:
+        """Class logits, signed distance and unit direction at normalized queries, in normalized units.
+
+        A head that no term of the loss has trained says nothing: it is NaN.
+        """
+        distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
+        if "l1" not in self.loss:
+            distance = torch.full_like(distance, torch.nan)
+        if "cd" not in self.loss:
+            direction = torch.full_like(direction, torch.nan)
+        return self.class_logits(prediction, queries), distance, direction
+
+    def class_logits(self, prediction: Prediction, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q c"]:
+        """Logits of empty space and each segment; ``queries`` are normalized."""
+        logits = prediction.logits
+        if not self.segmented:
+            # trained on distances alone: inside is one class, and -distance its margin (paper, section 4.4)
+            logits = torch.stack([prediction.distance, -prediction.distance], dim=-1)
+        if self.domain is None:
+            return logits
+        low, high = self._limits
+        outside = ((queries < low) | (queries > high)).any(dim=-1)
+        surely_empty = torch.zeros_like(logits[0, 0])
+        surely_empty[0] = SURE_LOGIT
+        return torch.where(outside[..., None], surely_empty, logits)
+
+    @cached_property
+    def _limits(self) -> Float[Tensor, "2 3"]:
+        """The domain's corners, made once: an upload for every chunk would wait for the device."""
+        return torch.tensor(self.domain, device=self.device)
+
+    @contextmanager
+    def answering(self) -> Iterator[None]:
+        """Around whatever the network computes for a user: no gradients, in the model's precision."""
+        dtype = pick_precision(self.precision, self.device)
+        with torch.inference_mode(), torch.autocast(self.device.type, dtype, enabled=dtype is not None):
+            yield
+
+    def _chunked(
+        self,
+        code: EncodedCloud,
+        points: Float[np.ndarray, "n 3"],
+        answer: Callable[[Prediction, Tensor], tuple[Tensor, ...]],
+    ) -> list[np.ndarray]:
+        normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
+        size = CUDA_QUERY_CHUNK if self.device.type == "cuda" else CPU_QUERY_CHUNK
+        chunks = []
+        with self.answering():
+            for start in range(0, max(len(normalized), 1), size):
+                queries = torch.from_numpy(normalized[start : start + size])[None].to(self.device)
+                chunks.append([part[0].cpu() for part in answer(self.inference.query(code.code, queries), queries)])
+        return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
+
+
+def check_enough(count: int, said: str) -> None:
+    """Raise ``ValueError``, beginning with ``said``, where the encoder needs more points than ``count``."""
+    if count < MIN_POINTS:
+        raise ValueError(
+            f"{said}; the encoder needs at least {MIN_POINTS}: move closer, or check the mask and the depth range"
+        )
+
+
+def checked_points(cloud: PointCloud) -> Float[np.ndarray, "n 3"]:
+    """The cloud's points as float64, or one sentence on why they cannot be used."""
+    points = np.asarray(cloud.points, dtype=np.float64)
+    check_enough(len(points), f"the cloud has {len(points)} points")
+    if (points[:, 2] <= 0).any():
+        raise ValueError(
+            f"{int((points[:, 2] <= 0).sum())} of {len(points)} points have z <= 0, behind the camera; the cloud must "
+            "be in a camera frame (x right, y down, z forward): turn it, or pass --frame scanner for y-up scans"
+        )
+    return points
+
+
+def thin(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.ndarray, "m 3"]:
+    """At most ``limit`` of the points, chosen at random but always the same way."""
+    if len(points) <= limit:
+        return points
+    return points[np.random.default_rng(0).choice(len(points), limit, replace=False)]

@@ -1,0 +1,1 @@
+"""Operations that torch lacks: ball query, batched singular values, kernels for GPUs."""

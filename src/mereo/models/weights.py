@@ -1,0 +1,138 @@
+"""Trained models on disk: one safetensors file whose header holds everything needed to run without the dataset."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int8
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from mereo.io.atomic_files import atomic_file
+from mereo.models.config import InferenceConfig
+from mereo.models.device import find_device
+from mereo.models.encoders.autodecoder import CODES
+from mereo.models.model import Model
+from mereo.models.network import Network, config_from_dict
+
+FORMAT_VERSION = 2
+"""Version 2 may hold the template in bytes; the rest is as in version 1, which is read too."""
+
+PACKED = "decoder.lookup.distance"
+"""The template's signed distances: with ten segments more than half of a float16 file."""
+
+FINE = 0.1
+"""Packed distances are finest within this of a surface: steps of 0.0008 at it, a fiftieth of the grid's, 0.1 at 1."""
+
+SHIPPED = Path(__file__).parents[1] / "weights"
+
+
+def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> None:
+    """Write weights and header atomically; ``float16`` halves the file and packs the template. All is read as float32.
+
+    An autodecoder's codes of training examples are left out: using a network needs their mean only.
+    """
+    header = {
+        "version": FORMAT_VERSION,
+        "network": asdict(model.network.config),
+        "names": model.names,
+        "colors": model.colors,
+        "loss": model.loss,
+        "normalizer": "center and half of the longest side of the observed cloud's box",
+        "domain": model.domain,
+        "nested": model.nested,
+        "provenance": model.provenance,
+    }
+    tensors = {
+        name: _stored(name, value, dtype).contiguous()
+        for name, value in model.network.state_dict().items()
+        if name != CODES
+    }
+    with atomic_file(path) as partial:
+        partial.write_bytes(save(tensors, metadata={"mereo": json.dumps(header)}))
+
+
+def _stored(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
+    """A tensor of the network as the file has it."""
+    if name == PACKED and dtype == torch.float16:
+        return _pack(value)
+    return value.to(dtype) if value.is_floating_point() else value
+
+
+def _restored(name: str, value: Tensor) -> Tensor:
+    """A tensor of the file as the network has it."""
+    if name == PACKED and value.dtype == torch.int8:
+        return _unpack(value)
+    return value.float() if value.is_floating_point() else value
+
+
+def _pack(distance: Float[Tensor, "*s"]) -> Int8[Tensor, "*s"]:
+    """One byte each: ``d / (|d| + FINE)`` in 254 steps, so that what is near is kept finely."""
+    return (127.0 * distance / (distance.abs() + FINE)).round().to(torch.int8)
+
+
+def _unpack(packed: Int8[Tensor, "*s"]) -> Float[Tensor, "*s"]:
+    """Inverse of ``_pack`` up to rounding; no distance of the template is so large that it would be infinite."""
+    share = packed.float() / 127.0
+    return FINE * share / (1.0 - share.abs())
+
+
+def shipped_names() -> tuple[str, ...]:
+    """Names that ``load_model`` knows without a path."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
+
+
+def find_weights(name: str | Path) -> Path:
+    """A shipped name or a path to an existing file."""
+    path = Path(name)
+    shipped = SHIPPED / f"{name}.safetensors"
+    if path.suffix == "" and not path.exists() and shipped.is_file():
+        return shipped
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"there are no weights {str(name)!r}; give a .safetensors file from mereo train or one of the shipped "
+            f"names: {', '.join(shipped_names()) or 'none'}"
+        )
+    return path
+
+
+def load_for(name: str | Path, inference: InferenceConfig) -> Model:
+    """``load_model``, on the device and in the precision that are asked for."""
+    return replace(load_model(name, find_device(inference.device)), precision=inference.precision)
+
+
+def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
+    """A shipped model by name, or a file. Raises ``ValueError`` when it is not weights of this version."""
+    path = find_weights(name)
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(
+            f"{path} is not a safetensors file ({error}); give the weights written by mereo train"
+        ) from None
+    if "mereo" not in metadata:
+        raise ValueError(f"{path} holds tensors but no mereo header; give the weights.safetensors of a mereo run")
+    header = json.loads(metadata["mereo"])
+    if header.get("version") not in (1, FORMAT_VERSION):
+        raise ValueError(
+            f"{path} has weights format {header.get('version')}; this mereo reads formats up to {FORMAT_VERSION}: "
+            "train again, or install the matching version"
+        )
+    network = Network(config_from_dict(header["network"]), len(header["names"]))
+    try:
+        network.load_state_dict({name: _restored(name, value) for name, value in tensors.items()})
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not fit its own header ({str(error).splitlines()[0]}); train again") from None
+    return Model(
+        network=network.eval().requires_grad_(False).to(device),
+        names=tuple(header["names"]),
+        colors=tuple(tuple(color) for color in header["colors"]),
+        loss=header["loss"],
+        provenance=header["provenance"],
+        domain=None if header["domain"] is None else (tuple(header["domain"][0]), tuple(header["domain"][1])),
+        nested=tuple((inner, outer) for inner, outer in header.get("nested", ())),  # older weights have none
+    )

@@ -1,0 +1,1 @@
+"""From a sensor's frame to closed surfaces of every segment."""

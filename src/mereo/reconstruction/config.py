@@ -1,0 +1,56 @@
+"""Settings of getting the object out of a frame; light, so that the command line may import them."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class IsolationConfig:
+    """What to leave out of a frame, so that only the object is left. Everything is off by default.
+
+    Attributes:
+        depth_range: nearest and farthest depth (z) in metres that is kept.
+        box: lower and upper corner of what is kept, x0 y0 z0 x1 y1 z1 in metres, in the input's frame.
+        remove_plane: leave out the largest plane: the table, the wall.
+        remove_outliers: leave out points whose neighbours are unusually far.
+        largest_cluster: keep only the largest group of points that hang together. A part that something else in front
+            cuts off is lost, unless `cluster_gap` reaches it.
+        cluster_gap: with `largest_cluster`, also keep groups (of 32 points or more) nearer than this to it, in metres.
+    """
+
+    depth_range: tuple[float, float] | None = None
+    box: tuple[float, float, float, float, float, float] | None = None
+    remove_plane: bool = False
+    remove_outliers: bool = False
+    largest_cluster: bool = False
+    cluster_gap: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.depth_range is not None and not 0 <= self.depth_range[0] < self.depth_range[1] < math.inf:
+            raise ValueError(
+                f"the depth range is {_numbers(self.depth_range)}; it must be the nearest and the farthest depth in "
+                "metres: give for example --depth-range 0.4 0.9"
+            )
+        if self.box is not None and not all(
+            math.isfinite(upper - lower) and lower < upper
+            for lower, upper in zip(self.box[:3], self.box[3:], strict=True)
+        ):
+            raise ValueError(
+                f"the box is {_numbers(self.box)}; each of x0 y0 z0 must be less than its x1 y1 z1: give the lower "
+                "corner, then the upper one, in metres"
+            )
+
+        if not 0 <= self.cluster_gap < math.inf or (self.cluster_gap > 0 and not self.largest_cluster):
+            raise ValueError(
+                f"the cluster gap is {self.cluster_gap:g} m; it must not be negative and belongs to the largest "
+                "cluster: give for example --largest-cluster --cluster-gap 0.01"
+            )
+
+    @property
+    def on(self) -> bool:
+        """Whether anything may be left out."""
+        return self != IsolationConfig()
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:g}" for value in values)

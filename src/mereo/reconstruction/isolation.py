@@ -1,0 +1,206 @@
+"""Getting the object out of what a camera saw: cropping, the largest plane, outliers, the largest cluster.
+
+    PointCloud -depth range-> -box-> -plane-> -thin-> -cluster-> -outliers-> PointCloud
+
+Every step is off by default, works on single points (no step moves one), and reports how many points it took away. The
+steps that compare neighbours measure lengths in the cloud's own spacing, so they need no unit and no setting.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mereo.geometry.camera import DepthImage, PointCloud
+from mereo.geometry.conventions import MIN_POINTS, CloudAxes
+from mereo.geometry.downsampling import MAX_POINTS, spacing, thin_to_grid
+from mereo.geometry.plane_fitting import largest_plane
+from mereo.reconstruction.config import IsolationConfig
+
+PLANE_SPACINGS = 3.0
+"""Half the thickness of a plane in the middle of the cloud; the noise of depth cameras is a few pixels wide."""
+
+PLANE_SHARE = 0.1
+"""The largest plane must hold this share of the points, or there is none."""
+
+OUTLIER_NEIGHBORS, OUTLIER_STD = 16, 6.0
+"""A point is an outlier where the mean distance to this many neighbours is beyond the mean over the cloud plus this
+many standard deviations (Rusu et al., RAS 2008; PCL's StatisticalOutlierRemoval). The 1 or 2 that are common elsewhere
+take surfaces that are seen edge-on, and with them the outline that the network's frame is made from."""
+
+CLUSTER_NEIGHBORS, CLUSTER_GAP = 12, 10.0
+"""A point belongs together with this many nearest neighbours, as far as they are less than this many spacings away.
+Nearest neighbours adapt to density: a surface seen edge-on, whose points are far apart, hangs together, while two dense
+sheets at the same distance do not. With a gap of 6, clean views lost up to 2 % of their points."""
+
+STRAY_SHARE = 0.005
+"""Less than this beside the largest cluster is not worth a word."""
+
+
+@dataclass(frozen=True)
+class IsolationStep:
+    """What one step did.
+
+    Attributes:
+        name: the step, as its option is called.
+        before, kept: points before and after it.
+        detail: what it found, in words; may be empty.
+    """
+
+    name: str
+    before: int
+    kept: int
+    detail: str = ""
+
+    def __str__(self) -> str:
+        note = f" ({self.detail})" if self.detail else ""
+        return f"{self.name}: {self.kept} of {self.before} points kept{note}"
+
+
+Keep = tuple[Bool[np.ndarray, " n"], str]
+"""Which points a step keeps, and what it found in words."""
+
+Step = Callable[[Float[np.ndarray, "_ 3"]], Keep]
+
+
+def isolate(
+    seen: PointCloud | DepthImage,
+    config: IsolationConfig,
+    unit_m: float = 1.0,
+    frame: CloudAxes = "camera",
+    rng: np.random.Generator | None = None,
+) -> tuple[PointCloud, tuple[IsolationStep, ...]]:
+    """The points of the object, and what each step left out.
+
+    Args:
+        seen: everything that was seen, any unit.
+        config: the steps. Before one that compares neighbours, a cloud of more than ``MAX_POINTS`` is thinned evenly
+            in space.
+        unit_m: metres per unit of ``seen``.
+        frame: its axes. In a camera's the noise is taken to grow with distance squared, as that of depth cameras does.
+        rng: draws the planes that are tried; by default always the same ones.
+
+    Raises ``ValueError`` where fewer than ``MIN_POINTS`` points are left, naming the step and its cure.
+    """
+    cloud = seen.to_points() if isinstance(seen, DepthImage) else seen
+    points, done = cloud.points, list[IsolationStep]()
+    for name, step in _steps(config, unit_m, frame, np.random.default_rng(0) if rng is None else rng):
+        keep, detail = step(points)
+        left = int(keep.sum())
+        if left < MIN_POINTS:
+            corners = " to ".join(_numbers(corner * unit_m) for corner in (points.min(axis=0), points.max(axis=0)))
+            raise ValueError(
+                f"the step {name!r} leaves {left} of {len(points)} points, which reach from {corners} m; the object "
+                f"needs at least {MIN_POINTS}: {CURES[name]}"
+            )
+        if left < len(points) or name != "thinning":
+            done.append(IsolationStep(name, len(points), left, detail))
+        points = points[keep]
+    return PointCloud(points), tuple(done)
+
+
+CURES = {
+    "depth range": "widen --depth-range",
+    "box": "widen --box",
+    "plane": "leave out --remove-plane, or crop with --box first",
+    "outliers": "leave out --remove-outliers, or crop with --box first",
+    "largest cluster": "leave out --largest-cluster, or crop with --box first",
+}
+
+
+def _numbers(position: Float[np.ndarray, "3"]) -> str:
+    return f"({', '.join(f'{value:.3g}' for value in position)})"
+
+
+def _steps(
+    config: IsolationConfig, unit_m: float, frame: CloudAxes, rng: np.random.Generator
+) -> Iterator[tuple[str, Step]]:
+    """The steps that are on, in their order: what is cheap and sure comes first."""
+    if config.depth_range is not None:
+        near, far = (limit / unit_m for limit in config.depth_range)
+        yield "depth range", lambda points: ((points[:, 2] >= near) & (points[:, 2] <= far), "")
+    if config.box is not None:
+        low, high = np.array(config.box).reshape(2, 3) / unit_m
+        yield "box", lambda points: (((points >= low) & (points <= high)).all(axis=1), "")
+    if config.remove_plane:
+        yield "plane", lambda points: _off_plane(points, unit_m, frame, rng)
+    if config.remove_outliers or config.largest_cluster:
+        yield "thinning", _thinned
+    if config.largest_cluster:
+        yield "largest cluster", lambda points: _largest_cluster(points, config.cluster_gap / unit_m)
+    if config.remove_outliers:
+        yield "outliers", _inliers
+
+
+# --- steps -----------------------------------------------------------------------------------------------------------
+
+
+def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, frame: CloudAxes, rng: np.random.Generator) -> Keep:
+    tolerance = np.full(len(points), PLANE_SPACINGS * spacing(points))
+    middle = np.median(points[:, 2])
+    if frame == "camera" and middle > 0:  # what lies behind the camera is refused later
+        tolerance *= np.maximum(points[:, 2] / middle, 1.0) ** 2
+    plane = largest_plane(points, tolerance, rng)
+    off = np.ones(len(points), dtype=bool) if plane is None else plane.distance(points) > tolerance
+    share = 1.0 - off.mean()
+    if plane is None or share < PLANE_SHARE:
+        raise ValueError(
+            f"the largest plane holds {share:.0%} of the {len(points)} points; a table or wall holds {PLANE_SHARE:.0%} "
+            "or more: leave out --remove-plane, or crop less before it"
+        )
+    normal = " ".join(f"{value:.2f}" for value in plane.normal)
+    return off, f"the plane with normal {normal}, {2e3 * tolerance.min() * unit_m:.2g} mm thick"
+
+
+def _thinned(points: Float[np.ndarray, "n 3"]) -> Keep:
+    keep = np.zeros(len(points), dtype=bool)
+    keep[thin_to_grid(points, MAX_POINTS)] = True
+    return keep, "one in each cell of a grid"
+
+
+def _inliers(points: Float[np.ndarray, "n 3"]) -> Keep:
+    """See ``OUTLIER_STD``."""
+    distance = cKDTree(points).query(points, k=min(OUTLIER_NEIGHBORS, len(points) - 1) + 1)[0][:, 1:].mean(axis=1)
+    return distance <= distance.mean() + OUTLIER_STD * distance.std(), ""
+
+
+def clusters(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """The number of each point's cluster, the largest being 0; see ``CLUSTER_NEIGHBORS``."""
+    count = min(CLUSTER_NEIGHBORS, len(points) - 1) + 1
+    gap = CLUSTER_GAP * spacing(points)
+    if gap == 0:  # all at one place
+        return np.zeros(len(points), dtype=np.int64)
+    distance, neighbor = cKDTree(points).query(points, k=range(1, count + 1), distance_upper_bound=gap)
+    row, column = np.nonzero(np.isfinite(distance))
+    edges = (np.ones(len(row), dtype=np.int8), (row, neighbor[row, column]))
+    label = connected_components(coo_matrix(edges, shape=(len(points),) * 2), directed=False)[1]
+    rank = np.argsort(np.argsort(-np.bincount(label), kind="stable"))
+    return np.asarray(rank[label], dtype=np.int64)
+
+
+def _largest_cluster(points: Float[np.ndarray, "n 3"], gap: float) -> Keep:
+    """With the clusters nearer than ``gap`` to it, those nearer than ``gap`` to them, and so on.
+
+    Clusters of fewer than ``MIN_POINTS`` are floating points and do not count.
+    """
+    label = clusters(points)
+    keep, sizes = label == 0, np.bincount(label)
+    parts = sizes[label] >= MIN_POINTS
+    while gap > 0 and (rest := parts & ~keep).any():
+        distance = cKDTree(points[keep]).query(points[rest], distance_upper_bound=gap)[0]
+        near = np.unique(label[rest][np.isfinite(distance)])
+        if len(near) == 0:
+            break
+        keep |= np.isin(label, near)
+    others = np.unique(label[~keep])
+    left_out = f", the largest left out has {sizes[others].max()}" if len(others) else ""
+    return keep, f"{len(sizes) - len(others)} of {len(sizes)} clusters{left_out}"
+
+
+def stray_share(cloud: PointCloud) -> float:
+    """The share of the points, thinned evenly in space, that lies apart from the largest cluster."""
+    return float((clusters(cloud.points[thin_to_grid(cloud.points, MAX_POINTS)]) > 0).mean())

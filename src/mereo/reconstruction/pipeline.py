@@ -1,0 +1,132 @@
+"""The inverse path: from what a camera saw of an object to all its segments, hidden side included.
+
+    PointCloud -normalize-> -encode-> code -query-> field -extract-> SegmentedMesh
+
+Everything that comes out is in the input's frame and units.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
+from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
+from mereo.geometry.scanner_axes import into_camera
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.models.model import Model
+from mereo.reconstruction.coarse_to_fine import Field
+from mereo.reconstruction.isosurfaces import extract_whole, locate
+from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
+
+SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
+"""Where segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one lies behind it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """An object with all its segments, in the input's frame and units.
+
+    Attributes:
+        surfaces: every segment of the model as a closed mesh; without faces where it was not found. Which lie inside
+            another is declared as in the model's scene.
+        labels: the label grid.
+        segments: each segment in numbers, in the same order.
+        timings_s: seconds of each stage.
+        evaluated: points at which the network was asked for surfaces.
+        clipped: whether a segment still reached the largest box and was closed there.
+        observed: the segment of each input point, where it was asked for.
+    """
+
+    surfaces: SegmentedMesh
+    labels: LabelGrid
+    segments: tuple[FoundSegment, ...]
+    timings_s: dict[str, float]
+    evaluated: int
+    clipped: bool
+    observed: SegmentedCloud | None = None
+
+
+def reconstruct(
+    cloud: PointCloud | Float[np.ndarray, "n 3"],
+    model: Model,
+    resolution: int = 128,
+    frame: CloudAxes = "camera",
+    label_points: bool = False,
+) -> Reconstruction:
+    """All segments of the object that ``cloud`` shows.
+
+    Args:
+        cloud: points on the object, any unit and density.
+        model: trained on this object, see ``mereo.load_model``.
+        resolution: cells along the longest side of the object's box.
+        frame: the cloud's axes: "camera" is x right, y down, z forward from the camera at the origin; "scanner" is y
+            up, z toward the scanner.
+        label_points: also say on which segment each point of the cloud lies (``Reconstruction.observed``).
+
+    Raises ``ValueError`` for unusable clouds, and where the model finds no segment at all.
+    """
+    points = np.asarray(cloud.points if isinstance(cloud, PointCloud) else cloud, dtype=np.float64)
+    timings: dict[str, float] = {}
+    T_camera_input = into_camera(points, frame)
+    with _timed(timings, "encode"):
+        seen = transform_points(T_camera_input, points)
+        code = model.encode(PointCloud(seen))
+    field: Field = partial(model.logits, code)
+    names, colors = segment_names(model)
+    with _timed(timings, "locate"):
+        box = locate(field, code.normalizer.invert(SEARCH_BOX))
+    with _timed(timings, "extract"):
+        found = extract_whole(field, box, resolution, names, colors, model.nested if "ce" in model.loss else ())
+    with _timed(timings, "measure"):
+        segments = measure(found, model, code)
+    observed = None
+    if label_points:
+        with _timed(timings, "points"):
+            observed = segment_points(field(seen), points, names, colors)
+    clipped = bool(found.grid.touched_sides().any())
+    result = Reconstruction(found.surfaces, found.grid, segments, timings, found.evaluated, clipped, observed)
+    return result if frame == "camera" else _turned_back(result, inverse_rigid(T_camera_input))
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    timings[stage] = time.perf_counter() - start
+
+
+def segment_names(model: Model) -> tuple[tuple[str, ...], tuple[Color, ...]]:
+    """Names and colours of the classes that the model tells apart; one trained on distances knows only the whole."""
+    return (model.names, model.colors) if model.segmented else (("object",), PALETTE[:1])
+
+
+def _turned_back(result: Reconstruction, T_scanner_camera: Float[np.ndarray, "4 4"]) -> Reconstruction:
+    """From the camera frame to the scanner's: half a turn about x reverses the grid along y and z."""
+    grid = result.labels
+    last = np.asarray(grid.labels.shape) - 1
+    corner = grid.origin + grid.spacing * last * np.array([0, 1, 1])
+    labels = LabelGrid(
+        np.ascontiguousarray(grid.labels[:, ::-1, ::-1]),
+        transform_points(T_scanner_camera, corner),
+        grid.spacing,
+        grid.names,
+    )
+    segments = tuple(
+        replace(
+            segment,
+            centroid=transform_points(T_scanner_camera, segment.centroid),
+            box=np.sort(transform_points(T_scanner_camera, segment.box), axis=0),
+        )
+        for segment in result.segments
+    )
+    return replace(result, surfaces=result.surfaces.transformed(T_scanner_camera), labels=labels, segments=segments)
+
+
+# --- files -----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,92 @@
+"""Segments in numbers: volume, place, and how sure the model is; and the segment of each observed point."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+from scipy.special import expit, logsumexp, softmax
+
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
+from mereo.geometry.mesh import Color, Segment
+from mereo.models.model import EncodedCloud, Model
+from mereo.reconstruction.isosurfaces import Extraction
+
+CONFIDENCE_VOXELS = 2000
+"""The confidence of a segment is a mean over at most this many of its voxels."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSegment:
+    """One segment in numbers, in the input's frame and units.
+
+    Attributes:
+        name, label: of the segment.
+        volume: inside its surface, less what is nested in it; 0 where it was not found.
+        centroid: mean of its voxels, NaN where it was not found.
+        box: lower and upper corner of its surface, NaN where it was not found.
+        confidence: mean probability that the model gives it over its voxels, NaN where it was not found.
+        voxels: how many of the label grid it has.
+        components: connected groups of voxels (over faces); more than one may be a fleck, and nothing is removed.
+    """
+
+    name: str
+    label: int
+    volume: float
+    centroid: Float[np.ndarray, "3"]
+    box: Float[np.ndarray, "2 3"]
+    confidence: float
+    voxels: int
+    components: int
+
+
+def segment_points(
+    logits: Float[np.ndarray, "n c"],
+    points: Float[np.ndarray, "n 3"],
+    names: tuple[str, ...],
+    colors: tuple[Color, ...],
+) -> SegmentedCloud:
+    """The segments of points from the model's logits there, of empty space first."""
+    parts = logits[:, 1:].astype(np.float64)
+    return SegmentedCloud(
+        points=points,
+        labels=(parts.argmax(axis=1) + 1).astype(np.uint8),
+        confidence=softmax(parts, axis=1).max(axis=1),
+        occupancy=expit(logsumexp(parts, axis=1) - logits[:, 0]),
+        names=names,
+        colors=colors,
+    )
+
+
+def measure(found: Extraction, model: Model, code: EncodedCloud) -> tuple[FoundSegment, ...]:
+    """Every segment in numbers."""
+    owned = zip(found.surfaces.segments, found.surfaces.owned_volumes, strict=True)
+    return tuple(
+        _measure(found.grid, label, segment, float(volume), model, code)
+        for label, (segment, volume) in enumerate(owned, start=1)
+    )
+
+
+def _measure(
+    grid: LabelGrid, label: int, segment: Segment, volume: float, model: Model, code: EncodedCloud
+) -> FoundSegment:
+    voxels = np.argwhere(grid.labels == label)
+    if len(voxels) == 0:
+        nothing = np.full((2, 3), np.nan)
+        return FoundSegment(segment.name, label, 0.0, nothing[0], nothing, float("nan"), 0, 0)
+    chosen = voxels
+    if len(voxels) > CONFIDENCE_VOXELS:
+        chosen = voxels[np.random.default_rng(0).choice(len(voxels), CONFIDENCE_VOXELS, replace=False)]
+    probability = model.query(code, grid.positions(chosen)).probability[:, label]
+    low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
+    part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    return FoundSegment(
+        name=segment.name,
+        label=label,
+        volume=volume,
+        centroid=grid.positions(voxels).mean(axis=0),
+        box=segment.bounds,
+        confidence=float(probability.mean()),
+        voxels=len(voxels),
+        components=int(ndimage.label(part == label)[1]),
+    )

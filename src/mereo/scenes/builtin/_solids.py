@@ -1,0 +1,53 @@
+"""What all scenes need of manifold3d: solids joined, and made into segments. Lengths are in scene units."""
+
+import numpy as np
+from jaxtyping import Float
+from manifold3d import CrossSection, Manifold, OpType
+
+from mereo.geometry.manifold import mesh_of
+from mereo.geometry.mesh import Color, Segment
+
+Vector = tuple[float, float, float]
+
+SIMPLIFY = 1e-3
+"""Detail below this is dropped from finished parts; it is far below the camera's noise and spares slivers."""
+
+
+def segment_of(name: str, color: Color, solid: Manifold) -> Segment:
+    """A solid as it is."""
+    return Segment(name, color, *mesh_of(solid))
+
+
+def segment(name: str, color: Color, part: Manifold, longest_edge: float = np.inf) -> Segment:
+    """The finished part as a segment, with no more triangles than its shape needs.
+
+    Edges longer than ``longest_edge`` are split, so that flat faces can bend. It also helps large parts: long slivers
+    have large boxes, which slow down searches among them.
+    """
+    part = part.as_original().simplify(SIMPLIFY)
+    return segment_of(name, color, part if longest_edge == np.inf else part.refine_to_length(longest_edge))
+
+
+def union(*parts: Manifold) -> Manifold:
+    """All parts as one solid."""
+    return Manifold.batch_boolean(list(parts), OpType.Add)
+
+
+def hull(*parts: Manifold) -> Manifold:
+    """The convex hull around all parts."""
+    return Manifold.batch_hull(list(parts))
+
+
+def ball(center: Vector, radius: float, sides: int = 12) -> Manifold:
+    """A sphere; ``sides`` around its equator."""
+    return Manifold.sphere(radius, sides).translate(center)
+
+
+def rod(start: Vector, end: Vector, start_radius: float, end_radius: float, sides: int = 12) -> Manifold:
+    """A tapering limb with round ends."""
+    return hull(ball(start, start_radius, sides), ball(end, end_radius, sides))
+
+
+def revolved(profile: Float[np.ndarray, "n 2"], sides: int) -> Manifold:
+    """A lathe part about the z axis from rows (radius, height), counter-clockwise."""
+    return Manifold.revolve(CrossSection([profile]), sides)

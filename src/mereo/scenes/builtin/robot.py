@@ -1,0 +1,168 @@
+"""Robot: an industrial arm with six revolute joints and a two-finger gripper; modelled here, needs no download.
+
+Source: modelled in mereo's own code (`_robot_parts`), MIT licence; no particular product. Proportions are those of an
+arm of 0.7 m reach, with a large gripper: one unit is about 16 mm. At rest, with the upper arm upright and the forearm
+level, it is 48 x 20 x 44 units.
+
+Segments: one for each link, `base`, `column`, `upper_arm`, `elbow`, `forearm`, `wrist`, `hand`, and the jaws
+`finger_left` and `finger_right`. Motors, covers, ribs and bolts belong to the link that carries them.
+
+Degrees of freedom, each uniform within its limits, rigid motions composed down the chain:
+
+    turn      column about z              -170 to 170 degrees
+    lean      upper arm about y            -50 to 75 (forward)
+    fold      elbow about y                -45 to 75 (down)
+    roll      forearm about its length    -180 to 180
+    pitch     wrist about the fork's pin  -100 to 100
+    spin      hand about its length       -180 to 180
+    opening   of each finger from the middle, 0.15 to 2.0 units
+
+Neighbours cannot meet within these limits, by construction; poses in which other parts would (the hand and the base,
+the column, the upper arm or the floor) are drawn again, about one in four. The base stays.
+
+What makes it hard: the chain reaches 58 units from a fixed base, so a small error in one angle moves everything after
+it; the forearm and the hand look almost the same after half a turn; the fingers differ by their place alone, are two
+pixels thick and often hidden; the camera may stand behind the arm, where the column hides the hand.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
+from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.scenes.builtin import _robot_parts as parts
+from mereo.scenes.builtin._solids import Vector, segment
+from mereo.scenes.scene import Scene, Workspace
+
+
+class Joint(NamedTuple):
+    """A revolute joint of the rest pose: a point of its axis, the axis, and limits in degrees."""
+
+    name: str
+    center: Vector
+    axis: Vector
+    lower_deg: float
+    upper_deg: float
+
+
+JOINTS = (
+    Joint("turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
+    Joint("lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
+    Joint("fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
+    Joint("roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+    Joint("pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
+    Joint("spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+)
+OPENING = (0.15, 2.0)
+"""Least and largest distance of a finger from the middle."""
+
+
+class Bulk(NamedTuple):
+    """``spheres`` of one radius with centres from ``start`` to ``end``, which enclose a part at rest."""
+
+    link: int
+    start: Vector
+    end: Vector
+    radius: float
+    spheres: int
+
+    def centers(self) -> Float[np.ndarray, "n 3"]:
+        return np.linspace(self.start, self.end, self.spheres)
+
+
+_Z = parts.FOREARM_HEIGHT
+REACHING = (
+    Bulk(3, (-5.0, 0.0, _Z), (6.5, 0.0, _Z), 4.4, 5),
+    Bulk(4, (11.0, 0.0, _Z), (19.5, 0.0, _Z), 3.9, 4),
+    Bulk(5, (21.5, 0.0, _Z), (24.0, 0.0, _Z), 3.9, 2),
+    Bulk(6, (27.5, 0.0, _Z), (35.8, 0.0, _Z), 4.9, 5),
+)
+"""What may come near the parts it does not hang from; the fingers are in the hand's spheres."""
+
+COLUMN = (
+    Bulk(1, (0.5, -0.8, 11.0), (3.5, -0.8, 19.0), 5.8, 4),
+    Bulk(1, (3.5, -7.0, 19.0), (3.5, -2.0, 19.0), 4.2, 3),
+    Bulk(1, (-4.3, -2.6, 11.0), (-4.3, -2.6, 14.5), 3.4, 3),
+)
+UPPER_ARM = (Bulk(2, (3.5, 5.4, 19.0), (3.5, 5.4, 37.0), 4.4, 9),)
+
+FOOT = np.array([[-10.6, -10.0, -50.0], [10.0, 10.0, 10.4]])
+"""A box around the base and the turntable."""
+
+
+@cache
+def rest_mesh() -> SegmentedMesh:
+    """The arm at rest: nine closed segments, 0.15 to 0.2 apart where they move upon each other."""
+    solids = {
+        "base": parts.base(),
+        "column": parts.column(),
+        "upper_arm": parts.upper_arm(),
+        "elbow": parts.elbow(),
+        "forearm": parts.forearm(),
+        "wrist": parts.wrist(),
+        "hand": parts.hand(),
+        "finger_left": parts.finger(1),
+        "finger_right": parts.finger(-1),
+    }
+    return SegmentedMesh(tuple(segment(name, PALETTE[i], part) for i, (name, part) in enumerate(solids.items())))
+
+
+def sample_angles(rng: np.random.Generator) -> Float[np.ndarray, "6"]:
+    """Joint angles in radians, uniform within the limits."""
+    limits = np.array([(joint.lower_deg, joint.upper_deg) for joint in JOINTS])
+    return np.deg2rad(rng.uniform(limits[:, 0], limits[:, 1]))
+
+
+def chain(angles_rad: Float[np.ndarray, "6"]) -> tuple[Rigid, ...]:
+    """Each joint's turn, in the rest frame; link k moves by the first k of them, the last one first."""
+    return tuple(
+        Rigid(angle * np.array(joint.axis), np.zeros(3), np.array(joint.center))
+        for joint, angle in zip(JOINTS, angles_rad, strict=True)
+    )
+
+
+def is_clear(turns: tuple[Rigid, ...]) -> bool:
+    """Whether the moving parts keep off the floor, the base, the column and the upper arm.
+
+    Neighbours are left out, as their layers keep them apart. The spheres enclose the parts with a little to spare, so
+    that some clear poses are refused, but none that collides is let through.
+    """
+    reaching = [(bulk.link, _moved(bulk, turns), bulk.radius) for bulk in REACHING]
+    for link, centers, radius in reaching:
+        outside = np.maximum(np.maximum(FOOT[0] - centers, centers - FOOT[1]), 0.0)
+        if centers[:, 2].min() < radius or np.linalg.norm(outside, axis=1).min() < radius:
+            return False
+        others = COLUMN if link < 5 else COLUMN + UPPER_ARM
+        for other in others:
+            gaps = np.linalg.norm(centers[:, None] - _moved(other, turns), axis=-1)
+            if gaps.min() < radius + other.radius:
+                return False
+    return True
+
+
+def _moved(bulk: Bulk, turns: tuple[Rigid, ...]) -> Float[np.ndarray, "n 3"]:
+    return Compose(turns[: bulk.link][::-1])(bulk.centers())
+
+
+def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    """Random angles of all joints and a random opening; the base stays."""
+    turns = chain(sample_angles(rng))
+    while not is_clear(turns):
+        turns = chain(sample_angles(rng))
+    links = [Compose(turns[:count][::-1]) for count in range(1, len(turns) + 1)]
+    slide = np.array([0.0, rng.uniform(*OPENING) - parts.JAW_OPENING, 0.0])
+    fingers = [Compose((Rigid(np.zeros(3), side * slide, np.zeros(3)), *turns[::-1])) for side in (1, -1)]
+    return (Identity(), *links, *fingers)
+
+
+def scene() -> Scene:
+    """The arm; the paper's camera workspace above it."""
+    return Scene(
+        name="robot",
+        rest=rest_mesh(),
+        sample_deformations=sample_deformations,
+        workspace=Workspace(fov_rad=float(np.deg2rad(44.0))),
+    )

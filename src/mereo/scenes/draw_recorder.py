@@ -1,0 +1,174 @@
+"""The degrees of freedom of a scene, found by recording what it draws.
+
+A scene says how it deforms by drawing from a generator. ``Recorder`` is a generator that writes down every draw as
+*shares*: where each number lies in its distribution, uniform in 0..1. Played back with other shares, the same scene
+gives the state that lies there. So every scene has sliders, a user's own YAML or Python file as well, and each stays
+within the scene's own bounds. docs/design/0013-viewer.md tells how draws are told apart and what happens in loops that
+draw again.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import CodeType, FrameType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtri
+
+Trail = tuple[tuple[CodeType, int], ...]
+"""The calls that led to a draw, outermost first: code, and the instruction within it."""
+
+Key = tuple[tuple[tuple[str, int, int], ...], int]
+"""Which draw it is: the trail, and how many draws there were with the same trail before it."""
+
+Shares = Float[np.ndarray, " n"]
+
+SMALLEST_SHARE = 1e-9
+"""Keeps normal draws finite."""
+
+
+class OutOfDraws(Exception):
+    """More was drawn than allowed: the scene refuses what it is given and draws again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """One call of the generator.
+
+    Attributes:
+        key, trail: where it came from.
+        kind: the method's name.
+        shares: of each number, in C order.
+        low, high: bounds of each number: of "uniform" and "integers" (high excluded) as drawn, of "normal" in standard
+            deviations (infinite), of "choice" the positions in what is chosen from.
+        shape: of the result; () for a single number.
+    """
+
+    key: Key
+    trail: Trail
+    kind: str
+    shares: Shares
+    low: Shares
+    high: Shares
+    shape: tuple[int, ...]
+
+
+class Recorder(np.random.Generator):
+    """A generator that records its draws, and takes those that it is given.
+
+    Methods that are not here (``gamma``, ``spawn``, ...), choices without replacement and draws into an array that is
+    given work, and depend on the seed alone; they get no slider.
+    """
+
+    def __init__(self, seed: int, given: Mapping[Key, Shares], most: int | None = None) -> None:
+        """``most`` is the largest number of calls before ``OutOfDraws``."""
+        super().__init__(np.random.PCG64([seed, 1]))
+        self.calls: list[Call] = []
+        self._given, self._most = given, most
+        self._fresh = np.random.default_rng([seed, 0])
+        self._seen: Counter[Any] = Counter()
+
+    def __reduce__(self) -> Any:
+        raise TypeError("a Recorder belongs to one run of a scene and cannot be copied")
+
+    def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any) -> Shares:
+        if self._most is not None and len(self.calls) >= self._most:
+            raise OutOfDraws
+        trail = _trail()
+        place = tuple((code.co_filename, code.co_firstlineno, instruction) for code, instruction in trail)
+        key = (place, self._seen[place])
+        self._seen[place] += 1
+        size = int(np.prod(shape))
+        shares = self._given.get(key)
+        if shares is None or len(shares) != size:
+            shares = self._fresh.random(size)
+        shares = np.clip(shares, SMALLEST_SHARE, 1 - SMALLEST_SHARE)
+        bounds = [np.broadcast_to(np.asarray(bound, dtype=float), shape).ravel() for bound in (low, high)]
+        self.calls.append(Call(key, trail, kind, shares, bounds[0], bounds[1], shape))
+        return shares
+
+    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
+        shape = _shape(size, low, high)
+        shares = self._take("uniform", shape, low, high).reshape(shape)
+        return _plain(np.asarray(low, dtype=float) + shares * (np.asarray(high, dtype=float) - low))
+
+    def random(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
+        if out is not None:
+            return super().random(size, dtype, out)
+        shape = _shape(size)
+        return _plain(self._take("uniform", shape, 0.0, 1.0).reshape(shape).astype(dtype))
+
+    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
+        shape = _shape(size, loc, scale)
+        return _plain(loc + scale * ndtri(self._take("normal", shape, -np.inf, np.inf)).reshape(shape))
+
+    def standard_normal(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
+        if out is not None:
+            return super().standard_normal(size, dtype, out)
+        shape = _shape(size)
+        return _plain(ndtri(self._take("normal", shape, -np.inf, np.inf)).reshape(shape).astype(dtype))
+
+    def triangular(self, left: Any, mode: Any, right: Any, size: Any = None) -> Any:
+        shape = _shape(size, left, mode, right)
+        shares = self._take("triangular", shape, left, right).reshape(shape)
+        left, mode, right = (np.asarray(value, dtype=float) for value in (left, mode, right))
+        rising = left + np.sqrt(shares * (right - left) * (mode - left))
+        falling = right - np.sqrt((1 - shares) * (right - left) * (right - mode))
+        return _plain(np.where(shares * (right - left) < mode - left, rising, falling))
+
+    def integers(
+        self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False
+    ) -> Any:
+        low, high = (0, low) if high is None else (low, high)
+        high = np.asarray(high) + endpoint
+        shape = _shape(size, low, high)
+        shares = self._take("integers", shape, low, high).reshape(shape)
+        return _plain((low + np.floor(shares * (high - low))).astype(dtype))
+
+    def choice(
+        self, a: Any, size: Any = None, replace: bool = True, p: Any = None, axis: int = 0, shuffle: bool = True
+    ) -> Any:
+        if not replace and size is not None:
+            return super().choice(a, size, replace, p, axis, shuffle)
+        options = np.arange(a) if np.ndim(a) == 0 else np.asarray(a)
+        count, shape = options.shape[axis], _shape(size)
+        edges = np.cumsum(np.full(count, 1 / count) if p is None else p)
+        shares = self._take("choice", shape, 0, count).reshape(shape)
+        index = np.minimum(np.searchsorted(edges, shares, side="right"), count - 1)
+        chosen = np.take(options, index, axis=axis)
+        return _plain(chosen)
+
+    def permutation(self, x: Any, axis: int = 0) -> Any:
+        items = np.arange(x) if np.ndim(x) == 0 else np.asarray(x)
+        order = np.argsort(self._take("permutation", (items.shape[axis],), 0.0, 1.0), kind="stable")
+        return np.take(items, order, axis=axis)
+
+
+def _shape(size: Any, *parameters: Any) -> tuple[int, ...]:
+    if size is None:
+        return np.broadcast_shapes(*(np.shape(p) for p in parameters))
+    return (int(size),) if np.ndim(size) == 0 else tuple(int(n) for n in size)
+
+
+def _plain(values: Any) -> Any:
+    """A single number as numpy's generators return it."""
+    return values if np.ndim(values) else np.asarray(values)[()].item()
+
+
+def _trail() -> Trail:
+    """The calls from ``parameters.play`` down to the recorder, which are what a draw is known by."""
+    frame: FrameType | None = sys._getframe(1)
+    found: list[tuple[CodeType, int]] = []
+    while frame is not None and frame.f_code.co_name != "play":
+        if not _is_ours(frame.f_code):
+            found.append((frame.f_code, frame.f_lasti))
+        frame = frame.f_back
+    return tuple(found[::-1])
+
+
+def _is_ours(code: CodeType) -> bool:
+    """Whether these are the recorder's own steps, or those of the tests' shape checks around every function."""
+    return code.co_filename == __file__ or code.co_filename.startswith("<@") or "jaxtyping" in code.co_filename

@@ -1,0 +1,180 @@
+"""``mereo scene check``: what a user should know of a scene's meshes before spending hours of training, and repairs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from mereo.geometry.camera import Camera
+from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, examine, likely_unit
+from mereo.geometry.mesh_repair import repaired, without_overlaps
+from mereo.geometry.overlap import Overlap, grid_volume, overlaps
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.io.atomic_files import atomic_file
+from mereo.io.yaml_document import Document
+from mereo.scenes.files.build import build, read
+from mereo.scenes.files.rewrite import with_segment_files
+from mereo.scenes.files.segments import read_segments
+from mereo.scenes.registry import SCENES, is_yaml, load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+
+STATES = 6
+"""Random states in which segments of a user's scene are tested for overlap, and for being in view."""
+
+STATE_TOLERANCE = 0.02
+"""Share of a segment that another one may overlap in a random state."""
+
+
+def check_scene(name: str, repair: bool = False) -> None:
+    """Print what each segment, the overlaps, the unit and random states are like; repair meshes where asked to.
+
+    Args:
+        name: a built-in name or a scene file.
+        repair: write repaired copies of faulty meshes beside a YAML file, as ``SEGMENT-repaired.ply``, and a scene file
+            ``NAME-repaired.yaml`` that names them. No existing file is changed.
+
+    Raises ``ValueError`` that counts the faults left, ``FileExistsError`` where a repaired file is there already.
+    """
+    if not is_yaml(name):
+        if repair:
+            raise ValueError(f"--repair works on YAML scene files, and {name!r} is none: repair its meshes where it is")
+        scene = load_scene(name)
+        faults = _report(scene.rest, _examined(scene.rest), "cubic units")
+    else:
+        document = Document(Path(name))
+        file = read(document)
+        mesh = read_segments(document, file)
+        health = _examined(mesh)
+        unit = next((key for key, value in UNITS_M.items() if value == file.units), "unit")
+        faults = _report(mesh, health, f"{unit}³")
+        _report_size(mesh, file.units, unit)
+        if faults and repair:
+            _check_repaired(document, mesh, health)
+            return
+        if repair:
+            print("nothing to repair")
+        if any(found.hopeless for found in health):
+            raise _refusal(name, faults)
+        scene = build(document, file, _marked(mesh, health))
+    if name not in SCENES:
+        faults += _report_states(scene)
+    if faults:
+        raise _refusal(name, faults)
+    nested = "".join(f", {inner} nested in {outer}" for inner, outer in scene.rest.nested)
+    print(f"{scene.name}: {len(scene.rest.segments)} segments, closed, outward oriented, without overlap{nested}")
+    print(f"source: {scene.source}")
+
+
+def _refusal(name: str, faults: int) -> ValueError:
+    cure = "repair the meshes with --repair, or adapt the file" if is_yaml(name) else "correct its meshes"
+    return ValueError(f"{name} has {faults} {'fault' if faults == 1 else 'faults'}, listed above: {cure}")
+
+
+def _examined(mesh: SegmentedMesh) -> list[Health]:
+    return [examine(segment) for segment in mesh.segments]
+
+
+def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
+    """Print each segment and each overlap; returns the number of faults."""
+    faults = 0
+    usable = not any(found.hopeless for found in health)
+    volumes = mesh.owned_volumes if usable else [np.nan] * len(health)
+    for segment, found, volume in zip(mesh.segments, health, volumes, strict=True):
+        inside = volume if found.sound or found.hopeless else grid_volume(replace(segment, solid=False))
+        amount = f"   volume {inside:.4g} {unit}" if np.isfinite(inside) else ""
+        print(f"{segment.name:<20} {len(segment.faces):>7} faces{amount}")
+        for fault in (*found.hopeless, *found.dirty):
+            faults += 1
+            print(f"  fault: it {fault}")
+    if usable:
+        for overlap in overlaps(_marked(mesh, health)):
+            faults += 1
+            print(f"  fault: {overlap}")
+    return faults
+
+
+def _marked(mesh: SegmentedMesh, health: list[Health]) -> SegmentedMesh:
+    """With segments that are no solids marked so."""
+    marked = (replace(s, solid=found.sound) for s, found in zip(mesh.segments, health, strict=True))
+    return replace(mesh, segments=tuple(marked))
+
+
+def _report_size(mesh: SegmentedMesh, unit_m: float, unit: str) -> None:
+    sides = mesh.bounds[1] - mesh.bounds[0]
+    longest_m = float(sides.max()) * unit_m
+    print(f"size: {' x '.join(f'{side:.4g}' for side in sides)} {unit}; the longest side is {longest_m:.3g} m")
+    if not PLAUSIBLE_M[0] <= longest_m <= PLAUSIBLE_M[1]:
+        print(f"  note: that is unlikely for a depth camera's object; the unit may be {likely_unit(mesh.bounds)}")
+
+
+# --- random states ----------------------------------------------------------------------------------------------------
+
+
+def _report_states(scene: Scene) -> int:
+    """Print what goes wrong in random states; returns the number of faults."""
+    camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
+    worst: dict[frozenset[str], Overlap] = {}
+    seen = 1.0
+    for index in range(STATES):
+        rng = example_rng(0, index)
+        mesh = scene.sample_state(rng).mesh
+        for found in overlaps(mesh, STATE_TOLERANCE):
+            pair = frozenset((found.small, found.large))
+            worst[pair] = max(worst.get(pair, found), found, key=lambda overlap: overlap.share)
+        pose = scene.workspace.sample(rng, mesh.bounds.mean(axis=0))
+        local = transform_points(inverse_rigid(pose), mesh.merged()[0])
+        pixels = camera.project(local)
+        seen = min(seen, float(((pixels > 0) & (pixels < 96)).all(axis=1).mean()))
+    for overlap in worst.values():
+        print(f"  fault: in random states {overlap}: narrow the deformations, or let both move by the same ones")
+    if seen < 0.98:
+        print(f"  note: in a random view only {seen:.0%} of the object is in the picture: widen `field_of_view`")
+    return len(worst)
+
+
+# --- repairs ----------------------------------------------------------------------------------------------------------
+
+
+def _check_repaired(document: Document, mesh: SegmentedMesh, health: list[Health]) -> None:
+    """Repair, say what was changed, write it, and check what was written."""
+    fixed = [repaired(segment) for segment in mesh.segments]
+    changes = {fix.segment.name: list(fix.changes) for fix in fixed}
+    whole, cuts = without_overlaps(replace(mesh, segments=tuple(fix.segment for fix in fixed)))
+    for name, cut in cuts.items():
+        changes[name] += cut
+    changed = [segment for segment in whole.segments if changes[segment.name]]
+    for segment in changed:
+        index = mesh.names.index(segment.name)
+        difference = _difference(mesh.segments[index], health[index], segment)
+        print(f"repaired {segment.name}: {'; '.join(changes[segment.name])} ({difference})")
+    path = _write(document, whole, {segment.name for segment in changed})
+    print(f"wrote {path} and the meshes that it names; checked again:")
+    check_scene(str(path))
+
+
+def _difference(before: Segment, health: Health, after: Segment) -> str:
+    faces = f"{len(before.faces)} faces before, {len(after.faces)} now"
+    if health.hopeless:
+        return faces
+    was = before.volume if health.sound else grid_volume(replace(before, solid=False))
+    return f"{faces}; volume {100 * (after.volume / was - 1) if was else np.inf:+.2g} %"
+
+
+def _write(document: Document, mesh: SegmentedMesh, changed: set[str]) -> Path:
+    """The repaired meshes and a scene file that names them, beside the original."""
+    path = document.path.with_name(f"{document.path.stem}-repaired{document.path.suffix}")
+    text, files = with_segment_files(document, mesh, changed)
+    for place in (path, *(document.path.parent / file for file in files.values())):
+        if place.exists():
+            raise FileExistsError(f"{place} exists; it is not overwritten: move or remove it")
+    for name, file in files.items():
+        segment = mesh.segments[mesh.names.index(name)]
+        with atomic_file(document.path.parent / file, force=False) as temporary:
+            trimesh.Trimesh(segment.vertices, segment.faces, process=False).export(temporary, file_type="ply")
+    with atomic_file(path, force=False) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path

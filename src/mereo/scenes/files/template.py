@@ -1,0 +1,243 @@
+"""``mereo scene new``: a scene file for given meshes, with defaults that fit their size and comments on each."""
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.deformation.samplers import default_cells
+from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.mesh_check import likely_unit
+from mereo.io.atomic_files import atomic_file
+from mereo.io.label_volumes import is_volume, read_label_volume, segment_surfaces
+from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.scenes.files.rewrite import quoted
+from mereo.scenes.registry import SCENES
+
+SIZE = 20.0
+"""Shortest side in scene units, as in the paper, unless the object is longer than ``LONGEST`` then."""
+
+LONGEST = 80.0
+
+ROOM = 1.15
+"""How much larger than at rest the object may become in the picture."""
+
+MOST_VIEW_RAD = float(np.deg2rad(60.0))
+
+LABEL_CELLS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """What the files hold.
+
+    Attributes:
+        block: the lines of the scene file that name them.
+        bounds: joint box of the segments, in the files' unit.
+        names: of the segments.
+        unit: the likely one.
+        reason: why.
+    """
+
+    block: str
+    bounds: Float[np.ndarray, "2 3"]
+    names: tuple[str, ...]
+    unit: str
+    reason: str
+
+
+def write_scene_file(files: Sequence[Path], output: Path | None = None, units: str | None = None) -> Path:
+    """Write a commented YAML file that names ``files`` relative to itself; returns its path.
+
+    Args:
+        files: one mesh for each segment, one file of named parts, or one label volume.
+        output: by default ``NAME.yaml`` in the working directory, after the first file.
+        units: a key of ``scene_schema.UNITS_M``; None guesses.
+
+    Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files.
+    """
+    if not files:
+        raise ValueError("no mesh is given; a scene needs at least one: name your files")
+    name = identifier((output or files[0]).name.split(".")[0])
+    path = output or Path(f"{name}.yaml")
+    if path.suffix not in (".yaml", ".yml"):
+        raise ValueError(f"{path} has the suffix {path.suffix!r}; a scene file is .yaml: rename it")
+    if path.exists():
+        raise FileExistsError(f"{path} exists; it is not overwritten: choose another --output")
+    source = _source(list(files), path.parent)
+    with atomic_file(path, force=False) as temporary:
+        temporary.write_text(_text(name, source, units), encoding="utf-8")
+    return path
+
+
+def identifier(text: str) -> str:
+    """A valid scene name that no built-in scene has."""
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-._") or "object"
+    return f"my-{name}" if name in SCENES else name
+
+
+def _source(files: list[Path], folder: Path) -> _Source:
+    relative = [Path(os.path.relpath(file, folder)).as_posix() for file in files]
+    if any(is_volume(file) for file in files):
+        if len(files) > 1:
+            raise ValueError(
+                f"{len(files)} files are given, with a label volume among them; it comes alone: name it only"
+            )
+        return _from_volume(files[0], relative[0])
+    if len(files) > 1:
+        return _from_meshes(files, relative)
+    mesh = read_segmented_mesh(files[0])
+    return _from_meshes(files, relative) if len(mesh.segments) == 1 else _from_model(files[0], relative[0], mesh)
+
+
+def _from_meshes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
+    """One segment for each file, called after it, with all of its parts."""
+    names = tuple(re.sub(r"[^\w. -]+", "_", file.stem) for file in files)
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"two files are called {repeated[0]!r}; segments are named after them: rename one of them")
+    boxes = np.stack([read_segmented_mesh(file).bounds for file in files])
+    bounds = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+    lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
+    for number, (name, file) in enumerate(zip(names, relative, strict=True)):
+        lines += [f"  - name: {quoted(name)}", f"    file: {quoted(file)}", f"    color: {_color(number)}"]
+    lines.append("    # nested_in: NAME  # for a segment that lies inside another one, which has to come after it")
+    return _Source("\n".join(lines), bounds, names, *_unit_of(files[0], bounds))
+
+
+def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
+    lines = [f"model: {quoted(relative)}", "parts:  # delete what is not wanted; their order is that of the labels"]
+    for number, name in enumerate(mesh.names):
+        lines += [f"  - name: {quoted(name)}", f"    color: {_color(number)}"]
+    lines.append("    # parts: [A, B]  # parts of the model to join into this segment, instead of the one of its name")
+    return _Source("\n".join(lines), mesh.bounds, mesh.names, *_unit_of(file, mesh.bounds))
+
+
+def _from_volume(file: Path, relative: str) -> _Source:
+    volume = read_label_volume(file)
+    values = [int(value) for value in np.unique(volume.labels) if value > 0]
+    if not values:
+        raise ValueError(f"{file} holds only empty space; a label volume has values above 0: export it again")
+    names = {value: volume.names.get(value, f"label_{value}") for value in values}
+    bounds = segment_surfaces(volume, names, LABEL_CELLS).bounds
+    lines = [f"labels: {quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
+    lines += [f"  {value}: {quoted(name)}" for value, name in names.items()]
+    lines.append(f"cells: {LABEL_CELLS}  # of the grid along the longest side on which surfaces are found")
+    return _Source("\n".join(lines), bounds, tuple(names.values()), "mm", "the convention of NIfTI and NRRD")
+
+
+def _unit_of(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str]:
+    if file.suffix.lower() in (".glb", ".gltf"):
+        return "m", "the rule of glTF"
+    if file.suffix.lower() == ".3mf":
+        return "mm", "the default of 3MF"
+    unit = likely_unit(bounds)
+    longest_m = float((bounds[1] - bounds[0]).max()) * UNITS_M[unit]
+    return unit, f"guessed: the object would be {longest_m:.3g} m long"
+
+
+# --- the text ---------------------------------------------------------------------------------------------------------
+
+
+def _text(name: str, source: _Source, units: str | None) -> str:
+    low, high = source.bounds
+    sides = high - low
+    size = min(SIZE, LONGEST * float(sides.min() / sides.max()))
+    radius = ROOM * size * float(np.linalg.norm(sides) / sides.min()) / 2
+    near = max(100.0, float(np.ceil(radius / np.sin(MOST_VIEW_RAD / 2))))
+    view = int(np.clip(np.ceil(np.rad2deg(2 * np.arcsin(radius / near))), 10, 90))
+    unit, reason = (units, "as you said") if units else (source.unit, source.reason)
+    x, y, z = default_cells(source.bounds)
+    center, longest = (low + high) / 2, int(sides.argmax())
+    ends = center.copy()
+    ends[longest] = low[longest]
+    return TEMPLATE.format(
+        name=name,
+        block=source.block,
+        unit=unit,
+        reason=reason,
+        sides=" x ".join(f"{side:.4g}" for side in sides),
+        size=f"{size:.3g}",
+        near=f"{near:g}",
+        far=f"{2 * near:g}",
+        view=view,
+        cells=[x, y, z],
+        center=_numbers(center),
+        end=_numbers(ends),
+        axis=[float(k == longest) for k in range(3)],
+        length=f"{sides[longest]:.4g}",
+        # half of the angle at which a straight bar of this thickness would fold over
+        angle=int(min(90, np.rad2deg(0.45 * sides[longest] / np.linalg.norm(np.delete(sides, longest) / 2)))),
+        part=quoted(source.names[-1]),
+        push=f"{0.1 * sides.min():.3g}",
+        reach=f"{0.5 * sides.min():.3g}",
+    )
+
+
+def _color(number: int) -> str:
+    return str(list(PALETTE[number % len(PALETTE)]))
+
+
+def _numbers(values: Float[np.ndarray, "3"]) -> str:
+    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+
+
+TEMPLATE = """\
+# A scene for mereo: what the object is, how it may deform, and from where it is seen.
+# Lengths and places are those of the files, angles are degrees, a range is [least, most].
+# Every key is explained in docs/own-object.md.
+
+name: {name}
+units: {unit}  # {reason}. mm, cm, m, in, or metres per unit
+source: my own  # where the meshes come from, and their licence; kept with datasets and weights
+
+# The object is {sides} {unit}. Paths are relative to this file.
+{block}
+
+# Scene units, in which networks see the object: its shortest side is this long. The camera's noise is 0.1 of them.
+size: {size}
+
+camera:
+  aperture: 140  # of the cone of directions from which the camera looks; 360 is all around
+  axis: [0, 0, 1]  # the middle of that cone, as seen from the object
+  distance: [{near}, {far}]  # from the object's centre, in scene units
+  roll: false  # whether the camera may be rolled about its line of sight
+  field_of_view: {view}  # wide enough for the object at the nearest distance
+
+# Drawn at random within these bounds for every example, and applied in this order to the segments named, or to all.
+# Segments that touch should move by the same deformations, so that they stay in contact.
+deformations:
+  - type: lattice  # smooth and free-form: the object in a box of rubber
+    cells: {cells}
+    strength: 0.5  # from 0 to below 1, at which space might fold over
+#  - type: bend  # along the longest side, to any side
+#    origin: {end}
+#    axis: {axis}
+#    length: {length}
+#    angle: [-{angle}, {angle}]
+#  - type: twist
+#    origin: {end}
+#    axis: {axis}
+#    length: {length}
+#    angle: [-30, 30]
+#  - type: squash  # along a random axis, with the volume kept
+#    factor: [0.9, 1.1]
+#  - type: waves
+#    wavelength: [{length}, {length}]
+#    strength: 0.3
+#  - type: push  # an instrument pulls (above 0) or presses (below 0) at a random place
+#    distance: [-{push}, {push}]
+#    tip: {push}
+#    reach: {reach}
+#  - type: joint  # rigid; in a chain, the joint at the tip comes first
+#    segments: [{part}]
+#    pivot: {center}
+#    axis: [0, 0, 1]
+#    angle: [-30, 30]
+# Recorded frames of a simulator take the place of all deformations:
+#states: states.npz
+"""

@@ -1,0 +1,262 @@
+"""States of a scene as points of a cube: every number that the scene draws is one degree of freedom.
+
+    scene -play-> Played (its draws, its deformations) -parameters-> Parameter, ... -set_value-> another Played
+
+See ``mereo.scenes.draw_recorder`` for how draws are recorded, and docs/design/0013-viewer.md.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from zlib import crc32
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtr, ndtri
+
+from mereo.deformation.maps import Deformation
+from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Recorder, Shares
+from mereo.scenes.parameter_names import name_of
+from mereo.scenes.scene import Scene
+
+MANY = 48
+"""An array of more numbers than this, or of more than ``MANY_NORMAL`` normal ones, gets one slider."""
+
+MANY_NORMAL = 3
+NORMAL_REACH = 3.0
+"""Sliders of normal draws go this many standard deviations to either side."""
+
+RETRIES = 10
+"""How often a scene may draw all it needs again before a state counts as refused."""
+
+WITNESSES = 40
+"""Vertices of each segment whose motion tells whether two states are the same."""
+
+
+class Refused(ValueError):
+    """A scene does not allow this state, for example because its parts would touch."""
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """One state of a scene, and the draws that lead to it.
+
+    Attributes:
+        seed: of all that is not given.
+        calls: the draws, without attempts that the scene itself has thrown away.
+        deformations: for each segment.
+        remembered: shares of these draws, and of draws that other states needed.
+        turns: for draws with one slider for many numbers, its value, and the shares at 0.
+    """
+
+    seed: int
+    calls: tuple[Call, ...]
+    deformations: tuple[Deformation, ...]
+    remembered: Mapping[Key, Shares]
+    turns: Mapping[Key, tuple[float, Shares]]
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """Which sliders there are; the same keys mean the same sliders."""
+        return tuple(call.key for call in self.calls)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One degree of freedom.
+
+    Attributes:
+        key, index: which draw, and which of its numbers; None for all of them together.
+        group, name, unit: for people.
+        low, high, value: as the scene draws them, angles in degrees; a normal draw in standard deviations, many
+            numbers together in turns.
+        whole: whether only whole numbers mean something.
+    """
+
+    key: Key
+    index: int | None
+    group: str
+    name: str
+    unit: str
+    low: float
+    high: float
+    value: float
+    whole: bool = False
+
+
+# --- playing ----------------------------------------------------------------------------------------------------------
+
+
+def random_state(scene: Scene, seed: int) -> Played:
+    """The state of a seed. Another seed, another state."""
+    return _played(scene, seed, {}, {}, None)
+
+
+def play(scene: Scene, seed: int, given: Mapping[Key, Shares], most: int | None) -> tuple[Recorder, tuple]:
+    """Let the scene draw; ``mereo.scenes.draw_recorder`` counts the calls from here on."""
+    recorder = Recorder(seed, given, most)
+    return recorder, scene.sample_deformations(recorder)
+
+
+def _played(
+    scene: Scene,
+    seed: int,
+    given: Mapping[Key, Shares],
+    turns: Mapping[Key, tuple[float, Shares]],
+    before: Played | None,
+) -> Played:
+    most = None if before is None else RETRIES * (len(before.calls) + 10)
+    recorder, deformations = play(scene, seed, given, most)
+    calls = tuple(recorder.calls)
+    if before is None or tuple(call.key for call in calls) != before.keys:
+        calls = _without_refused(scene, seed, calls, deformations)
+    renumbered = _renumbered(calls)
+    remembered = {**given, **{call.key: call.shares for call in renumbered}}
+    return Played(seed, renumbered, deformations, remembered, turns)
+
+
+def _renumbered(calls: Sequence[Call]) -> tuple[Call, ...]:
+    """Keys counted anew where calls were left out."""
+    seen: Counter[object] = Counter()
+    result = []
+    for call in calls:
+        place = call.key[0]
+        result.append(replace(call, key=(place, seen[place])))
+        seen[place] += 1
+    return tuple(result)
+
+
+def _without_refused(
+    scene: Scene, seed: int, calls: tuple[Call, ...], deformations: tuple[Deformation, ...]
+) -> tuple[Call, ...]:
+    """The draws that matter: those of attempts that the scene threw away are left out.
+
+    A run of draws that starts where a later one starts again is left out, if without it the scene draws exactly the
+    rest and deforms alike. This is a test of the scene's behaviour, so it needs to know nothing of its loops.
+    """
+    wanted = _witness(scene, deformations)
+    first = 0
+    while first < len(calls):
+        again = [k for k in range(len(calls) - 1, first, -1) if calls[k].key[0] == calls[first].key[0]]
+        for later in again:
+            kept = calls[:first] + calls[later:]
+            if _plays_alike(scene, seed, kept, wanted):
+                calls = kept
+                break
+        first += 1
+    return calls
+
+
+def _plays_alike(scene: Scene, seed: int, calls: tuple[Call, ...], wanted: Float[np.ndarray, "w 3"]) -> bool:
+    renumbered = _renumbered(calls)
+    given = {call.key: call.shares for call in renumbered}
+    try:
+        recorder, deformations = play(scene, seed, given, len(calls))
+    except (OutOfDraws, ValueError):
+        return False
+    same_draws = [call.key for call in recorder.calls] == [call.key for call in renumbered]
+    return same_draws and np.array_equal(_witness(scene, deformations), wanted)
+
+
+def _witness(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "w 3"]:
+    """Where a few vertices of each segment go."""
+    return np.concatenate(
+        [
+            deformation(segment.vertices[:: max(1, len(segment.vertices) // WITNESSES)])
+            for segment, deformation in zip(scene.rest.segments, deformations, strict=True)
+        ]
+    )
+
+
+# --- sliders ----------------------------------------------------------------------------------------------------------
+
+
+def parameters(played: Played) -> tuple[Parameter, ...]:
+    """What can be moved in this state, in the order in which it is drawn, with names that differ within a group."""
+    found: list[Parameter] = []
+    names = [name_of(call.trail) for call in played.calls]
+    repeated = Counter(names)
+    seen: Counter[tuple[str, str, str]] = Counter()
+    for call, named in zip(played.calls, names, strict=True):
+        seen[named] += 1
+        group, name, unit = named
+        name = f"{name} {seen[named]}" if repeated[named] > 1 else name
+        if _together(call):
+            turn = played.turns.get(call.key, (0.0, call.shares))[0]
+            found.append(Parameter(call.key, None, group, name, " turns", 0.0, 1.0, turn))
+        else:
+            found += [_parameter(call, index, group, name, unit) for index in range(len(call.shares))]
+    return tuple(parameter for parameter in found if parameter.high > parameter.low)
+
+
+def _together(call: Call) -> bool:
+    return len(call.shares) > (MANY_NORMAL if call.kind == "normal" else MANY)
+
+
+def _parameter(call: Call, index: int, group: str, name: str, unit: str) -> Parameter:
+    if len(call.shares) > 1:
+        name = f"{name} {'xyz'[index] if call.shape == (3,) and call.kind != 'permutation' else index + 1}"
+    low, high, share = float(call.low[index]), float(call.high[index]), float(call.shares[index])
+    if call.kind == "normal":
+        value = float(np.clip(ndtri(share), -NORMAL_REACH, NORMAL_REACH))
+        return Parameter(call.key, index, group, name, " σ", -NORMAL_REACH, NORMAL_REACH, value)
+    if call.kind in ("integers", "choice"):
+        value = low + np.floor(share * (high - low))
+        return Parameter(call.key, index, group, name, "", low, high - 1, float(value), whole=True)
+    factor = 180 / np.pi if unit == "°" else 1.0
+    low, high = sorted((low * factor, high * factor))
+    return Parameter(call.key, index, group, name, unit, low, high, low + share * (high - low))
+
+
+def set_value(scene: Scene, played: Played, parameter: Parameter, value: float) -> Played:
+    """The state with one degree of freedom at another value, within its bounds.
+
+    Draws that only the new state needs are random, and those of the old one are remembered for the way back. Raises
+    ``Refused`` where the scene does not take the value.
+    """
+    call = next(call for call in played.calls if call.key == parameter.key)
+    turns = dict(played.turns)
+    if parameter.index is None:
+        start = turns.get(call.key, (0.0, call.shares))[1]
+        turns[call.key] = (value, start)
+        shares = turned(start, value, crc32(repr(call.key).encode()) + played.seed)
+    else:
+        shares = call.shares.copy()
+        shares[parameter.index] = _share(call.kind, parameter, value)
+    given = {**played.remembered, call.key: shares}
+    try:
+        result = _played(scene, played.seed, given, turns, played)
+    except (OutOfDraws, ValueError):  # a scene that gives up raises ValueError
+        raise Refused(_refusal(parameter)) from None
+    taken = next((c for c in result.calls if c.key == call.key), None)
+    if taken is None or not np.allclose(taken.shares, shares, atol=1e-6):
+        raise Refused(_refusal(parameter))
+    return result
+
+
+def turned(shares: Shares, turn: float, seed: int) -> Shares:
+    """Many numbers moved at once, so that they stay as random as they were.
+
+    As normal numbers z they go round a circle through other ones w: z cos + w sin has the same distribution everywhere
+    on it (elliptical slice sampling, Murray et al., AISTATS 2010, walks on the same curve). 0 and 1 are the start.
+    """
+    other = np.random.default_rng(seed).normal(size=len(shares))
+    angle = 2 * np.pi * turn
+    moved: Shares = ndtr(np.cos(angle) * ndtri(shares) + np.sin(angle) * other)
+    return moved
+
+
+def _share(kind: str, parameter: Parameter, value: float) -> float:
+    value = min(max(value, parameter.low), parameter.high)
+    if kind == "normal":
+        return float(ndtr(value))
+    if kind in ("integers", "choice"):
+        return float((np.rint(value) - parameter.low + 0.5) / (parameter.high - parameter.low + 1))
+    return float((value - parameter.low) / (parameter.high - parameter.low))
+
+
+def _refusal(parameter: Parameter) -> str:
+    return (
+        f"the scene refuses this value of {parameter.name!r}: with the other values as they are, its parts would "
+        "touch, or fold over; the last state that it allows is shown: move another slider first"
+    )

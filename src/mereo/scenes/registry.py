@@ -1,0 +1,38 @@
+"""Scenes by name: the built-in ones, and those of files."""
+
+from importlib import import_module
+from pathlib import Path
+
+from mereo.scenes.scene import Scene
+
+SCENES = (
+    *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
+    *("tumor", "liver-simulated"),
+)
+"""Built-in scenes, one module each in ``mereo.scenes.builtin``: the paper's ten, then ours."""
+
+
+def is_yaml(scene: "str | Path | Scene") -> bool:
+    """Whether this names a YAML scene file."""
+    return isinstance(scene, str | Path) and Path(scene).suffix.lower() in (".yaml", ".yml")
+
+
+def load_scene(name: str | Path) -> Scene:
+    """A scene by its built-in name, or from a file: YAML (``scenes.files.build``), or Python
+    (``scenes.files.python``), which is run.
+
+    Raises ``ValueError`` listing what there is for an unknown name, or saying what is wrong with a file;
+    ``FileNotFoundError`` where it, or a mesh that it names, does not exist.
+    """
+    if is_yaml(name):
+        scene: Scene = import_module("mereo.scenes.files.build").load(Path(name))
+    elif Path(name).suffix == ".py":
+        scene = import_module("mereo.scenes.files.python").load(Path(name))
+    elif name in SCENES:
+        scene = import_module(f"mereo.scenes.builtin.{str(name).replace('-', '_')}").scene()
+    else:
+        raise ValueError(
+            f"scene {str(name)!r} is unknown; it must be one of {', '.join(SCENES)}, or a file of your own (.yaml, as "
+            "`mereo scene new` writes it, or .py with a function scene()): check the spelling"
+        )
+    return scene

@@ -1,0 +1,38 @@
+"""The rest pose: its coordinates, and its segments as signed distances on a grid (a dataset's template.safetensors).
+
+Rest coordinates are ``(rest - centre) / half`` of the joint rest box, ``half`` being half of its longest side, so that
+the object fills [-1, 1] along its longest side.
+"""
+
+import numpy as np
+from jaxtyping import Float, Float16
+
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+
+TEMPLATE_NODES = 64
+"""Nodes of the grid along each axis: 0.04 apart, a fiftieth of the object's longest side."""
+
+TEMPLATE_REACH = 1.25
+"""The grid covers rest coordinates from -1.25 to 1.25: whatever is farther out is far outside."""
+
+
+def rest_frame(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "3"], float]:
+    """Centre and half of the longest side of the joint rest box."""
+    low, high = rest.bounds
+    return (low + high) / 2, float((high - low).max() / 2)
+
+
+def rest_distances(rest: SegmentedMesh) -> Float16[np.ndarray, "s n n n"]:
+    """Signed distance to what each segment owns, negative inside, in rest coordinates; axes [segment, x, y, z]."""
+    center, half = rest_frame(rest)
+    axis = np.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) * half + center
+    solids = Solids(rest)
+    rows = [
+        np.where(solids.inside(index, nodes), -1.0, 1.0) * solids.segment_distance(index, nodes)
+        for index in range(solids.count)
+    ]
+    for inner, outer in rest.nesting:  # exact, because the inner segment lies inside
+        rows[outer] = np.maximum(rows[outer], -rows[inner])
+    return (np.stack(rows) / half).astype(np.float16).reshape(-1, *(TEMPLATE_NODES,) * 3)

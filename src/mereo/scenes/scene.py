@@ -1,0 +1,120 @@
+"""Scenes: a segmented model at rest, its random deformations, and where a camera may stand (paper, appendix B)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.deformation.maps import Deformation
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.transforms import look_at, rotation_along
+from mereo.scenes.seeds import TEST_SEED_START
+
+PAPER_APERTURE_RAD = float(np.deg2rad(140.0))
+WHOLE_SPHERE_RAD = float(np.deg2rad(360.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """Where the camera may be: a cone around ``axis`` with its tip at the object (paper, appendix B).
+
+    Attributes:
+        aperture_rad: full opening angle of the cone; 2 pi is the whole sphere.
+        distance: nearest and farthest distance from the object's centre, in scene units.
+        axis: direction from the object to the middle of the workspace, in the scene's frame.
+        any_roll: whether the camera may be rolled about its viewing axis; otherwise its x axis stays perpendicular
+            to ``axis`` (the horizon is level).
+        fov_rad: full angle of view of the square image.
+    """
+
+    aperture_rad: float = PAPER_APERTURE_RAD
+    distance: tuple[float, float] = (100.0, 200.0)
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    any_roll: bool = False
+    fov_rad: float = float(np.deg2rad(35.0))
+
+    def sample(self, rng: np.random.Generator, target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+        """``T_world_camera`` of a camera aimed at ``target``, uniform in direction and in distance."""
+        cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, np.pi)), 1.0)
+        azimuth = rng.uniform(0.0, 2 * np.pi)
+        distance = rng.uniform(*self.distance)
+        roll = rng.uniform(0.0, 2 * np.pi) if self.any_roll else 0.0
+        return self.pose(target, cosine, azimuth, distance, roll)
+
+    def pose(
+        self, target: Float[np.ndarray, "3"], cosine: float, azimuth_rad: float, distance: float, roll_rad: float = 0.0
+    ) -> Float[np.ndarray, "4 4"]:
+        """``T_world_camera`` of a camera aimed at ``target``, by its azimuth and the cosine of its tilt."""
+        sine = np.sqrt(1.0 - cosine**2)
+        local = np.array([sine * np.cos(azimuth_rad), sine * np.sin(azimuth_rad), cosine])
+        to_camera = rotation_along(np.asarray(self.axis, dtype=float)) @ local
+        return look_at(target + distance * to_camera, target, np.asarray(self.axis, dtype=float), roll_rad)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """One random state of a scene, in the scene's own (world) frame.
+
+    Attributes:
+        mesh: the deformed segments.
+        deformations: for each segment the map of space from its rest pose to ``mesh``.
+    """
+
+    mesh: SegmentedMesh
+    deformations: tuple[Deformation, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A deformable object to learn.
+
+    Attributes:
+        name: stable identifier.
+        rest: the segments at rest, in scene units (shortest dimension about 20).
+        sample_deformations: draws one deformation per segment; segments that move together share one object.
+        workspace: where the camera may be.
+        source: where the mesh comes from, and its licence.
+        held_out: the same object in states that are kept for testing; None where states are drawn without end.
+        unit_m: metres per scene unit; None where the object's true size is not known.
+        definition: what a scene from a file states, in a text that changes exactly when its meaning does. Empty for
+            built-in scenes: the version of mereo stands for it.
+    """
+
+    name: str
+    rest: SegmentedMesh
+    sample_deformations: Callable[[np.random.Generator], tuple[Deformation, ...]]
+    workspace: Workspace = field(default_factory=Workspace)
+    source: str = "modelled in mereo's own code, MIT licence"
+    held_out: "Scene | None" = None
+    unit_m: float | None = None
+    definition: str = ""
+
+    def __post_init__(self) -> None:
+        if self.held_out is not None and self.held_out.rest.names != self.rest.names:
+            raise ValueError(
+                f"scene {self.name!r} has the segments {', '.join(self.rest.names)} but its held-out states "
+                f"{', '.join(self.held_out.rest.names)}; they must be one object: give both the same rest mesh"
+            )
+
+    def for_seed(self, seed: int) -> "Scene":
+        """What a seed draws from: one for testing (``TEST_SEED_START`` up) the held-out states, where there are any."""
+        return self.held_out if self.held_out is not None and seed >= TEST_SEED_START else self
+
+    def sample_state(self, rng: np.random.Generator) -> State:
+        """A random deformed state within the scene's hand-made bounds."""
+        return self.deform(self.sample_deformations(rng))
+
+    def deform(self, deformations: tuple[Deformation, ...]) -> State:
+        """The state made by one deformation per segment; vertices shared by a common map are moved in one call."""
+        groups: dict[int, list[int]] = {}
+        for index, deformation in enumerate(deformations):
+            groups.setdefault(id(deformation), []).append(index)
+        moved: list[Float[np.ndarray, "_ 3"]] = [np.empty((0, 3))] * len(deformations)
+        for members in groups.values():
+            parts = [self.rest.segments[i].vertices for i in members]
+            joint = deformations[members[0]](np.concatenate(parts))
+            pieces = np.split(joint, np.cumsum([len(part) for part in parts])[:-1])
+            for index, piece in zip(members, pieces, strict=True):
+                moved[index] = piece
+        return State(self.rest.with_vertices(moved), deformations)

@@ -1,0 +1,1 @@
+"""Virtual depth camera, query points, labelled examples, and datasets of them."""

@@ -1,0 +1,214 @@
+"""What else a camera sees: a tool or a hand in front of the object, a plane behind it.
+
+Everything is in the camera frame, in scene units; lengths in metres are multiplied by ``unit``, scene units per metre.
+Occluders made in front of a rendered object are a common way to train for occlusion (Sárándi et al., "How robust is 3D
+human pose estimation to occlusion?", IROS workshops 2018). Here they are solid bodies with a depth of their own.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from mereo.geometry.raycasting import Hits, toward
+from mereo.geometry.solids import Solids
+from mereo.synthesis.config import SensorConfig
+
+NOTHING, OBJECT, OCCLUDER, BACKGROUND = range(4)
+"""What a pixel's ray meets first."""
+
+Vector = Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """All points within ``radius`` of the segment from ``start`` to ``end``."""
+
+    start: Vector
+    end: Vector
+    radius: float
+
+    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+        """Which rays from the origin hit the capsule, and where each of them does first."""
+        low, high = np.minimum(self.start, self.end) - self.radius, np.maximum(self.start, self.end) + self.radius
+        rows = toward(directions, low, high)
+        rays = directions[rows]
+        distance = np.minimum(self._end_hit(self.start, rays), self._end_hit(self.end, rays))
+        distance = np.minimum(distance, self._side_hit(rays))
+        hit = np.isfinite(distance)
+        place = rays[hit] * distance[hit, None]
+        return rows[hit], Hits(distance[hit], place - self._axis_point(place))
+
+    def _end_hit(self, center: Vector, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Entry into the ball around one end: the smaller root of |t ray - center| = radius."""
+        a, b, c = np.einsum("ij,ij->i", rays, rays), rays @ center, center @ center - self.radius**2
+        return _entry(a, b, np.full(len(rays), c))
+
+    def _side_hit(self, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Entry through the cylinder's side: the same equation for the parts perpendicular to the axis."""
+        axis = self.end - self.start
+        length = float(np.linalg.norm(axis))
+        if length == 0:
+            return np.full(len(rays), np.inf)
+        axis = axis / length
+        along, offset = rays @ axis, float(self.start @ axis)
+        across, start = rays - along[:, None] * axis, self.start - offset * axis
+        distance = _entry(
+            np.einsum("ij,ij->i", across, across), across @ start, np.full(len(rays), start @ start - self.radius**2)
+        )
+        place = np.where(np.isfinite(distance), distance, 0.0) * along - offset
+        return np.where((place >= 0) & (place <= length), distance, np.inf)
+
+    def _axis_point(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """The nearest point of the axis."""
+        axis = self.end - self.start
+        share = np.clip((points - self.start) @ axis / max(float(axis @ axis), 1e-300), 0.0, 1.0)
+        return self.start + share[:, None] * axis
+
+
+def _entry(
+    a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """The smaller root of a t^2 - 2 b t + c = 0 where it is positive, else infinity."""
+    discriminant = b * b - a * c
+    root = (b - np.sqrt(np.maximum(discriminant, 0.0))) / np.maximum(a, 1e-300)
+    return np.where((discriminant > 0) & (a > 0) & (root > 0), root, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Backdrop:
+    """All points with ``normal @ point = offset``; ``offset`` is positive, so that the normal points away."""
+
+    normal: Vector
+    offset: float
+
+    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+        """Which rays from the origin hit the plane, and where."""
+        slope = directions @ self.normal
+        rows = np.flatnonzero(slope > 1e-6)
+        return rows, Hits(self.offset / slope[rows], np.tile(self.normal, (len(rows), 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """All that is not the object."""
+
+    occluders: tuple[Capsule, ...] = ()
+    background: Backdrop | None = None
+
+    def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+        """Let what is nearer replace the hits of the object, in place; returns what each ray meets first."""
+        source = np.where(np.isfinite(hits.distance), OBJECT, NOTHING).astype(np.uint8)
+        if self.background is not None:
+            source[hits.nearer(*self.background.first_hit(directions))] = BACKGROUND
+        for capsule in self.occluders:
+            source[hits.nearer(*capsule.first_hit(directions))] = OCCLUDER
+        return source
+
+
+def sample_surroundings(
+    sensor: SensorConfig,
+    solids: Solids,
+    seen: Float[np.ndarray, "m 3"],
+    reach: float,
+    streams: dict[str, np.random.Generator],
+) -> Surroundings:
+    """Random things around an object of which the points ``seen`` are visible.
+
+    Args:
+        sensor: how probable each is.
+        solids: the object.
+        seen: at least one point; tools and hands point at one of them.
+        reach: slope x/z from the image's centre to its corners, so that shafts and forearms begin outside the image.
+        streams: a random generator for each of ``tool``, ``hand``, ``background``.
+    """
+    unit = 1 / sensor.metres_per_unit
+    occluders: list[Capsule] = []
+    if streams["tool"].random() < sensor.tool:
+        occluders += sample_tool(seen, reach, unit, streams["tool"])
+    if streams["hand"].random() < sensor.hand:
+        occluders += sample_hand(seen, reach, unit, streams["hand"])
+    plane = None
+    if streams["background"].random() < sensor.background:
+        plane = sample_plane(solids, unit, streams["background"])
+    return Surroundings(tuple(occluders), plane)
+
+
+def sample_plane(solids: Solids, unit: float, rng: np.random.Generator) -> Backdrop:
+    """A table or wall behind the object: up to 45 degrees off the image plane, touching to 5 cm behind."""
+    normal = _polar(np.tan(rng.uniform(0, np.pi / 4)), rng.uniform(0, 2 * np.pi))
+    normal = normal / np.linalg.norm(normal)
+    farthest = max(float((segment.vertices @ normal).max()) for segment in solids.mesh.segments)
+    return Backdrop(normal, farthest + rng.uniform(0, 0.05) * unit)
+
+
+def _polar(radius: float, angle_rad: float) -> Vector:
+    return np.array([radius * np.cos(angle_rad), radius * np.sin(angle_rad), 1.0])
+
+
+def _approach(
+    seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator
+) -> tuple[Vector, Vector]:
+    """A tip up to 3 cm before a visible point, and the way out: a point nearer to the camera, outside the image."""
+    target = seen[rng.integers(len(seen))]
+    tip = target * max(1 - rng.uniform(0.002, 0.03) * unit / target[2], 0.5)
+    out = tip[2] * rng.uniform(0.65, 0.95) * _polar(1.1 * reach, rng.uniform(0, 2 * np.pi))
+    return tip, out
+
+
+def sample_tool(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
+    """A straight shaft that ends in two jaws, as laparoscopic instruments have: 5 to 12 mm thick."""
+    tip, out = _approach(seen, reach, unit, rng)
+    radius, jaw, opening = rng.uniform(0.0025, 0.006) * unit, 0.018 * unit, rng.uniform(0.05, 0.4)
+    axis = (out - tip) / np.linalg.norm(out - tip)
+    across = np.cross(axis, rng.normal(size=3))
+    across /= np.linalg.norm(across)
+    joint = tip + jaw * axis
+    ends = [joint - jaw * (np.cos(opening) * axis + side * np.sin(opening) * across) for side in (-1, 1)]
+    return [Capsule(joint, out, radius), *(Capsule(joint, end, 0.45 * radius) for end in ends)]
+
+
+_FINGERS = ((-0.030, 0.90), (-0.010, 1.0), (0.010, 0.93), (0.030, 0.75))
+"""Index to little finger: place of the knuckle across the palm in metres, length relative to the middle finger."""
+
+
+def sample_hand(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
+    """A left or right hand with forearm, as capsules, that reaches up to 7 cm past the point it is sent to.
+
+    Hands of simple solids are known from tracking (Oikonomidis et al., "Efficient model-based 3D tracking of hand
+    articulations using Kinect", BMVC 2011). An adult's: about 18 cm long, 8 cm wide, with 10 % of variation. Fingers
+    bend away from the camera by random angles.
+    """
+    tip, out = _approach(seen, reach, unit, rng)
+    size, mirror = unit * rng.uniform(0.9, 1.1), rng.choice([-1.0, 1.0])
+    frame, reach_m = _hand_frame(tip, out, rng), 0.18 - rng.uniform(0, 0.07)
+
+    def part(start: Vector, end: Vector, radius: float) -> Capsule:
+        """From (across, along, away) in metres, seen from the wrist."""
+        places = [tip + size * ((place - [0, reach_m, 0]) * [mirror, 1, 1]) @ frame for place in (start, end)]
+        return Capsule(places[0], places[1], size * radius)
+
+    def bone(start: Vector, length: float, bend_rad: float) -> Vector:
+        return start + length * np.array([0, np.cos(bend_rad), np.sin(bend_rad)])
+
+    parts = [part(np.array([0, -0.35, 0]), np.zeros(3), 0.03)]
+    for across, share in _FINGERS:
+        bend = np.cumsum(rng.uniform(0, [0.7, 1.0]))
+        knuckle = np.array([across, 0.09, 0])
+        middle = bone(knuckle, 0.047 * share, bend[0])
+        end = bone(middle, 0.043 * share, bend[1])
+        parts += [part(np.array([0.4 * across, 0, 0]), knuckle, 0.012)]
+        parts += [part(knuckle, middle, 0.0095), part(middle, end, 0.008)]
+    base, thumb = np.array([-0.045, 0.045, 0.01]), np.array([-0.06, 0.09, 0.02])
+    return [*parts, part(np.array([-0.015, 0.0, 0]), base, 0.014), part(base, thumb, 0.01)]
+
+
+def _hand_frame(tip: Vector, out: Vector, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    """Rows: across the palm, along the fingers, away from the camera; rolled by up to 45 degrees."""
+    along = (tip - out) / np.linalg.norm(tip - out)
+    away = tip - (tip @ along) * along
+    away /= np.linalg.norm(away)
+    across = np.cross(along, away)
+    roll = rng.uniform(-np.pi / 4, np.pi / 4)
+    cosine, sine = np.cos(roll), np.sin(roll)
+    return np.stack([cosine * across + sine * away, along, cosine * away - sine * across])

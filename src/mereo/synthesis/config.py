@@ -1,0 +1,141 @@
+"""Settings of making examples: simulated depth cameras and query points; light, for the command line."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from tyro.conf import OmitArgPrefixes
+
+SensorModel = Literal["structured-light", "time-of-flight"]
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """Errors of real depth cameras, on top of the paper's noise; each is off at 0 (docs/design/0006-sensors.md).
+
+    A strength of 1 is as published. The formulas are in metres, scenes in their own units.
+
+    Attributes:
+        metres_per_unit: size of a scene unit; 0.005 makes objects 10 cm thick, seen from 0.5 to 1 m, where depth
+            cameras of arm's reach work.
+        model: whose formulas the axial and lateral noise follow.
+        axial: strength of the noise along the ray, which grows with distance and slant.
+        lateral: strength of the noise across the ray: where a pixel looks.
+        quantization: strength of the depth steps of structured light, which grow with the distance squared.
+        flying: probability that a pixel at a depth edge lies between both sides; the object's outline is such an edge
+            where there is a background.
+        dropout: probability that a pixel on a surface seen edge-on is missing; below 60 degrees of slant none is.
+        holes: mean number of missing blobs on the object (mirroring or absorbing spots).
+        hole_radius_m: their mean radius in metres.
+        tool: probability of a thin tool in front of the object.
+        hand: probability of a hand with its forearm in front of the object.
+        background: probability of a plane behind the object, which a wrong mask lets in.
+        mask_offset_px: how far the mask's edge is off, outward or inward, standard deviation in pixels of the image.
+        mask_shift_px: how far the whole mask is off, standard deviation along each axis in pixels of the image.
+    """
+
+    metres_per_unit: float = 0.005
+    model: SensorModel = "structured-light"
+    axial: float = 0.0
+    lateral: float = 0.0
+    quantization: float = 0.0
+    flying: float = 0.0
+    dropout: float = 0.0
+    holes: float = 0.0
+    hole_radius_m: float = 0.01
+    tool: float = 0.0
+    hand: float = 0.0
+    background: float = 0.0
+    mask_offset_px: float = 0.0
+    mask_shift_px: float = 0.0
+
+    @property
+    def on(self) -> bool:
+        """Whether anything differs from the paper's sensor."""
+        return any(getattr(self, name) != 0 for name in SENSOR_TERMS)
+
+
+SENSOR_TERMS = (
+    *("axial", "lateral", "quantization", "flying", "dropout", "holes", "tool", "hand", "background"),
+    *("mask_offset_px", "mask_shift_px"),
+)
+"""What a sensor is off without; each term draws from a random stream of its own."""
+
+Sensor = Literal["paper", "structured-light", "time-of-flight"]
+
+SENSORS: dict[Sensor, SensorConfig] = {
+    # Gaussian noise alone, GenerateConfig.noise_std
+    "paper": SensorConfig(),
+    # the first Kinect and its kin, with a segmentation that is about half a pixel off
+    "structured-light": SensorConfig(
+        axial=1.0,
+        lateral=1.0,
+        quantization=1.0,
+        dropout=0.8,
+        holes=1.0,
+        background=1.0,
+        mask_offset_px=0.5,
+        mask_shift_px=0.3,
+    ),
+    # the second Kinect and its kin: no depth steps, but flying pixels
+    "time-of-flight": SensorConfig(
+        model="time-of-flight",
+        axial=1.0,
+        lateral=1.0,
+        flying=0.5,
+        dropout=0.5,
+        holes=0.5,
+        background=1.0,
+        mask_offset_px=0.5,
+        mask_shift_px=0.3,
+    ),
+}
+
+
+TEMPLATE = "template.safetensors"
+"""A dataset's file with the segments at rest (``rest_pose``)."""
+
+
+Sampler = Literal["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"]
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """Where training queries are drawn (paper, section 3.2, "Sampling Method for Query Points").
+
+    Attributes:
+        sampler: one of the paper's three samplers, or the authors' later NestedSortSample.
+        per_segment: points kept for each segment, half inside and half outside except for volume-uniform.
+        oversample: SortSample's n / k; 1 keeps about all inside points, 2 points closer to the surface.
+        box_margin: each segment's box is extended by this fraction of its size, half on each side.
+        uniform_fraction: further points drawn uniformly in the joint box, as a fraction of all per-segment points.
+    """
+
+    sampler: Sampler = "sort-sample"
+    per_segment: int = 256
+    oversample: int = 1
+    box_margin: float = 0.5
+    uniform_fraction: float = 0.15
+
+    def total(self, segments: int) -> int:
+        """Number of queries of one example."""
+        return self.per_segment * segments + round(self.uniform_fraction * self.per_segment * segments)
+
+
+@dataclass(frozen=True)
+class GenerateConfig:
+    """How one example is made (paper, appendix B).
+
+    Attributes:
+        image_size: the depth image is square, in pixels.
+        noise_std: Gaussian noise on the depth, standard deviation in scene units.
+        points: the observed cloud is kept in farthest-point order, at most this many points.
+        sampling: where queries are drawn.
+        sensor: what else is wrong with the depth image; nothing in the paper.
+    """
+
+    image_size: int = 96
+    noise_std: float = 0.1
+    points: int = 1024
+    # the marker keeps --sampler short on the command line, where --sensor.axial keeps its prefix
+    sampling: OmitArgPrefixes[SamplingConfig] = field(default_factory=SamplingConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)

@@ -1,0 +1,298 @@
+"""What a depth camera makes of a scene: the paper's Gaussian noise, and errors that real cameras add (off by default).
+
+Order of a measurement: what each pixel's ray meets, along a direction that is slightly off (lateral noise); mixed
+pixels at depth edges; noise in depth; quantization; missing pixels; and the mask that cuts out the object.
+docs/design/0006-sensors.md has the sources and figures. Notation: h x w pixels, z_m depth in metres, angle_rad between
+ray and surface normal.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.raycasting import Hits
+from mereo.geometry.solids import Solids
+from mereo.synthesis.clutter import NOTHING, OBJECT, sample_surroundings
+from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
+from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
+
+STEEPEST_RAD = float(np.deg2rad(80.0))
+"""The noise formulas have a pole at 90 degrees; surfaces seen at a larger angle count as seen at this one."""
+
+GRAZING_RAD = float(np.deg2rad(60.0))
+"""From here on axial noise rises steeply (Nguyen et al. 2012) and pixels go missing."""
+
+KINECT_FOCAL_PX = 585.0
+"""Nguyen et al. state lateral noise in pixels of this focal length."""
+
+KINECT_DISPARITY_M = 351.3
+"""Depth in metres times disparity in steps; 35130 in centimetres (Barron and Malik 2013)."""
+
+PROBABILITIES = ("flying", "dropout", "tool", "hand", "background")
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedView:
+    """What a camera gives, and the truth about it.
+
+    Attributes:
+        whole: everything that was measured.
+        mask: the object's pixels, according to the segmentation.
+        source: what each pixel's ray met first, ``surroundings.OBJECT`` and so on.
+    """
+
+    whole: DepthImage
+    mask: Bool[np.ndarray, "h w"]
+    source: UInt8[np.ndarray, "h w"]
+
+    @property
+    def image(self) -> DepthImage:
+        """The depth image cut out by the mask."""
+        return DepthImage(np.where(self.mask, self.whole.depth, 0.0), self.whole.camera)
+
+    @property
+    def object_points(self) -> int:
+        """Pixels of ``image`` that show the object."""
+        return int((self.mask & self.whole.valid & (self.source == OBJECT)).sum())
+
+
+def check_sensor(sensor: SensorConfig) -> None:
+    """Raise ``ValueError`` naming the setting, its rule and the cure."""
+    for name in SENSOR_TERMS:
+        value = getattr(sensor, name)
+        if name in PROBABILITIES and not 0 <= value <= 1:
+            raise ValueError(f"sensor.{name} is {value}; it is a probability: pass a number from 0 to 1")
+        if not 0 <= value < np.inf:
+            raise ValueError(f"sensor.{name} is {value}; it must be finite and not negative: pass 0 to switch it off")
+    for name in ("metres_per_unit", "hole_radius_m"):
+        if not 0 < getattr(sensor, name) < np.inf:
+            raise ValueError(f"sensor.{name} is {getattr(sensor, name)}; it is a length: pass a positive number")
+
+
+def observe(
+    solids: Solids, camera: Camera, noise_std: float, sensor: SensorConfig, rng: np.random.Generator
+) -> SimulatedView:
+    """One picture of an object in the camera frame.
+
+    The Gaussian noise of ``noise_std`` is drawn from ``rng`` itself, every other term from a stream of its own that is
+    spawned from it. So whatever is drawn from ``rng`` afterwards is the same with any sensor, and switching one term on
+    or off leaves the others as they were.
+
+    Raises ``ValueError`` for settings out of their range.
+    """
+    check_sensor(sensor)
+    if not sensor.on:
+        image = add_depth_noise(render_depth(solids, camera), noise_std, rng)
+        return SimulatedView(image, image.valid, np.where(image.valid, OBJECT, NOTHING).astype(np.uint8))
+    streams = dict(zip(SENSOR_TERMS, rng.spawn(len(SENSOR_TERMS)), strict=True))
+    hits, source = _look(solids, camera, sensor, streams)
+    shape = (camera.height, camera.width)
+    depth = np.where(np.isfinite(hits.distance), hits.distance, 0.0).reshape(shape)
+    angle_rad = _incidence(hits, camera.directions().reshape(-1, 3)).reshape(shape)
+    source = source.reshape(shape)
+    seen = source == OBJECT
+    depth = mix_edges(depth, camera.focal_x_px, sensor.flying, streams["flying"])
+    depth = add_axial_noise(depth, angle_rad, sensor, streams["axial"])
+    depth = add_depth_noise(DepthImage(depth, camera), noise_std, rng).depth
+    if sensor.quantization > 0:
+        depth = quantize(depth * sensor.metres_per_unit, sensor.quantization) / sensor.metres_per_unit
+    missing = streams["dropout"].random(shape) < dropout_probability(angle_rad, sensor.dropout)
+    missing |= sample_holes(depth, seen, camera.focal_x_px, sensor, streams["holes"])
+    return SimulatedView(DepthImage(np.where(missing, 0.0, depth), camera), sample_mask(seen, sensor, streams), source)
+
+
+# --- where rays go ----------------------------------------------------------------------------------------------------
+
+
+def _look(
+    solids: Solids, camera: Camera, sensor: SensorConfig, streams: dict[str, np.random.Generator]
+) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
+    """What each pixel's ray meets, with the surroundings and lateral noise."""
+    directions = camera.directions().reshape(-1, 3)
+    hits = solids.first_hit(directions)
+    visible = np.isfinite(hits.distance)
+    if visible.sum() < MIN_POINTS:
+        return hits, np.where(visible, OBJECT, NOTHING).astype(np.uint8)
+    seen = directions[visible] * hits.distance[visible, None]
+    reach = float(np.linalg.norm(directions[:, :2], axis=1).max())
+    around = sample_surroundings(sensor, solids, seen, reach, streams)
+    source = around.join(hits, directions)
+    if sensor.lateral > 0:
+        depth = np.where(np.isfinite(hits.distance), hits.distance, np.median(seen[:, 2]))
+        std = lateral_std(depth * sensor.metres_per_unit, _incidence(hits, directions), sensor.model)
+        directions[:, :2] += sensor.lateral * std[:, None] * streams["lateral"].normal(size=(len(directions), 2))
+        hits = solids.first_hit(directions)
+        source = around.join(hits, directions)
+    return hits, source
+
+
+def _incidence(hits: Hits, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Angle between ray and surface normal in radians, from 0 to pi / 2; 0 where nothing is hit."""
+    along = np.abs(np.einsum("ij,ij->i", hits.normal, directions))
+    squared = np.einsum("ij,ij->i", hits.normal, hits.normal) * np.einsum("ij,ij->i", directions, directions)
+    cosine = along / np.sqrt(np.where(squared > 0, squared, 1.0))
+    return np.arccos(np.where(squared > 0, np.minimum(cosine, 1.0), 1.0))
+
+
+def lateral_std(
+    z_m: Float[np.ndarray, "*n"], angle_rad: Float[np.ndarray, "*n"], model: SensorModel = "structured-light"
+) -> Float[np.ndarray, "*n"]:
+    """Standard deviation of where a pixel looks, as a slope x/z.
+
+    Structured light: 0.8 + 0.035 a / (pi/2 - a) pixels of the Kinect (Nguyen, Izadi and Lovell, "Modeling Kinect sensor
+    noise for improved 3D reconstruction and tracking", 3DIMPVT 2012). Time of flight: 1.6 mm at any depth (Fankhauser
+    et al., "Kinect v2 for mobile robot navigation: evaluation and modeling", ICAR 2015).
+    """
+    if model == "time-of-flight":
+        return 0.0016 / z_m
+    angle = np.minimum(angle_rad, STEEPEST_RAD)
+    return (0.8 + 0.035 * angle / (np.pi / 2 - angle)) / KINECT_FOCAL_PX
+
+
+# --- depth ------------------------------------------------------------------------------------------------------------
+
+
+def axial_std_m(
+    z_m: Float[np.ndarray, "*n"], angle_rad: Float[np.ndarray, "*n"], model: SensorModel = "structured-light"
+) -> Float[np.ndarray, "*n"]:
+    """Standard deviation of the depth in metres, at distance z and angle a.
+
+    Structured light: 0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 z^-1/2 a^2 / (pi/2 - a)^2 (Nguyen et al. 2012, who add the
+    last term beyond 60 degrees only; it is small below, and here there is no jump). Time of flight: 1.5 - 0.5 z +
+    0.3 z^2 + 0.1 z^3/2 a^2 / (pi/2 - a)^2 millimetres (Fankhauser et al. 2015).
+    """
+    angle = np.minimum(angle_rad, STEEPEST_RAD)
+    slant = (angle / (np.pi / 2 - angle)) ** 2
+    if model == "time-of-flight":
+        return 0.001 * (1.5 - 0.5 * z_m + 0.3 * z_m**2 + 0.1 * z_m**1.5 * slant)
+    return 0.0012 + 0.0019 * (z_m - 0.4) ** 2 + 0.0001 * slant / np.sqrt(z_m)
+
+
+def add_axial_noise(
+    depth: Float[np.ndarray, "h w"], angle_rad: Float[np.ndarray, "h w"], sensor: SensorConfig, rng: np.random.Generator
+) -> Float[np.ndarray, "h w"]:
+    """Gaussian noise of ``axial_std_m`` on every measured pixel; misses (0) stay misses."""
+    if sensor.axial == 0:
+        return depth
+    measured = depth > 0
+    z_m = depth[measured] * sensor.metres_per_unit
+    noise_m = (
+        sensor.axial * axial_std_m(z_m, angle_rad[measured], sensor.model) * rng.normal(size=depth.shape)[measured]
+    )
+    noisy = depth.copy()
+    noisy[measured] = np.maximum(z_m + noise_m, np.finfo(np.float32).tiny) / sensor.metres_per_unit
+    return noisy
+
+
+def quantize(z_m: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray, "*n"]:
+    """Depth of the nearest whole disparity: z -> D / round(D / z), D = 351.3 m / ``strength``; 0 stays 0.
+
+    A triangulating camera measures disparity in steps (an eighth of a pixel in the Kinect), so depth has steps of about
+    z^2 / D: 0.7 mm at 0.5 m, 2.8 mm at 1 m. D is from Barron and Malik ("Intrinsic scene properties from a single
+    RGB-D image", CVPR 2013), whom Handa et al. follow (ICL-NUIM, ICRA 2014); it agrees with the 2.85e-5 / cm measured
+    by Khoshelham and Elberink ("Accuracy and resolution of Kinect depth data", Sensors 2012). Their noise before
+    rounding is left to the axial noise.
+    """
+    disparity = KINECT_DISPARITY_M / strength
+    steps = np.maximum(np.rint(disparity / np.where(z_m > 0, z_m, 1.0)), 1.0)
+    return np.where(z_m > 0, disparity / steps, 0.0)
+
+
+def mix_edges(
+    depth: Float[np.ndarray, "h w"], focal_px: float, probability: float, rng: np.random.Generator
+) -> Float[np.ndarray, "h w"]:
+    """Flying pixels: at depth edges, with this probability, a depth between the pixel's own and its neighbour's.
+
+    A pixel whose footprint covers both sides of an edge returns a mixture (Hebert and Krotkov, "3D measurements from
+    imaging laser radars: how good are they?", Image and Vision Computing 1992; for time-of-flight cameras Sabov and
+    Krüger, "Identification and correction of flying pixels in range camera data", SCCG 2008). How much of each depends
+    on both surfaces' brightness, which is unknown: the share is uniform. The neighbour is the one of four that differs
+    most; an edge is where it differs by more than one surface seen at 80 degrees would. An edge before nothing at all
+    stays sharp: no light comes back from there.
+    """
+    if probability == 0:
+        return depth
+    padded = np.pad(depth, 1)
+    beside = np.stack([padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]])
+    step = np.where((beside > 0) & (depth > 0), beside - depth, 0.0)
+    largest = np.take_along_axis(step, np.abs(step).argmax(axis=0)[None], axis=0)[0]
+    mixed = np.abs(largest) > depth * np.tan(STEEPEST_RAD) / focal_px
+    mixed &= rng.random(depth.shape) < probability
+    return depth + np.where(mixed, rng.random(depth.shape) * largest, 0.0)
+
+
+# --- missing pixels, mask ---------------------------------------------------------------------------------------------
+
+
+def dropout_probability(angle_rad: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray, "*n"]:
+    """How probably a pixel is missing: 0 up to 60 degrees, then rising to ``strength`` at 90.
+
+    The light that comes back from a matt surface falls with the cosine of the angle (Lambert), and cameras give up on
+    weak or distorted returns (Mallick, Das and Majumdar, "Characterizations of noise in Kinect depth images: a review",
+    IEEE Sensors Journal 2014). The probability is what the cosine lacks of its value at 60 degrees.
+    """
+    return strength * np.maximum(0.0, 1.0 - np.cos(angle_rad) / np.cos(GRAZING_RAD))
+
+
+def sample_holes(
+    depth: Float[np.ndarray, "h w"],
+    seen: Bool[np.ndarray, "h w"],
+    focal_px: float,
+    sensor: SensorConfig,
+    rng: np.random.Generator,
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels in missing blobs, as mirroring and absorbing spots leave them (Mallick et al. 2014).
+
+    A Poisson number of ellipses at object pixels with gamma-distributed radii (shape 5), after the augmentation of Xie
+    et al. ("Unseen object instance segmentation for robotic environments", T-RO 2021), with radii in metres.
+    """
+    holes = np.zeros(depth.shape, dtype=bool)
+    rows, columns = np.nonzero(seen)
+    if len(rows) == 0 or sensor.holes == 0:
+        return holes
+    v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
+    for chosen in rng.integers(len(rows), size=rng.poisson(sensor.holes)):
+        row, column = rows[chosen], columns[chosen]
+        radii_m, angle = rng.gamma(5.0, sensor.hole_radius_m / 5.0, size=2), rng.uniform(0, np.pi)
+        a, b = radii_m * focal_px / (depth[row, column] * sensor.metres_per_unit)
+        along = (u - column) * np.cos(angle) + (v - row) * np.sin(angle)
+        across = (v - row) * np.cos(angle) - (u - column) * np.sin(angle)
+        holes |= (along / a) ** 2 + (across / b) ** 2 <= 1
+    return holes
+
+
+def sample_mask(
+    seen: Bool[np.ndarray, "h w"], sensor: SensorConfig, streams: dict[str, np.random.Generator]
+) -> Bool[np.ndarray, "h w"]:
+    """The object's mask as a segmentation gives it: shifted, its edge too far out here and too far in there.
+
+    Xie et al. (T-RO 2021) shift, erode and dilate masks to resemble those of a network. Here the signed distance to the
+    true edge is compared with a smooth random offset, so that neighbouring parts of the edge are wrong alike.
+    """
+    if (sensor.mask_offset_px == 0 and sensor.mask_shift_px == 0) or not seen.any() or seen.all():
+        return seen
+    outward = ndimage.distance_transform_edt(~seen) - ndimage.distance_transform_edt(seen)
+    outward -= 0.5 * np.sign(outward)
+    shift = sensor.mask_shift_px * streams["mask_shift_px"].normal(size=2)
+    outward = ndimage.shift(outward, shift, order=1, mode="nearest")
+    height, width = seen.shape
+    return outward < sensor.mask_offset_px * smooth_field(height, width, streams["mask_offset_px"])
+
+
+def smooth_field(height: int, width: int, rng: np.random.Generator, nodes: int = 7) -> Float[np.ndarray, "h w"]:
+    """A Gaussian random field of mean 0 and variance 1 everywhere, with ``nodes`` hills along each axis."""
+    return _bumps(height, nodes) @ rng.normal(size=(nodes, nodes)) @ _bumps(width, nodes).T
+
+
+@lru_cache(maxsize=8)
+def _bumps(size: int, nodes: int) -> Float[np.ndarray, "s n"]:
+    """Weights of the nodes at each pixel; their squares sum to 1."""
+    pixels, centers = np.arange(size)[:, None] / max(size - 1, 1), np.linspace(0, 1, nodes)
+    weights = np.exp(-0.5 * ((pixels - centers) * (nodes - 1) / 0.7) ** 2)
+    normalized: Float[np.ndarray, "s n"] = weights / np.linalg.norm(weights, axis=1, keepdims=True)
+    return normalized

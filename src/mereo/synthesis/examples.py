@@ -1,0 +1,185 @@
+"""One labelled example: a random state, a random view, labelled query points (paper, section 3.2).
+
+    SegmentedMesh -deform-> -render-> DepthImage -unproject-> PointCloud
+                      '---- sample and label query points ---> LabelledPoints
+
+Query points are drawn in the camera frame, in boxes whose sides are parallel to the camera's axes. The paper draws them
+around the object and then "transforms them into camera space"; drawn there directly, they fill the boxes that
+evaluation and reconstruction look into, which know the camera's axes only.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from mereo.deformation.maps import Deformation, invert
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.geometry.mesh import SegmentedMesh, barycentric
+from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.solids import Nearest, Solids, signed_distance_and_direction
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.scenes.rest_pose import rest_frame
+from mereo.scenes.scene import Scene
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.depth_sensor import observe
+from mereo.synthesis.query_sampling import Samples, sample_queries
+
+ATTEMPTS = 100
+"""Views drawn before giving up on a scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A random state seen by a random camera.
+
+    Attributes:
+        mesh: the deformed segments in the CAMERA frame, in scene units.
+        depth: the noisy depth image, cut out by the mask, with the camera it was taken with.
+        T_world_camera: the camera's pose in the scene's frame.
+        deformations: for each segment the map from rest to the scene's frame.
+    """
+
+    mesh: SegmentedMesh
+    depth: DepthImage
+    T_world_camera: Float[np.ndarray, "4 4"]
+    deformations: tuple[Deformation, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledPoints:
+    """Query points with their answers, normalized, in the camera frame.
+
+    Attributes:
+        positions, labels: where, and which segment (0 is empty space).
+        distances: signed, to the nearest segment surface, negative inside any segment.
+        directions: unit vector to that surface.
+        rest: rest coordinates (``rest_pose``) of inside points; NaN outside, and where the deformation could not be
+            inverted.
+    """
+
+    positions: Float[np.ndarray, "q 3"]
+    labels: UInt8[np.ndarray, " q"]
+    distances: Float[np.ndarray, " q"]
+    directions: Float[np.ndarray, "q 3"]
+    rest: Float[np.ndarray, "q 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """What a network learns from.
+
+    Attributes:
+        cloud: observed points, normalized, in farthest-point order.
+        normalizer: from the observed cloud alone.
+        queries: labelled points in the same normalized frame.
+    """
+
+    cloud: Float[np.ndarray, "p 3"]
+    normalizer: Normalizer
+    queries: LabelledPoints
+
+
+def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> Example:
+    """One training example: a random state, seen and noisy, and query points with their answers.
+
+    Raises:
+        ValueError: no random view sees the object, or a segment cannot be sampled (``query_sampling``).
+    """
+    view, solids = _sample_view(scene, settings, rng)
+    points = view.depth.to_points().points
+    normalizer = Normalizer.fit(points)
+    cloud = normalizer.apply(points)
+    samples = sample_queries(solids, settings.sampling, rng)
+    return Example(
+        cloud=cloud[farthest_point_order(cloud, settings.points)],
+        normalizer=normalizer,
+        queries=label_queries(scene, view, solids, samples, normalizer),
+    )
+
+
+def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> View:
+    """A random state seen by a random camera; both are drawn again while fewer than ``MIN_POINTS`` points of the object
+    are seen.
+
+    Raises ``ValueError`` naming the scene after ``ATTEMPTS`` such views.
+    """
+    return _sample_view(scene, settings, rng)[0]
+
+
+def _sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> tuple[View, Solids]:
+    """The view, and the search structures on its mesh that rendering has built."""
+    camera = Camera.from_fov(settings.image_size, settings.image_size, scene.workspace.fov_rad)
+    for _ in range(ATTEMPTS):
+        state = scene.sample_state(rng)
+        T_world_camera = scene.workspace.sample(rng, state.mesh.bounds.mean(axis=0))
+        mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
+        solids = Solids(mesh)
+        seen = observe(solids, camera, settings.noise_std, settings.sensor, rng)
+        if seen.object_points >= MIN_POINTS:
+            return View(mesh, seen.image, T_world_camera, state.deformations), solids
+    raise ValueError(
+        f"scene {scene.name!r} showed fewer than {MIN_POINTS} points in {ATTEMPTS} random views; "
+        "its camera workspace must see the object: check its distance and field of view"
+        + (", or weaken the sensor's errors" if settings.sensor.on else "")
+    )
+
+
+def label_queries(scene: Scene, view: View, solids: Solids, samples: Samples, normalizer: Normalizer) -> LabelledPoints:
+    """Distances, directions and rest coordinates of sampled points, normalized."""
+    nearest = solids.nearest(samples.points)
+    distance, direction = signed_distance_and_direction(solids, samples.points, samples.labels, nearest)
+    return LabelledPoints(
+        positions=normalizer.apply(samples.points),
+        labels=samples.labels,
+        distances=distance * normalizer.scale,
+        directions=direction,
+        rest=rest_coordinates(scene, view, samples, nearest),
+    )
+
+
+def rest_coordinates(scene: Scene, view: View, samples: Samples, nearest: Nearest) -> Float[np.ndarray, "q 3"]:
+    """Where inside points were before the deformation, normalized by the joint rest box; NaN for the others."""
+    inside = np.flatnonzero(samples.labels)
+    world = transform_points(view.T_world_camera, samples.points[inside])
+    guess = _rest_guess(scene.rest, view.mesh, samples.points[inside], nearest.point[inside], nearest.face[inside])
+    rest = np.full((len(samples.points), 3), np.nan)
+    # segments that move together share one deformation and are inverted in one call
+    maps = np.array([id(deformation) for deformation in view.deformations])[samples.labels[inside] - 1]
+    for deformation in {id(d): d for d in view.deformations}.values():
+        members = np.flatnonzero(maps == id(deformation))
+        if len(members):
+            found, converged = invert(deformation, world[members], guess[members])
+            rest[inside[members[converged]]] = found[converged]
+    center, half = rest_frame(scene.rest)
+    return (rest - center) / half
+
+
+def _rest_guess(
+    rest: SegmentedMesh,
+    deformed: SegmentedMesh,
+    points: Float[np.ndarray, "n 3"],
+    closest: Float[np.ndarray, "n 3"],
+    face: Int[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"]:
+    """First guess of rest positions: the closest surface point's, and the offset from it turned as its triangle was.
+
+    ``closest`` lies on ``face`` of ``deformed.merged()``. The interface of two neighbours is the same in both, so it
+    does not matter whose face it is.
+    """
+    before, faces, _ = rest.merged()
+    after, _, _ = deformed.merged()
+    old, new = before[faces[face]], after[faces[face]]
+    weights = barycentric(new, closest)
+    local = np.einsum("nji,nj->ni", _triangle_frames(new), points - closest)
+    return np.einsum("nk,nkj->nj", weights, old) + np.einsum("nij,nj->ni", _triangle_frames(old), local)
+
+
+def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """Rotations whose columns are each triangle's first edge, its normal, and the direction across."""
+    along = triangles[:, 1] - triangles[:, 0]
+    normal = np.cross(along, triangles[:, 2] - triangles[:, 0])
+    along, normal = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (along, normal))
+    return np.stack([along, normal, np.cross(along, normal)], axis=2)

@@ -1,0 +1,274 @@
+"""Where training queries are drawn: the paper's samplers, in any dimension (Henrich et al., WACV 2024, section 3.2).
+
+Notation: k is the number of points kept on each side of a segment's surface, n >= k the number drawn on each side
+before the k nearest are kept. "Inside" means in this segment; "empty" means in no segment.
+
+SortSample is defined on single draws: draw until both sides hold n. Here draws come in batches, but the draw at which
+both sides hold n ends the segment and later draws are dropped, and each segment has a random stream of its own. So the
+result does not depend on the size of a batch: it is, bit for bit, that of drawing one point at a time.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial import cKDTree
+
+from mereo.synthesis.config import SamplingConfig
+from mereo.synthesis.label_rules import Shape, owner_labels
+
+MAX_DRAWS = 2_000_000
+"""Draws for one segment after which sampling gives up: its share of its box is too small to be sampled from."""
+
+_FIRST_BATCH = 8
+"""The first batch draws this many times n; a segment usually fills a tenth to a quarter of its extended box."""
+
+_LARGEST_BATCH = 1 << 17
+
+
+class Samples(NamedTuple):
+    """Query points with labels: segment by segment, inside before outside, then the uniform ones."""
+
+    points: Float[np.ndarray, "n d"]
+    labels: UInt8[np.ndarray, " n"]
+
+
+Boxes = Float[np.ndarray, "s 2 d"]
+Label = Callable[[Float[np.ndarray, "n d"]], UInt8[np.ndarray, " n"]]
+
+
+def extended_boxes(shape: Shape, margin: float = 0.5) -> Boxes:
+    """Each segment's box, extended by ``margin`` of its size, half on each side (the paper: 50 %)."""
+    boxes = shape.boxes()
+    reach = (boxes[:, 1] - boxes[:, 0]) * margin / 2
+    return np.stack([boxes[:, 0] - reach, boxes[:, 1] + reach], axis=1)
+
+
+def joint_box(shape: Shape) -> Float[np.ndarray, "2 d"]:
+    """The box of all segments together, not extended.
+
+    The paper's "joint boundaries of all segments", read as its evaluation's "joint bounding box of all objects".
+    """
+    boxes = shape.boxes()
+    return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+
+
+def volume_uniform(shape: Shape, count: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
+    """Volume Uniform: ``count`` points per segment, uniform in its draw box, whatever they hit.
+
+    ``boxes`` [s, 2, d] are the draw boxes; by default ``extended_boxes(shape)``.
+    """
+    boxes = extended_boxes(shape) if boxes is None else boxes
+    points = np.concatenate([_uniform(box, count, rng) for box in boxes])
+    return Samples(points, shape.label(points))
+
+
+def label_uniform(shape: Shape, keep: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
+    """Label Uniform: per segment, ``keep`` points uniform inside it and ``keep`` uniform outside it in its draw box.
+
+    Points outside may lie in other segments and carry their labels. Raises ``ValueError`` as ``sort_sample``.
+    """
+    draws = _draw_all(shape, boxes, keep, shape.label, others=True, rng=rng)
+    sides = [(d.points[rows[:keep]], d.labels[rows[:keep]]) for d in draws for rows in d.sides()]
+    return _join(sides)
+
+
+def sort_sample(shape: Shape, keep: int, draw: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
+    """SortSample: per segment, the ``keep`` points nearest to its surface inside it, and as many in empty space.
+
+    Points are drawn uniformly in the segment's draw box until ``draw`` of them lie inside the segment and ``draw`` in
+    empty space; those in other segments are dropped. Where segments overlap, the first one owns the point. A segment
+    declared nested has no empty space around it: draws in those around it are its outside, with their labels.
+
+    Args:
+        shape: the object, with d-dimensional points.
+        keep: the paper's k, per side.
+        draw: the paper's n, per side, at least ``keep``; twice ``keep`` brings the points closer to the surface.
+        rng: advanced by the same amount whatever is drawn.
+        boxes: draw boxes [s, 2, d]; by default ``extended_boxes(shape)``.
+
+    Raises:
+        ValueError: a side of a segment stays short of ``draw`` points after ``MAX_DRAWS`` draws.
+    """
+    return _sort(shape, keep, draw, shape.label, others=False, rng=rng, boxes=boxes)
+
+
+def nested_sort_sample(
+    shape: Shape, keep: int, draw: int, rng: np.random.Generator, boxes: Boxes | None = None
+) -> Samples:
+    """NestedSortSample (the authors' later work): as ``sort_sample``, for organs inside organs.
+
+    A draw in another segment counts as outside and keeps that segment's label; see ``owner_labels`` for overlaps.
+    """
+    return _sort(shape, keep, draw, lambda points: owner_labels(shape, points), others=True, rng=rng, boxes=boxes)
+
+
+def sample_queries(shape: Shape, settings: SamplingConfig, rng: np.random.Generator) -> Samples:
+    """The queries of one example: ``settings.sampler``, then uniform points in ``joint_box`` (paper, section 3.2).
+
+    Returns:
+        ``settings.total(shape.count)`` points.
+
+    Raises:
+        ValueError: a setting is out of its range, or a segment cannot be sampled.
+    """
+    check_settings(settings)
+    boxes = extended_boxes(shape, settings.box_margin)
+    keep, draw = settings.per_segment // 2, settings.per_segment // 2 * settings.oversample
+    near = {
+        "volume-uniform": lambda: volume_uniform(shape, settings.per_segment, rng, boxes),
+        "label-uniform": lambda: label_uniform(shape, keep, rng, boxes),
+        "sort-sample": lambda: sort_sample(shape, keep, draw, rng, boxes),
+        "nested-sort-sample": lambda: nested_sort_sample(shape, keep, draw, rng, boxes),
+    }[settings.sampler]()
+    spread = _uniform(joint_box(shape), settings.total(shape.count) - len(near.points), rng)
+    nested = settings.sampler == "nested-sort-sample"
+    labels = owner_labels(shape, spread) if nested else shape.label(spread)
+    return Samples(np.concatenate([near.points, spread]), np.concatenate([near.labels, labels]))
+
+
+def check_settings(settings: SamplingConfig) -> None:
+    """Raise ``ValueError`` naming the setting, its rule and the cure."""
+    if settings.per_segment < 2 or settings.per_segment % 2:
+        raise ValueError(
+            f"per_segment is {settings.per_segment}; half the points go inside and half outside: pass an even number"
+        )
+    if settings.oversample < 1:
+        raise ValueError(f"oversample is {settings.oversample}; it is n / k and at least 1: pass 1 or 2")
+    if not settings.box_margin > 0:
+        raise ValueError(
+            f"box_margin is {settings.box_margin}; boxes must reach beyond their segments: pass a fraction, as 0.5"
+        )
+    if not settings.uniform_fraction >= 0:
+        raise ValueError(f"uniform_fraction is {settings.uniform_fraction}; it cannot be negative: pass 0 or 0.15")
+
+
+class _Draws:
+    """The draws for one segment, up to the one at which both sides hold ``need``."""
+
+    def __init__(self, index: int, box: Float[np.ndarray, "2 d"], need: int, outside: np.ndarray, seed: np.ndarray):
+        self.index, self.box, self.need, self.outside = index, box, need, outside
+        self.rng = np.random.default_rng(seed)
+        self.points = np.empty((0, box.shape[1]))
+        self.labels = np.empty(0, dtype=np.uint8)
+        self.fewest = 0
+
+    def sides(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of the draws inside the segment and of those that count as outside, in drawing order."""
+        return np.flatnonzero(self.labels == self.index + 1), np.flatnonzero(self.outside[self.labels])
+
+    def next_batch(self) -> Float[np.ndarray, "b d"]:
+        """About as many draws as are still missing, from the hit rate so far; at most four times those made."""
+        drawn = len(self.points)
+        size = _FIRST_BATCH * self.need
+        if drawn:
+            size = min(int(1.2 * (self.need - self.fewest) * drawn / (self.fewest + 1)) + 1, 4 * drawn)
+        return _uniform(self.box, min(size, _LARGEST_BATCH, MAX_DRAWS - drawn), self.rng)
+
+    def add(self, points: Float[np.ndarray, "b d"], labels: UInt8[np.ndarray, " b"]) -> bool:
+        """Take a batch; True when the segment is done, and then drop what was drawn after its last draw."""
+        self.points, self.labels = np.concatenate([self.points, points]), np.concatenate([self.labels, labels])
+        inside, outside = self.sides()
+        self.fewest = min(len(inside), len(outside))
+        if self.fewest < self.need:
+            self._check_limit(len(inside), len(outside))
+            return False
+        stop = max(inside[self.need - 1], outside[self.need - 1]) + 1
+        self.points, self.labels = self.points[:stop], self.labels[:stop]
+        return True
+
+    def _check_limit(self, inside: int, outside: int) -> None:
+        if len(self.points) < MAX_DRAWS:
+            return
+        found, where = inside, "inside it"
+        cure = "check that it is closed and no earlier segment covers it, or split it into shorter parts"
+        if inside >= self.need:
+            found, where = outside, "outside it" if self.outside.sum() > 1 else "in the empty space around it"
+            cure = "widen box_margin, or use nested-sort-sample for a segment enclosed by others"
+        raise ValueError(
+            f"segment {self.index} has {found} of {MAX_DRAWS:,} draws {where}; {self.need} are needed: {cure}"
+        )
+
+
+def _draw_all(
+    shape: Shape, boxes: Boxes | None, need: int, label: Label, others: bool, rng: np.random.Generator
+) -> list[_Draws]:
+    """Draw for all segments at once: one large call of ``label`` per round, two to four rounds in all."""
+    boxes = extended_boxes(shape) if boxes is None else boxes
+    # a stream per segment: how many draws one segment's batches hold changes no other segment's points
+    seeds = rng.integers(0, 2**32, size=(shape.count, 4), dtype=np.uint32)
+    outside = _outside(shape, others)
+    draws = [_Draws(i, boxes[i], need, outside[i], seeds[i]) for i in range(shape.count)]
+    pending = draws
+    while pending:
+        batches = [d.next_batch() for d in pending]
+        ends = np.cumsum([len(batch) for batch in batches])[:-1]
+        labels = np.split(label(np.concatenate(batches)), ends)
+        pending = [d for d, b, part in zip(pending, batches, labels, strict=True) if not d.add(b, part)]
+    return draws
+
+
+def _outside(shape: Shape, others: bool) -> Bool[np.ndarray, "s c"]:
+    """For each segment which labels count as outside it: empty space, what it is nested in, and maybe all others."""
+    table = np.full((shape.count, shape.count + 1), others)
+    table[:, 0] = True
+    for inner, outer in shape.nesting:
+        table[inner, outer + 1] = True
+    table[np.arange(shape.count), np.arange(shape.count) + 1] = False
+    return table
+
+
+def _sort(
+    shape: Shape, keep: int, draw: int, label: Label, others: bool, rng: np.random.Generator, boxes: Boxes | None
+) -> Samples:
+    if not 1 <= keep <= draw:
+        raise ValueError(f"keep is {keep} and draw is {draw}; at least as many are drawn as kept: pass keep <= draw")
+    sides = []
+    for d in _draw_all(shape, boxes, draw, label, others, rng):
+        for rows in d.sides():
+            near = rows[_nearest_rows(shape, d.index, d.points[rows], keep)]
+            sides.append((d.points[near], d.labels[near]))
+    return _join(sides)
+
+
+def _nearest_rows(shape: Shape, index: int, points: Float[np.ndarray, "n d"], keep: int) -> np.ndarray:
+    """Rows of the ``keep`` points nearest to segment ``index``'s surface, in the order given; exact.
+
+    Distances dominate data generation, so most are avoided: a point is no nearer to the surface than to its box, and a
+    distance grows by at most the way travelled, so a point ``gap`` away from one of known distance is no nearer than
+    that distance minus ``gap``. The points nearest to the box are measured first and the others in the order of their
+    bound, until it exceeds the distance of the keep-th nearest.
+    """
+    if len(points) <= keep:
+        return np.arange(len(points))
+    low, high = shape.boxes()[index]
+    to_box = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
+    known = np.argsort(to_box, kind="stable")[: 2 * keep]
+    distance = np.full(len(points), np.inf)
+    distance[known] = shape.segment_distance(index, points[known])
+    rest = np.flatnonzero(np.isinf(distance) & (to_box <= _keep_th(distance, keep)))
+    if len(rest):
+        gap, pivot = cKDTree(points[known]).query(points[rest])
+        bound = np.maximum(distance[known][pivot] - gap, to_box[rest])
+        rest, bound = rest[np.argsort(bound)], np.sort(bound)
+    while len(rest):
+        chunk = rest[: min(keep, int(np.searchsorted(bound, _keep_th(distance, keep))))]
+        if len(chunk) == 0:
+            break
+        distance[chunk] = shape.segment_distance(index, points[chunk])
+        rest, bound = rest[len(chunk) :], bound[len(chunk) :]
+    return np.sort(np.argpartition(distance, keep - 1)[:keep])
+
+
+def _keep_th(distance: Float[np.ndarray, " n"], keep: int) -> float:
+    return float(np.partition(distance, keep - 1)[keep - 1])
+
+
+def _join(sides: list[tuple[np.ndarray, np.ndarray]]) -> Samples:
+    return Samples(np.concatenate([points for points, _ in sides]), np.concatenate([labels for _, labels in sides]))
+
+
+def _uniform(box: Float[np.ndarray, "2 d"], count: int, rng: np.random.Generator) -> Float[np.ndarray, "n d"]:
+    low, high = box
+    return low + rng.random((count, len(low))) * (high - low)

@@ -1,0 +1,267 @@
+"""Many examples on disk: shards of 64, each written whole or not at all, the same bits for any number of workers.
+
+Example i comes from (seed, i) alone. A dataset is a directory with ``manifest.json``, everything needed to make it
+again, and ``shard-00000.safetensors`` and so on, whose tensors are (e examples, p stored points, q queries):
+
+    cloud f32 [e, p, 3], cloud_count i32 [e], center f64 [e, 3], scale f64 [e],
+    positions f32 [e, q, 3], labels u8 [e, q], distances f32 [e, q], directions f16 [e, q, 3], rest f16 [e, q, 3]
+
+and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``rest_pose``).
+
+Workers only compute; this process alone writes. So one place meets a full disk, and whatever kills a worker leaves
+nothing half-written.
+"""
+
+import hashlib
+import json
+import platform
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from mereo.io.atomic_files import atomic_file, write_json
+from mereo.scenes.registry import is_yaml, load_scene
+from mereo.scenes.rest_pose import rest_distances
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import TEMPLATE, GenerateConfig
+from mereo.synthesis.depth_sensor import check_sensor
+from mereo.synthesis.examples import Example, synthesize
+from mereo.synthesis.progress import progress
+from mereo.synthesis.query_sampling import check_settings
+from mereo.synthesis.workers import in_processes
+
+SHARD_SIZE = 64
+MANIFEST = "manifest.json"
+LIBRARIES = ("numpy", "scipy", "embreex", "libigl", "manifold3d", "trimesh")
+"""Their versions are in the manifest: others may move last bits, but make no other dataset."""
+
+NOT_COMPARED = ("libraries", "bytes")
+"""Manifest entries that may differ when a dataset is resumed."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What all shards of a dataset have in common; a scene made by code is sent to workers by its name or file."""
+
+    scene: str | Scene
+    settings: GenerateConfig
+    seed: int
+
+
+@dataclass(frozen=True)
+class _Shard:
+    """One file: examples ``first`` up to ``end``, without the end."""
+
+    path: Path
+    first: int
+    end: int
+
+    def is_complete(self) -> bool:
+        """Whether the file is there with all its examples; a file cut off by a crashed machine is reported."""
+        try:
+            with safe_open(self.path, framework="numpy") as file:
+                if file.get_slice("labels").get_shape()[0] == self.end - self.first:
+                    return True
+        except FileNotFoundError:
+            return False
+        except (SafetensorError, OSError):
+            pass
+        print(f"{self.path.name} is damaged and is made again", flush=True)
+        return False
+
+
+def generate(
+    scene: str | Scene,
+    output: Path,
+    settings: GenerateConfig,
+    *,
+    examples: int,
+    seed: int,
+    workers: int = 1,
+    shard: tuple[int, int] = (0, 1),
+    resume: bool = False,
+    test: bool = False,
+) -> None:
+    """Make ``examples`` labelled examples of a scene in the directory ``output``.
+
+    Args:
+        scene: a built-in scene's name, a scene file, or a scene (which workers must be able to unpickle).
+        output: created; with ``resume`` its complete shards are kept and the missing ones made.
+        settings: how one example is made.
+        seed: seeds from ``TEST_SEED_START`` up are for testing and need ``test``, which refuses smaller ones.
+        workers: processes; the files do not depend on their number. More than one needs a main module that can be
+            imported (``if __name__ == "__main__":``).
+        shard: ``(i, n)`` makes every n-th file from the i-th on, to share the work between machines; they may all
+            write to one directory.
+
+    Raises:
+        ValueError: a number or setting out of its range, a seed of the wrong kind, ``resume`` with other settings.
+        FileExistsError: ``output`` holds something and ``resume`` is not set.
+        OSError: the disk is full; complete shards are kept. ``ChildProcessError`` where a worker was killed.
+    """
+    _check_request(examples, seed, workers, shard, test)
+    check_settings(settings.sampling)
+    check_sensor(settings.sensor)
+    loaded = load_scene(scene) if isinstance(scene, str) else scene
+    manifest = make_manifest(loaded, settings, examples, seed)
+    shards = [
+        _Shard(output / f"shard-{n:05d}.safetensors", n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
+        for n in range(shard[0], -(-examples // SHARD_SIZE), shard[1])
+    ]
+    _claim_directory(output, manifest, shards, resume, alone=shard[1] == 1)
+    if not (output / TEMPLATE).exists():
+        with atomic_file(output / TEMPLATE) as temporary:
+            temporary.write_bytes(save({"distance": rest_distances(loaded.rest)}))
+    missing = [item for item in shards if not item.is_complete()]
+    total = sum(item.end - item.first for item in missing)
+    # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile
+    work = partial(_make_shard, _Work(loaded if is_yaml(scene) else scene, settings, seed))
+    with closing(in_processes(work, missing, workers)) as made, progress(total) as advance:
+        for item, data in made:
+            with atomic_file(item.path) as temporary:
+                temporary.write_bytes(data)
+            advance(item.end - item.first)
+
+
+def _check_request(examples: int, seed: int, workers: int, shard: tuple[int, int], test: bool) -> None:
+    if examples < 1:
+        raise ValueError(f"--examples is {examples}; it must be at least 1: ask for some")
+    if workers < 1:
+        raise ValueError(f"the number of workers is {workers}; it must be at least 1: pass 1, or one per core")
+    if not 0 <= shard[0] < shard[1]:
+        raise ValueError(f"the shard is {shard[0]}/{shard[1]}; i/n needs i from 0 to n - 1: pass for example 0/4")
+    if seed < 0:
+        raise ValueError(f"--seed is {seed}; it must not be negative: choose from 0 to {TEST_SEED_START - 1}")
+    if seed >= TEST_SEED_START and not test:
+        raise ValueError(
+            f"--seed is {seed}; seeds from {TEST_SEED_START} up are for testing and never for training: "
+            "choose a smaller one, or pass --test to make a test set"
+        )
+    if test and seed < TEST_SEED_START:
+        raise ValueError(
+            f"--seed is {seed}; a test set needs one from {TEST_SEED_START} up, which training never uses: choose one"
+        )
+
+
+# --- the directory ----------------------------------------------------------------------------------------------------
+
+
+def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: int) -> dict[str, Any]:
+    """Everything that decides the dataset, and what training needs to know of the scene, as JSON values."""
+    digest = hashlib.sha256()
+    for segment in scene.rest.segments:
+        for array, dtype in ((segment.vertices, "<f8"), (segment.faces, "<i8")):
+            digest.update(np.ascontiguousarray(array, dtype=dtype).tobytes())
+    manifest = {
+        "scene": scene.name,
+        "source": scene.source,
+        "segments": [{"name": s.name, "color": s.color} for s in scene.rest.segments],
+        "nested": scene.rest.nested,
+        "any_roll": scene.workspace.any_roll,
+        "workspace": asdict(scene.workspace),
+        "settings": asdict(settings),
+        "seed": seed,
+        "examples": examples,
+        "shard_size": SHARD_SIZE,
+        "rest_sha256": digest.hexdigest(),
+        "scene_file_sha256": hashlib.sha256(scene.definition.encode()).hexdigest() if scene.definition else None,
+        "unit_m": scene.unit_m,
+        "version": version("mereo"),
+        "libraries": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "bytes": examples * example_bytes(settings, len(scene.rest.segments)),
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(manifest))
+    return plain
+
+
+def example_bytes(settings: GenerateConfig, segments: int) -> int:
+    """Size of one example, on disk and in memory."""
+    per_point, per_query, once = 12, 12 + 1 + 4 + 6 + 6, 4 + 24 + 8
+    return per_point * settings.points + per_query * settings.sampling.total(segments) + once
+
+
+def _claim_directory(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> None:
+    """Create the directory with its manifest, or check that it is this very dataset; other machines' shards may come.
+
+    What a killed run was writing is removed, of this part's shards only.
+    """
+    path = output / MANIFEST
+    if output.exists() and not output.is_dir():
+        raise FileExistsError(f"{output} is a file; a dataset is a directory: choose another --output")
+    if path.is_file():
+        if not resume and (alone or any(item.path.exists() for item in shards)):
+            raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
+        _check_same(path, manifest)
+    elif output.is_dir() and any(not file.name.startswith(".") for file in output.iterdir()):
+        raise FileExistsError(f"{output} is not empty and holds no {MANIFEST}; choose another --output")
+    else:
+        write_json(path, manifest)
+    for item in shards:
+        for leftover in output.glob(f".{item.path.stem}.*.partial*"):
+            leftover.unlink(missing_ok=True)
+
+
+def _check_same(path: Path, manifest: dict[str, Any]) -> None:
+    try:
+        before = json.loads(path.read_text("utf-8"))
+    except ValueError:
+        before = None
+    if not isinstance(before, dict):
+        raise ValueError(f"{path} is not a manifest; it cannot be resumed: choose another --output")
+    # a manifest of an older version may not state everything; settings it lacks were as their defaults are
+    before = _flat({"settings": asdict(GenerateConfig())}) | _flat(before)
+    for key, now in _flat(manifest).items():
+        if before.get(key, now) != now:
+            raise ValueError(
+                f"{path.parent} was made with {key} = {before[key]!r}, not {now!r}; resuming needs equal settings: "
+                "use them, or choose another --output"
+            )
+
+
+def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as ``settings.sampling.sampler`` and so on."""
+    flat: dict[str, Any] = {}
+    for key, item in value.items():
+        if key not in NOT_COMPARED:
+            flat |= _flat(item, f"{prefix}{key}.") if isinstance(item, dict) else {prefix + key: item}
+    return flat
+
+
+# --- the work ---------------------------------------------------------------------------------------------------------
+
+
+def _make_shard(work: _Work, shard: _Shard, cancelled: Callable[[], bool]) -> bytes:
+    """The shard's file content; nothing when cancelled, which is asked before every example."""
+    loaded = load_scene(work.scene) if isinstance(work.scene, str) else work.scene
+    scene = loaded.for_seed(work.seed)
+    rows = []
+    for index in range(shard.first, shard.end):
+        if cancelled():
+            return b""
+        rows.append(pack(synthesize(scene, work.settings, example_rng(work.seed, index)), work.settings.points))
+    return save({key: np.stack([row[key] for row in rows]) for key in rows[0]})
+
+
+def pack(example: Example, points: int) -> dict[str, np.ndarray]:
+    """One row of each tensor of a shard; clouds with fewer points repeat theirs from the front."""
+    count, queries = len(example.cloud), example.queries
+    return {
+        "cloud": example.cloud[np.arange(points) % count].astype(np.float32),
+        "cloud_count": np.array(count, dtype=np.int32),
+        "center": example.normalizer.center.astype(np.float64),
+        "scale": np.array(example.normalizer.scale, dtype=np.float64),
+        "positions": queries.positions.astype(np.float32),
+        "labels": queries.labels.astype(np.uint8),
+        "distances": queries.distances.astype(np.float32),
+        "directions": queries.directions.astype(np.float16),
+        "rest": queries.rest.astype(np.float16),
+    }

@@ -1,0 +1,1 @@
+"""Dataset, losses, the loop, its directory, and released weights."""

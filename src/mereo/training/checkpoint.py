@@ -1,0 +1,60 @@
+"""Checkpoints of a training run as safetensors: network, averaged network, optimizer and step. No pickles."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from mereo.io.atomic_files import atomic_file
+
+NAME = "checkpoint.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """The objects whose state makes a run resumable; loading fills them in place."""
+
+    step: int
+    network: nn.Module
+    average: nn.Module
+    optimizer: torch.optim.Optimizer
+
+
+def save_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> None:
+    """Write atomically, so that a killed run keeps its previous checkpoint."""
+    tensors: dict[str, Tensor] = {}
+    for prefix, module in (("network", checkpoint.network), ("average", checkpoint.average)):
+        tensors |= {f"{prefix}/{name}": value.contiguous() for name, value in module.state_dict().items()}
+    for index, state in checkpoint.optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer/{index}/{name}": value.contiguous() for name, value in state.items()}
+    with atomic_file(run_dir / NAME) as partial:
+        partial.write_bytes(save(tensors, metadata={"step": str(checkpoint.step)}))
+
+
+def load_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> int | None:
+    """Fill network, average and optimizer; returns the step, or None when there is no checkpoint yet."""
+    path = run_dir / NAME
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(path, framework="pt") as file:
+            step = int((file.metadata() or {})["step"])
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, OSError, KeyError) as error:
+        raise ValueError(f"{path} cannot be read ({error}); delete it to train from the start") from None
+    for prefix, module in (("network", checkpoint.network), ("average", checkpoint.average)):
+        module.load_state_dict(_below(tensors, prefix + "/"))
+    states: dict[int, dict[str, Tensor]] = {}
+    for name, value in _below(tensors, "optimizer/").items():
+        index, key = name.split("/")
+        states.setdefault(int(index), {})[key] = value
+    groups = checkpoint.optimizer.state_dict()["param_groups"]
+    checkpoint.optimizer.load_state_dict({"state": states, "param_groups": groups})
+    return step
+
+
+def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -1,0 +1,238 @@
+"""Generated examples in memory, and the training batches drawn from them.
+
+Notation: e examples, b of them in a batch, p stored points, n points that the network sees, q queries.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.synthesis.config import TEMPLATE
+from mereo.training.config import AugmentConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What one training step reads; all normalized by the (augmented) cloud.
+
+    ``index`` says which of the dataset's examples they are; ``rest`` are rest-pose coordinates
+    (``synthesis.LabelledPoints``), NaN outside.
+    """
+
+    index: Int[Tensor, " b"]
+    cloud: Float[Tensor, "b n 3"]
+    viewpoint: Float[Tensor, "b 3"]
+    positions: Float[Tensor, "b q 3"]
+    labels: Int[Tensor, "b q"]
+    distances: Float[Tensor, "b q"]
+    directions: Float[Tensor, "b q 3"]
+    rest: Float[Tensor, "b q 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """All examples of a directory written by ``mereo generate``.
+
+    Attributes:
+        cloud: observed points in farthest-point order; only the first ``count`` of each are real.
+        viewpoint: the camera's position in normalized coordinates.
+        manifest: how the dataset was made.
+        template: signed distances to the segments at rest (``rest_pose.rest_distances``); None in older datasets.
+        visible_m: least and greatest longest side of the visible part's box in metres; None where the unit is unknown.
+    """
+
+    cloud: Float[Tensor, "e p 3"]
+    count: Int[Tensor, " e"]
+    viewpoint: Float[Tensor, "e 3"]
+    positions: Float[Tensor, "e q 3"]
+    labels: UInt8[Tensor, "e q"]
+    distances: Float[Tensor, "e q"]
+    directions: Float[Tensor, "e q 3"]
+    rest: Float[Tensor, "e q 3"]
+    manifest: dict[str, Any]
+    template: Float[Tensor, "s n n n"] | None = None
+    visible_m: tuple[float, float] | None = None
+
+    def __len__(self) -> int:
+        return len(self.cloud)
+
+    @classmethod
+    def load(cls, directory: Path, device: torch.device | str = "cpu") -> "Dataset":
+        """Read every shard; ``ValueError`` or ``FileNotFoundError`` when the directory is not a whole dataset."""
+        manifest = read_manifest(directory)
+        shards = sorted(directory.glob("shard-*.safetensors"))
+        parts = [_read_shard(path) for path in shards]
+        have = sum(len(part["cloud"]) for part in parts)
+        if have != manifest["examples"]:
+            raise ValueError(
+                f"{directory} holds {have} of {manifest['examples']} examples; training needs all of them: "
+                "finish it with mereo generate ... --resume"
+            )
+        queries = ("positions", "labels", "distances", "directions", "rest")
+        joined = {}
+        for key in ("cloud", "cloud_count", "center", "scale", *queries):
+            joined[key] = torch.cat([part.pop(key) for part in parts]).to(device)
+        viewpoint = (-joined["center"] * joined["scale"][:, None]).float()
+        return cls(
+            cloud=joined["cloud"],
+            count=joined["cloud_count"].long(),
+            viewpoint=viewpoint,
+            **{key: joined[key] for key in queries},
+            manifest=manifest,
+            template=_read_template(directory),
+            visible_m=_visible_m(joined["scale"], manifest.get("unit_m")),
+        )
+
+    @property
+    def uniform_queries(self) -> int:
+        """How many queries of an example, its last ones, are uniform in the joint box."""
+        near: int = self.manifest["settings"]["sampling"]["per_segment"] * len(self.manifest["segments"])
+        return self.positions.shape[1] - near
+
+    def domain(self, margin: float = 0.15) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Lower and upper corner of where segments occur in the normalized training data, widened on each side.
+
+        Beyond it the network has hardly been told anything, so a model answers "empty" there.
+        """
+        occupied = self.positions[self.labels > 0]
+        low, high = occupied.amin(dim=0), occupied.amax(dim=0)
+        widen = margin * (high - low)
+        (x0, y0, z0), (x1, y1, z1) = (low - widen).tolist(), (high + widen).tolist()
+        return (x0, y0, z0), (x1, y1, z1)
+
+    def batch(
+        self,
+        index: Int[Tensor, " b"],
+        points: int,
+        queries: int,
+        augment: AugmentConfig,
+        rng: torch.Generator,
+    ) -> Batch:
+        """Examples ``index`` with ``points`` cloud points and a random ``queries`` of their queries (0: all).
+
+        The random numbers come from ``rng`` (on the CPU), so a batch depends on nothing else.
+        """
+        device = self.cloud.device
+        index = index.to(device)
+        total = self.positions.shape[1]
+        rows = index[:, None]
+        chosen: Tensor | slice = slice(None)
+        if 0 < queries < total:
+            order = torch.rand(len(index), total, generator=rng).topk(queries, dim=1).indices
+            chosen = order.to(device)
+        else:
+            rows = index
+        cloud = choose_points(self.cloud[index], self.count[index], points, augment, rng)
+        batch = Batch(
+            index=index,
+            cloud=cloud,
+            viewpoint=self.viewpoint[index],
+            positions=self.positions[rows, chosen],
+            labels=self.labels[rows, chosen].long(),
+            distances=self.distances[rows, chosen],
+            directions=self.directions[rows, chosen].float(),
+            rest=self.rest[rows, chosen].float(),
+        )
+        return augment_batch(batch, augment, rng)
+
+
+def read_manifest(directory: Path) -> dict[str, Any]:
+    """The dataset's manifest; one sentence on what is wrong otherwise."""
+    path = directory / "manifest.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{directory} has no manifest.json; a dataset is a directory made by mereo generate")
+    try:
+        manifest: dict[str, Any] = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is not valid JSON ({error}); generate the dataset again") from None
+    return manifest
+
+
+def _read_shard(path: Path) -> dict[str, Tensor]:
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path} cannot be read ({error}); delete it and run mereo generate ... --resume") from None
+
+
+def _visible_m(scale: Float[Tensor, " e"], unit_m: float | None) -> tuple[float, float] | None:
+    """From the normalizers' scales, which are one over half the longest side."""
+    return None if unit_m is None else (2 * unit_m / float(scale.max()), 2 * unit_m / float(scale.min()))
+
+
+def _read_template(directory: Path) -> Tensor | None:
+    path = directory / TEMPLATE
+    return _read_shard(path)["distance"].float() if path.is_file() else None
+
+
+def choose_points(
+    cloud: Float[Tensor, "b p 3"],
+    count: Int[Tensor, " b"],
+    points: int,
+    augment: AugmentConfig,
+    rng: torch.Generator,
+) -> Float[Tensor, "b n 3"]:
+    """The first ``points`` real points of each cloud that survive dropping, repeated from the front where too few.
+
+    What remains of a farthest-point order is still in order, and nearly a farthest-point order of what remains.
+    """
+    batch, stored, _ = cloud.shape
+    device = cloud.device
+    low, high = augment.keep_points
+    keep = low + (high - low) * torch.rand(batch, 1, generator=rng)
+    dropped = (torch.rand(batch, stored, generator=rng) >= keep).to(device)
+    hole = (torch.rand(batch, generator=rng) < augment.hole_probability).to(device)
+    radius = (augment.hole_radius * torch.rand(batch, 1, generator=rng)).to(device)
+    center_index = (torch.rand(batch, generator=rng).to(device) * count).long()
+    center = cloud[torch.arange(batch, device=device), center_index]
+    dropped |= hole[:, None] & ((cloud - center[:, None]).norm(dim=-1) < radius)
+    position = torch.arange(stored, device=device)
+    padding = position >= count[:, None]
+    # a cloud that loses nearly everything is left as it is: there would be nothing to reconstruct from
+    dropped &= (~dropped & ~padding).sum(dim=1, keepdim=True) >= MIN_POINTS
+    unwanted = dropped | padding
+    order = (position + stored * unwanted).argsort(dim=1)
+    left = (~unwanted).sum(dim=1, keepdim=True)
+    slot = torch.arange(points, device=device) % left.clamp(max=points)
+    return cloud.gather(1, order.gather(1, slot)[..., None].expand(-1, -1, 3))
+
+
+def augment_batch(batch: Batch, augment: AugmentConfig, rng: torch.Generator) -> Batch:
+    """Jitter along the view, roll about the optical axis, and normalize again by the changed cloud.
+
+    The optical axis passes through the viewpoint, so rolling about it is a rotation about z around the viewpoint.
+    """
+    count, device = len(batch.cloud), batch.cloud.device
+    jitter = (
+        augment.jitter_std * torch.rand(count, 1, generator=rng) * torch.randn(batch.cloud.shape[:2], generator=rng)
+    )
+    angle = 2 * torch.pi * torch.rand(count, generator=rng) if augment.roll else torch.zeros(count)
+    cosine, sine = angle.cos().to(device), angle.sin().to(device)
+    zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)
+    roll = torch.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one], dim=-1).view(count, 3, 3)
+    origin = batch.viewpoint[:, None]
+    # depth noise moves a point along its ray: p = v + (p - v) * (z + noise) / z
+    rays = batch.cloud - origin
+    rays = rays * (1 + jitter.to(device) / rays[..., 2])[..., None]
+    cloud = rays @ roll.transpose(1, 2)
+    positions = (batch.positions - origin) @ roll.transpose(1, 2)
+    low, high = cloud.amin(dim=1), cloud.amax(dim=1)
+    center, scale = (low + high) / 2, 2 / (high - low).amax(dim=1)
+    return Batch(
+        index=batch.index,
+        cloud=(cloud - center[:, None]) * scale[:, None, None],
+        viewpoint=-center * scale[:, None],
+        positions=(positions - center[:, None]) * scale[:, None, None],
+        labels=batch.labels,
+        distances=batch.distances * scale[:, None],
+        directions=batch.directions @ roll.transpose(1, 2),
+        rest=batch.rest,
+    )

@@ -1,0 +1,110 @@
+"""The record of a training run: metrics.csv, curves.png, and TensorBoard events where the extra is installed."""
+
+import csv
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+from mereo.io.atomic_files import atomic_file
+
+FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "code", "val_iou", "val_miou")
+Row = dict[str, float]
+
+
+class MetricsLog:
+    """One row per step in memory; ``write`` puts all of them on disk.
+
+    Rows up to the checkpoint are read back when a run continues, so the file equals that of an uninterrupted run.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self.run_dir = run_dir
+        self.rows: list[Row] = []
+        self.board = _tensorboard(run_dir)
+
+    def add_step(self, step: int, rate: float, losses: dict[str, float]) -> None:
+        """``losses`` are the total under "loss" and its terms."""
+        self._add({"step": step, "rate": rate, **losses})
+
+    def add_validation(self, step: int, iou: float, miou: float) -> None:
+        """Validation of the state after ``step``: joins the row of that step. An undefined mIoU (NaN) is left out."""
+        scores = {name: value for name, value in (("val_iou", iou), ("val_miou", miou)) if not math.isnan(value)}
+        self.rows[-1] |= scores
+        self._to_board({"step": step, **scores})
+
+    def _add(self, row: Row) -> None:
+        self.rows.append(row)
+        self._to_board(row)
+
+    def _to_board(self, row: Row) -> None:
+        if self.board is not None:
+            for name, value in row.items():
+                self.board.add_scalar(name, value, int(row["step"]))
+
+    def summary(self) -> str:
+        """The latest numbers in one line."""
+        shown = {k: v for k, v in self.rows[-1].items() if k not in ("step", "rate")}
+        return "  ".join(f"{name} {value:.4f}" for name, value in shown.items())
+
+    def write(self) -> None:
+        """metrics.csv and curves.png, each atomically."""
+        text = io.StringIO()
+        writer = csv.DictWriter(text, FIELDS, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({k: _exact(k, v) for k, v in row.items()} for row in self.rows)
+        with atomic_file(self.run_dir / "metrics.csv") as temporary:
+            temporary.write_text(text.getvalue())
+        with atomic_file(self.run_dir / "curves.png") as temporary:
+            draw_curves(self.rows, temporary)
+
+    def read_until(self, step: int) -> None:
+        """Take up the rows of the steps that the checkpoint includes."""
+        path = self.run_dir / "metrics.csv"
+        if not path.is_file():
+            return
+        with path.open(newline="") as file:
+            rows = [{k: float(v) for k, v in row.items() if v != ""} for row in csv.DictReader(file)]
+        self.rows = [row for row in rows if row["step"] <= step]
+
+
+def _exact(name: str, value: float) -> str:
+    return str(int(value)) if name == "step" else repr(value)
+
+
+def _tensorboard(run_dir: Path) -> Any:
+    """A TensorBoard writer where the extra `track` is installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(run_dir / "tensorboard"))
+
+
+def draw_curves(rows: list[Row], path: Path) -> None:
+    """Loss terms (running median, logarithmic) and validation scores against the step."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    for name in ("loss", "ce", "l1"):
+        points = [(row["step"], row[name]) for row in rows if row.get(name, 0) > 0]
+        if points:
+            steps, values = zip(*points, strict=True)
+            window = max(1, len(values) // 100)
+            smooth = [sorted(values[i : i + window])[window // 2] for i in range(len(values) - window + 1)]
+            left.plot(steps[window - 1 :], smooth, label=name)
+    left.set(yscale="log", xlabel="step", title="training loss (running median)")
+    left.legend()
+    for name, label in (("val_iou", "IoU"), ("val_miou", "mIoU")):
+        points = [(row["step"], row[name]) for row in rows if name in row]
+        if points:
+            right.plot(*zip(*points, strict=True), marker=".", label=label)
+            right.annotate(f"{points[-1][1]:.3f}", points[-1])
+    right.set(xlabel="step", ylim=(0, 1), title="held-out queries")
+    if right.lines:
+        right.legend()
+    figure.savefig(path, dpi=110, format="png")
+    plt.close(figure)

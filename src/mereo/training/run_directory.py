@@ -1,0 +1,175 @@
+"""A training run's processes, settings and directory."""
+
+import json
+import os
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from mereo.io.atomic_files import write_json
+from mereo.models.config import NetworkConfig
+from mereo.models.encoders.autodecoder import Autodecoder
+from mereo.models.network import Network
+from mereo.models.weights import load_model
+from mereo.synthesis.config import TEMPLATE
+from mereo.training.config import AugmentConfig, TrainConfig
+from mereo.training.dataset import Dataset
+
+
+@dataclass(frozen=True)
+class Process:
+    """This process's place among those that train together."""
+
+    rank: int = 0
+    world: int = 1
+
+    @property
+    def is_main(self) -> bool:
+        return self.rank == 0
+
+
+def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
+    """Settings that the dataset decides: how much can be held out, and whether a roll keeps a view plausible.
+
+    Raises ``ValueError`` for settings with which an autodecoder cannot be trained.
+    """
+    if config.network.encoder == "autodecoder":
+        _check_autodecoder(config)
+    holdout = min(config.holdout, len(data) // 10)
+    augment = replace(config.augment, roll=config.augment.roll and bool(data.manifest["any_roll"]))
+    return replace(config, holdout=holdout, augment=augment)
+
+
+def _check_autodecoder(config: TrainConfig) -> None:
+    if "l1" not in config.loss:
+        raise ValueError(
+            f"the loss is {config.loss!r}, but an autodecoder finds the code of a cloud by its distances, which only "
+            "the L1 term trains; take --loss l1, ce+l1 or ce+l1+cd"
+        )
+    if config.augment != AugmentConfig():
+        raise ValueError(
+            "an autodecoder has one code per training example, and augmentation makes another example of it each "
+            "time; train without, as the preset paper-autodecoder does"
+        )
+
+
+def start_network(config: TrainConfig, data: Dataset) -> Network:
+    """A network to train: random from the seed, or with the weights that ``config.init`` names.
+
+    Weights that know other segments give all that is not about segments (docs/design/0002-learning.md). An
+    autodecoder gets a random code for each example that is not held out. Raises ``ValueError`` when the weights are of
+    another architecture.
+    """
+    names = tuple(segment["name"] for segment in data.manifest["segments"])
+    torch.manual_seed(config.seed)
+    network = Network(config.network, len(names))
+    if config.init:
+        start = load_model(config.init)
+        _check_architecture(start.network.config, config)
+        given = start.network.state_dict()
+        if start.names != names:
+            given = _without_segments(given, network)
+        network.load_state_dict(network.state_dict() | given)
+    if isinstance(network.encoder, Autodecoder):
+        network.encoder.add_codes(len(data) - config.holdout)
+    lookup = network.decoder.lookup
+    if lookup is not None:
+        if data.template is None:
+            raise ValueError(
+                f"the dataset has no {TEMPLATE}, which this network reads; an older mereo made it: continue it with "
+                "mereo generate ... --resume, or train with --network.no-rest-template"
+            )
+        lookup.distance.copy_(data.template)
+    return network
+
+
+COUNTS = ("points", "neighbors", "ratio1", "ratio2", "local_neighbors", "sight_neighbors", "align_points")
+"""Network settings that say how many points are looked at: weights trained with one number run with another."""
+
+
+def _check_architecture(start: NetworkConfig, config: TrainConfig) -> None:
+    """Only the template lookup, which begins as nothing, may be new, and counts differ that both have."""
+    ours = config.network
+    counts = {name: getattr(ours, name) for name in COUNTS if getattr(start, name) and getattr(ours, name)}
+    known = replace(start, rest_template=start.rest_template or ours.rest_template, **counts)
+    odd = [f.name for f in fields(known) if getattr(known, f.name) != getattr(ours, f.name)]
+    if odd:
+        raise ValueError(
+            f"the weights {config.init} have another network setting {odd[0]}; continuing needs the same "
+            "network: use the preset and settings they were trained with, or train without --init"
+        )
+
+
+def _without_segments(given: dict[str, Tensor], network: Network) -> dict[str, Tensor]:
+    """What weights of one object can tell a ``network`` of another: all but its segments and its template.
+
+    Of the last layer, the rows of empty space, distance and direction mean the same everywhere; the others stay as
+    they are in ``network``.
+    """
+    kept = {name: value for name, value in given.items() if not name.startswith(("decoder.lookup.", "decoder.head."))}
+    for name, value in network.decoder.head.state_dict(prefix="decoder.head.").items():
+        kept[name] = torch.cat([given[name][:1], value[1:-4], given[name][-4:]])
+    return kept
+
+
+def join_processes() -> Process:
+    """Join the group that torchrun started, if any."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    if world == 1:
+        return Process()
+    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    return Process(dist.get_rank(), world)
+
+
+def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Process) -> None:
+    """Create the run directory, or check that it belongs to the same settings and dataset.
+
+    Process 0 does so alone: another one would find the directory that it is just creating, without its settings yet.
+    The others wait; where process 0 refuses, torchrun ends them.
+    """
+    if config.batch % process.world:
+        raise ValueError(
+            f"the batch of {config.batch} cannot be shared by {process.world} processes; it must be a multiple: "
+            "change --batch or the number of processes"
+        )
+    if process.is_main:
+        dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
+        _claim_directory(run_dir, json.loads(json.dumps({"dataset": dataset, "train": asdict(config)})))
+    if process.world > 1:
+        dist.barrier()
+
+
+def _claim_directory(run_dir: Path, settings: dict[str, Any]) -> None:
+    path = run_dir / "config.json"
+    if path.is_file():
+        before = _with_defaults(json.loads(path.read_text()))
+        if before != settings:
+            odd = _first_difference(before, settings)
+            raise ValueError(
+                f"{run_dir} holds a run with another {odd}; continuing needs equal settings: "
+                "use them, or another --output"
+            )
+    elif run_dir.exists() and any(run_dir.iterdir()):
+        raise FileExistsError(f"{run_dir} exists and is not a training run; choose another --output")
+    else:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        write_json(path, settings)
+
+
+def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
+    """A run's settings; those that an older mereo did not have are as they were then, which is their default."""
+    default = json.loads(json.dumps(asdict(TrainConfig())))
+    train = default | settings.get("train", {})
+    return settings | {"train": train | {"network": default["network"] | train["network"]}}
+
+
+def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:
+    for group in now:
+        for key, value in now[group].items():
+            if before.get(group, {}).get(key) != value:
+                return f"{group} setting {key} ({before.get(group, {}).get(key)!r} instead of {value!r})"
+    return "format"

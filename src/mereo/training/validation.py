@@ -1,0 +1,62 @@
+"""What a network in training answers on stored examples: its held-out scores, and class offsets when it is finished.
+
+Notation: n points, c classes.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.models.network import Network
+from mereo.training.config import AugmentConfig, TrainConfig
+from mereo.training.dataset import Batch, Dataset
+from mereo.training.logit_adjustment import class_offsets
+
+SEARCHED = 16
+"""Held-out examples of an autodecoder's curve: each one's code must be searched for first."""
+
+
+def held_out(data: Dataset, config: TrainConfig) -> range:
+    """The examples of the validation curve, none of which is trained on."""
+    first = len(data) - config.holdout
+    count = min(config.holdout, SEARCHED) if config.network.encoder == "autodecoder" else config.holdout
+    return range(first, first + count)
+
+
+@torch.no_grad()
+def validate(network: Network, data: Dataset, config: TrainConfig) -> Scores:
+    """IoU and mIoU on the held-out examples' queries (not the paper's grid metric)."""
+    segmented = "ce" in config.loss
+    classes = network.segments + 1 if segmented else 2
+    total = torch.zeros(classes, classes, dtype=torch.long)
+    for batch, logits, distance in _answers(network, data, config, held_out(data, config)):
+        guess = logits.argmax(-1) if segmented else (distance < 0).long()
+        truth = batch.labels if segmented else (batch.labels > 0).long()
+        total += torch.from_numpy(confusion_matrix(truth.cpu().numpy(), guess.cpu().numpy(), classes))
+    return intersection_over_union(total.numpy(), segmented)
+
+
+@torch.no_grad()
+def choose_offsets(network: Network, data: Dataset, config: TrainConfig) -> Float[Tensor, " c"] | None:
+    """Class offsets (``calibration``) from the first training examples; None when off."""
+    count, uniform = min(config.offset_examples, len(data) - config.holdout), data.uniform_queries
+    if not (count and uniform and "ce" in config.loss):
+        return None
+    answers = _answers(network, data, config, range(count))
+    found = [(logits[:, -uniform:], batch.labels[:, -uniform:]) for batch, logits, _ in answers]
+    return class_offsets(*(torch.cat(part).flatten(0, 1).cpu() for part in zip(*found, strict=True)))
+
+
+def _answers(
+    network: Network, data: Dataset, config: TrainConfig, examples: range
+) -> Iterator[tuple[Batch, Float[Tensor, "b q c"], Float[Tensor, "b q"]]]:
+    """Logits and distances at all queries of stored examples, encoded as in use, batch by batch."""
+    network.eval()
+    for start in examples[:: config.batch]:
+        index = torch.arange(start, min(start + config.batch, examples.stop))
+        batch = data.batch(index, config.network.points, 0, AugmentConfig(), torch.Generator().manual_seed(0))
+        prediction = network.query(network.encode(batch.cloud, batch.viewpoint), batch.positions)
+        yield batch, prediction.logits, prediction.distance

@@ -1,0 +1,1 @@
+"""Renderer, figures, reports, folders of results, and the viewer."""

@@ -1,0 +1,129 @@
+"""Contact sheets, captions, legends, and depth as colour: what all pictures are put together from."""
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from mereo.geometry.camera import DepthImage
+from mereo.geometry.mesh import Color
+from mereo.io.atomic_files import atomic_file
+from mereo.visualization.renderer import Canvas, Viewpoint
+
+Picture = UInt8[np.ndarray, "_ _ 3"]
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
+
+INK: Color = (28, 32, 38)
+MISSING: Color = (236, 237, 240)
+
+
+def save_png(path: str | Path, picture: Picture) -> None:
+    """Write a picture whole or not at all."""
+    with atomic_file(Path(path)) as partial:
+        Image.fromarray(picture).save(partial, format="PNG")
+
+
+def contact_sheet(
+    images: Sequence[Picture], captions: Sequence[str], columns: int, title: str = "", gap: int = 12
+) -> Picture:
+    """Images in rows of ``columns`` on white, each with its caption below, ``title`` above all.
+
+    Raises ``ValueError`` when there are no images, or not as many captions.
+    """
+    if not images or len(images) != len(captions) or columns < 1:
+        raise ValueError(
+            f"{len(images)} images, {len(captions)} captions, {columns} columns; one caption for each image"
+        )
+    cell_w, cell_h = max(i.shape[1] for i in images), max(i.shape[0] for i in images)
+    text_h = 24 if any(captions) else 0
+    top = gap + (36 if title else 0)
+    rows = -(-len(images) // columns)
+    size = (gap + columns * (cell_w + gap), top + rows * (cell_h + text_h + gap))
+    sheet = Image.new("RGB", size, "white")
+    pen = ImageDraw.Draw(sheet)
+    if title:
+        pen.text((gap, gap), title, fill=INK, font=fit_font(20, title, size[0] - 2 * gap))
+    for index, (image, caption) in enumerate(zip(images, captions, strict=True)):
+        x = gap + index % columns * (cell_w + gap)
+        y = top + index // columns * (cell_h + text_h + gap)
+        sheet.paste(Image.fromarray(image), (x + (cell_w - image.shape[1]) // 2, y + (cell_h - image.shape[0]) // 2))
+        anchor = (x + cell_w // 2, y + cell_h + text_h // 2)
+        pen.text(anchor, caption, fill=INK, font=fit_font(14, caption, cell_w), anchor="mm")
+    return np.asarray(sheet)
+
+
+def fit_font(size: int, text: str, width: int) -> Font:
+    """Pillow's own font, small enough for ``text`` to fit into ``width`` pixels."""
+    while size > 8 and font(size).getlength(text) > width:
+        size -= 1
+    return font(size)
+
+
+@cache
+def font(size: int) -> Font:
+    """Pillow's own font; unpacking it takes longer than drawing with it."""
+    return ImageFont.load_default(size)
+
+
+def depth_to_rgb(image: DepthImage, limits: tuple[float, float] | None = None) -> Picture:
+    """Depth as colour (viridis, near is bright); pale grey where nothing was measured.
+
+    ``limits`` is the nearest and farthest depth shown; by default the range of what was measured.
+    """
+    seen = image.depth[image.valid]
+    near, far = limits or ((float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0))
+    nearness = 1 - (image.depth - near) / max(far - near, 1e-12)
+    rgb = np.asarray(matplotlib.colormaps["viridis"](nearness, bytes=True))[..., :3]
+    return np.where(image.valid[..., None], rgb, np.asarray(MISSING, dtype=np.uint8))
+
+
+def enlarge(picture: Picture, width: int) -> Picture:
+    """Whole pixels, without interpolation."""
+    return np.asarray(Image.fromarray(picture).resize((width, width * picture.shape[0] // picture.shape[1]), 0))
+
+
+def _draw_cloud(canvas: Canvas, points: Float[np.ndarray, "n 3"], radius_px: float = 1.5) -> None:
+    """Points coloured by depth in the picture: bright is near."""
+    if len(points) == 0:
+        return
+    z = canvas.view.apply(points)[:, 2]
+    nearness = 1 - (z - z.min()) / max(float(np.ptp(z)), 1e-12)
+    colors = np.asarray(matplotlib.colormaps["viridis"](0.05 + 0.85 * nearness))[:, :3]
+    canvas.draw_points(points, colors, radius_px)
+
+
+def cloud_picture(points: Float[np.ndarray, "n 3"], view: Viewpoint, size: tuple[int, int]) -> Picture:
+    """A point cloud coloured by depth, on white."""
+    canvas = Canvas.empty(view, size)
+    _draw_cloud(canvas, points)
+    return canvas.picture()
+
+
+def legend(names: Sequence[str], colors: Sequence[Color], width: int) -> Picture:
+    """A swatch and a name for each segment, in as many rows as are needed."""
+    places, x, y = [], 12, 6
+    for name in names:
+        length = 22 + int(font(15).getlength(name)) + 20
+        if x > 12 and x + length > width:
+            x, y = 12, y + 26
+        places.append((x, y))
+        x += length
+    strip = Image.new("RGB", (width, y + 30), "white")
+    pen = ImageDraw.Draw(strip)
+    for name, color, (left, top) in zip(names, colors, places, strict=True):
+        pen.rounded_rectangle((left, top + 2, left + 15, top + 17), 4, fill=color)
+        pen.text((left + 22, top + 10), name, fill=INK, font=font(15), anchor="lm")
+    return np.asarray(strip)
+
+
+def name_plate(name: str, width: int, height: int) -> Picture:
+    """A caption as a picture of its own; it may have several lines."""
+    longest = max(name.splitlines(), key=len, default="")
+    plate = Image.new("RGB", (width, height), "white")
+    pen = ImageDraw.Draw(plate)
+    pen.text((width // 2, height // 2), name, fill=INK, font=fit_font(18, longest, width - 4), anchor="mm")
+    return np.asarray(plate)

@@ -1,0 +1,155 @@
+"""``report.html`` of ``mereo evaluate``: the scores of a test set on one self-contained page, with its error picture.
+
+Plain HTML with its style inside: no script, nothing from outside.
+"""
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+from PIL import Image
+
+from mereo.geometry.mesh import Color
+from mereo.io.atomic_files import atomic_file
+from mereo.visualization.reconstruction_report import BUDGET_BYTES
+
+STYLE = """
+:root { color-scheme: light dark; --bg: #f6f7f9; --card: #fff; --ink: #1d2430; --soft: #667085; --line: #e3e6ec; --accent: 37 99 201; }
+@media (prefers-color-scheme: dark) { :root { --bg: #12151b; --card: #1a1f28; --ink: #e8ebf1; --soft: #98a2b3; --line: #2b323f; --accent: 127 176 255; } }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--bg); color: var(--ink); font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+main { max-width: 1240px; margin: 0 auto; padding: 24px 20px 40px; }
+h1 { font-size: 24px; line-height: 1.25; margin: 0 0 4px; overflow-wrap: anywhere; }
+h2 { font-size: 12px; font-weight: 650; margin: 0 0 10px; color: var(--soft); letter-spacing: .06em; text-transform: uppercase; }
+p { margin: 0 0 18px; color: var(--soft); overflow-wrap: anywhere; }
+section { background: var(--card); border: 1px solid var(--line); border-radius: 14px; padding: 16px; margin-bottom: 16px; overflow-x: auto; }
+.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 16px; }
+.big { display: flex; flex-wrap: wrap; gap: 12px 44px; } .big b { display: block; font-size: 34px; line-height: 1.15; font-weight: 650; }
+.big span, th { color: var(--soft); font-weight: 500; font-size: 13px; }
+table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
+th, td { text-align: right; padding: 5px 10px; white-space: nowrap; } td { border-top: 1px solid var(--line); }
+th:first-child, td:first-child { text-align: left; padding-left: 0; }
+.swatch { width: 14px; height: 14px; border-radius: 4px; display: inline-block; margin-right: 9px; vertical-align: -2px; }
+.bar { display: inline-block; width: 120px; height: 6px; border-radius: 3px; background: var(--line); margin-right: 8px; vertical-align: 2px; overflow: hidden; }
+.bar i { display: block; height: 100%; background: rgb(var(--accent)); }
+.long { max-height: 360px; overflow: auto; } .cm td { text-align: center; } .cm td:first-child { text-align: left; }
+img { width: 100%; border-radius: 8px; background: #fff; display: block; }
+footer { color: var(--soft); font-size: 13px; }
+"""  # noqa: E501 (lines of CSS)
+
+
+def write_evaluation_report(
+    path: str | Path, metrics: Mapping[str, Any], colors: Sequence[Color], picture: str | Path
+) -> None:
+    """Write the page, under ``BUDGET_BYTES``.
+
+    Args:
+        path: the .html file.
+        metrics: what ``metrics.json`` holds, see ``evaluation.metrics``; NaN is shown as a dash.
+        colors: of the segments.
+        picture: a PNG file; it is made smaller where it is too large for the page.
+
+    Raises ``ValueError`` where even then the page is too large.
+    """
+    names, mean = tuple(metrics["per_segment"]), metrics["example_mean"]
+    title = " on ".join(str(metrics[key]) for key in ("weights", "scene") if key in metrics) or "mereo evaluation"
+    told = {"iou", "miou", "definition"}
+    facts = {k: v for k, v in metrics.items() if isinstance(v, str | int | float) and k not in told}
+    shown = [f"{key.replace('_', ' ')}: {value}" for key, value in facts.items()]
+    text = "".join(
+        (
+            f"<h1>{escape(title)}</h1>",
+            f"<p>{escape('  ·  '.join(shown))}</p>",
+            _overall(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]),
+            f'<div class="pair">{_segments(metrics["per_segment"], colors)}{_examples(metrics["per_example"])}</div>',
+            _confusion(("empty", *names), metrics["confusion"]),
+        )
+    )
+    words = escape(str(metrics.get("definition", "")))
+    room = BUDGET_BYTES - len(text.encode()) - len(STYLE) - len(words) - 2000
+    kind, data = _fitting(Path(picture), room * 3 // 4)
+    page = (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body><main>{text}"
+        '<section><h2>Errors of the first examples</h2><img alt="clouds, reconstructions, errors and references" '
+        f'src="data:image/{kind};base64,{data}"></section><footer>Made by mereo: {words}.</footer></main></body>'
+        "</html>\n"
+    ).encode("utf-8", errors="replace")
+    if len(page) > BUDGET_BYTES:
+        raise ValueError(f"the report has {len(page)} bytes; at most {BUDGET_BYTES}: evaluate fewer examples")
+    with atomic_file(path) as partial:
+        partial.write_bytes(page)
+
+
+def _overall(*figures: float) -> str:
+    titles = ("IoU, whole set", "mIoU, whole set", "IoU, mean over examples", "mIoU, mean over examples")
+    each = zip(titles, figures, strict=True)
+    shown = "".join(f"<div><b>{_number(value)}</b><span>{title}</span></div>" for title, value in each)
+    return f'<section><div class="big">{shown}</div></section>'
+
+
+def _segments(per_segment: Mapping[str, float], colors: Sequence[Color]) -> str:
+    rows = "".join(
+        f'<tr><td><span class="swatch" style="background:rgb{tuple(color)}"></span>{escape(name)}</td>'
+        f"<td>{_bar(value)}</td></tr>"
+        for (name, value), color in zip(per_segment.items(), colors, strict=True)
+    )
+    return f"<section><h2>Segments</h2><table><tr><th>segment</th><th>IoU</th></tr>{rows}</table></section>"
+
+
+def _confusion(classes: Sequence[str], confusion: Int[np.ndarray, "c c"]) -> str:
+    """Shares of each true class, so that rows add up to 100 %."""
+    shares = confusion / np.maximum(confusion.sum(axis=1, keepdims=True), 1)
+    head = "".join(f"<th>{escape(name)}</th>" for name in classes)
+    rows = "".join(
+        f"<tr><td>{escape(name)}</td>"
+        + "".join(
+            f'<td style="background:rgb(var(--accent) / {0.7 * share:.3f})">{_percent(share)}</td>' for share in row
+        )
+        + f"<td>{count:,}</td></tr>"
+        for name, row, count in zip(classes, shares, confusion.sum(axis=1), strict=True)
+    )
+    title = "<h2>Confusion: rows are the true class, columns the predicted one, % of the true class</h2>"
+    return f'<section class="cm">{title}<table><tr><th></th>{head}<th>points</th></tr>{rows}</table></section>'
+
+
+def _examples(per_example: Mapping[str, Mapping[str, float]]) -> str:
+    """Worst first: those are what one looks for."""
+    rows = "".join(
+        f"<tr><td>{escape(name)}</td><td>{_bar(each['iou'])}</td><td>{_bar(each['miou'])}</td></tr>"
+        for name, each in sorted(per_example.items(), key=lambda item: item[1]["iou"])
+    )
+    head = "<tr><th>example</th><th>IoU</th><th>mIoU</th></tr>"
+    return f'<section><h2>Examples, worst first</h2><div class="long"><table>{head}{rows}</table></div></section>'
+
+
+def _bar(value: float) -> str:
+    width = 0.0 if np.isnan(value) else 100 * value
+    return f'<span class="bar"><i style="width:{width:.0f}%"></i></span>{_number(value)}'
+
+
+def _number(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.3f}"
+
+
+def _percent(share: float) -> str:
+    return "·" if share < 0.0005 else f"{100 * share:.1f}"
+
+
+def _fitting(path: Path, room_bytes: int) -> tuple[str, str]:
+    """The picture as it is, or as a JPEG that is made smaller until it fits: kind and base64 text."""
+    data, kind = path.read_bytes(), "png"
+    with Image.open(path) as image:
+        small = image.convert("RGB")
+    while len(data) > room_bytes and min(small.size) > 16:
+        encoded = io.BytesIO()
+        small.save(encoded, "JPEG", quality=85)
+        data, kind = encoded.getvalue(), "jpeg"
+        small = small.resize((max(1, small.width * 3 // 4), max(1, small.height * 3 // 4)))
+    return kind, base64.b64encode(data).decode("ascii")

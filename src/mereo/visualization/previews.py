@@ -1,0 +1,165 @@
+"""Pictures: previews of scenes and of reconstructions, and (from ``error_pictures``) the paper's error pictures.
+
+Everything is drawn by ``mereo.visualization.renderer``, without a display.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.evaluation.scoring import EvaluatedView
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.transforms import rigid, transform_points
+from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import View, sample_view
+from mereo.visualization.contact_sheets import (
+    Picture,
+    cloud_picture,
+    contact_sheet,
+    depth_to_rgb,
+    enlarge,
+    legend,
+    save_png,
+)
+from mereo.visualization.error_maps import error_picture
+from mereo.visualization.renderer import Viewpoint, shade
+
+__all__ = [
+    "EvaluatedView",
+    "contact_sheet",
+    "depth_to_rgb",
+    "error_picture",
+    "preview_scene",
+    "render_cloud_and_segments",
+    "save_png",
+    "scene_preview",
+    "shade",
+]
+
+CAMERA_VIEWS = {
+    "as the camera sees it": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+    "from its right": ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
+    "from behind": ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0)),
+}
+"""Viewing direction and up, in the camera frame."""
+
+
+def render_cloud_and_segments(
+    path: str | Path,
+    cloud: PointCloud,
+    surfaces: SegmentedMesh,
+    title: str = "",
+    size: int = 420,
+    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
+) -> None:
+    """Write a preview: the input cloud (top) and the segments (bottom) from the camera, its right and behind.
+
+    Args:
+        path: the .png file.
+        cloud: what was observed.
+        surfaces: what was reconstructed, in the same frame; segments without faces are left out.
+        title: one line above.
+        size: width and height of each of the six pictures in pixels.
+        frame_rotation: rotation from the input's frame to x right, y up, z toward the viewer, as for the GLB.
+    """
+    to_camera = rigid(GLTF_CAMERA_ROTATION.T @ frame_rotation, np.zeros(3))
+    points = transform_points(to_camera, cloud.points)
+    solid = _with_faces(surfaces).transformed(to_camera)
+    bounds = _joint_bounds(points, *(segment.vertices for segment in solid.segments if len(segment.faces)))
+    views = {name: Viewpoint.along(bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
+    clouds = [cloud_picture(points, view, (size, size)) for view in views.values()]
+    shaded = [shade(solid, view, (size, size)) for view in views.values()]
+    captions = [f"input, {name}" for name in views] + [f"segments, {name}" for name in views]
+    sheet = contact_sheet(clouds + shaded, captions, 3, title)
+    save_png(path, np.concatenate([sheet, legend(surfaces.names, surfaces.colors, sheet.shape[1])]))
+
+
+def _with_faces(surfaces: SegmentedMesh) -> SegmentedMesh:
+    kept = tuple(segment for segment in surfaces.segments if len(segment.faces)) or surfaces.segments[:1]
+    names = [segment.name for segment in kept]
+    return SegmentedMesh(kept, tuple(pair for pair in surfaces.nested if set(pair) <= set(names)))
+
+
+def _joint_bounds(*clouds: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "2 3"]:
+    points = np.concatenate(clouds)
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+# --- scenes ----------------------------------------------------------------------------------------------------------
+
+
+def preview_scene(scene: Scene, path: str | Path, seed: int = 0, states: int = 9) -> None:
+    """Write ``scene_preview`` of random states; state i comes from (seed, i) alone."""
+    settings = GenerateConfig()
+    views = [sample_view(scene, settings, example_rng(seed, index)) for index in range(states)]
+    # a workspace around the whole object has no meaningful axis; mesh files are mostly y up
+    up = (0.0, 1.0, 0.0) if scene.workspace.aperture_rad >= 2 * np.pi else scene.workspace.axis
+    scene_preview(path, views, f"{scene.name}: {states} random states", up=up)
+
+
+def scene_preview(
+    path: str | Path,
+    views: Sequence[View],
+    title: str = "",
+    size: int = 220,
+    across: int = 3,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> None:
+    """Write a sheet of random states: for each, what the camera sees, the state from a fixed side, the depth image.
+
+    The fixed side is the same world direction for all states; an arrow shows where the camera looks from.
+
+    Args:
+        path: the .png file.
+        views: the states, see ``mereo.synthesis.examples.sample_view``.
+        title: one line above.
+        size: width of each picture in pixels.
+        across: states in a row.
+        up: the world direction that is upwards in the fixed side's pictures.
+    """
+    images: list[Picture] = []
+    captions: list[str] = []
+    for number, view in enumerate(views, start=1):
+        camera = view.depth.camera
+        height = size * camera.height // camera.width
+        images += [shade(view.mesh, Viewpoint.through(camera), (size, height)), _from_side(view, size, up)]
+        images.append(enlarge(depth_to_rgb(view.depth), size))
+        captions += [f"{number}: camera", "fixed side, arrow = camera", f"depth, {int(view.depth.valid.sum())} pixels"]
+    save_png(path, contact_sheet(images, captions, 3 * across, title))
+
+
+def _from_side(view: View, size: int, up: tuple[float, float, float]) -> Picture:
+    world = view.mesh.transformed(view.T_world_camera)
+    center = world.bounds.mean(axis=0)
+    radius = float(np.linalg.norm(world.bounds[1] - world.bounds[0])) / 2
+    toward = view.T_world_camera[:3, 3] - center
+    arrow = _arrow(center, toward / np.linalg.norm(toward), radius)
+    # an arrow that points away from the viewer is hidden by the object, as it should be
+    shown = replace(world, segments=(*world.segments, arrow))
+    z = np.asarray(up) / np.linalg.norm(up)
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    direction = -(x / np.linalg.norm(x) + 0.35 * np.cross(z, x) + 0.4 * z)
+    side = Viewpoint.along(world.bounds, (direction[0], direction[1], direction[2]), up)
+    return shade(shown, replace(side, half_size=1.4 * radius), (size, size))
+
+
+def _arrow(center: Float[np.ndarray, "3"], toward: Float[np.ndarray, "3"], radius: float, sides: int = 16) -> Segment:
+    """A cone on a thin shaft outside the object, pointing at it along the camera's line of sight."""
+    helper = np.eye(3)[np.argmin(np.abs(toward))]
+    across = np.cross(toward, helper) / np.linalg.norm(np.cross(toward, helper))
+    angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    ring = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(toward, across)
+    # (distance from the centre, thickness), both in radii, from the tip to the end of the shaft
+    profile = ((0.85, 0.0), (1.03, 0.08), (1.03, 0.03), (1.35, 0.03), (1.35, 0.0))
+    vertices = np.concatenate([center + radius * (far * toward + thick * ring) for far, thick in profile])
+    here, beside = np.arange(sides), np.roll(np.arange(sides), -1)
+    quads = [(here + k * sides, beside + k * sides, beside + (k + 1) * sides, here + (k + 1) * sides) for k in range(4)]
+    faces = np.concatenate([np.stack(corner, axis=1) for a, b, c, d in quads for corner in ((a, b, c), (a, c, d))])
+    return Segment("camera direction", (40, 44, 52), vertices, faces)

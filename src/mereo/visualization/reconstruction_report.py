@@ -1,0 +1,161 @@
+"""``report.html``: one self-contained page that shows the input cloud and the segments, offline, in any browser.
+
+The page is ``report.html`` beside this module with its data in place of one marker. Positions are 16-bit steps of the
+joint box and travel as base64, so that the page stays under ``BUDGET_BYTES``; surfaces over the budget are coarsened
+for the page only (``segments.glb`` keeps all).
+"""
+
+import base64
+import json
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt16
+
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.io.atomic_files import atomic_file
+from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, OUTER_OPACITY
+
+BUDGET_BYTES = 5_000_000
+CLOUD_POINTS = 60_000
+DATA_MARKER = "/*DATA*/null"
+TITLE_MARKER = "<!--TITLE-->"
+STEPS = 65535
+
+
+def write_report(
+    path: str | Path,
+    cloud: PointCloud,
+    surfaces: SegmentedMesh,
+    summary: dict[str, Any],
+    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
+) -> None:
+    """Write the page.
+
+    Args:
+        path: the .html file.
+        cloud: the input, in its frame and units; at most ``CLOUD_POINTS`` of it are shown.
+        surfaces: the segments in the same frame; those without faces are listed but not drawn, those
+            around a nested one are drawn see-through.
+        summary: what the page says in words; every key may be missing. ``title`` and ``unit`` are text; ``segments`` is
+            a list of ``{"name", "centroid" [3], "volume", "confidence" in 0..1}`` in the order of ``surfaces``;
+            ``timings_s`` maps stages to seconds; other texts and numbers are listed as facts.
+        frame_rotation: rotation from the input's frame to the viewer's (x right, y up, z toward the viewer).
+
+    Raises ``ValueError`` when the page cannot be brought under the budget.
+    """
+    title = str(summary.get("title", "mereo reconstruction"))
+    page = files("mereo.visualization").joinpath("report.html").read_text(encoding="utf-8")
+    data = _page_data(cloud, surfaces, summary, np.asarray(frame_rotation))
+    # "</script>" inside a name must not end the script; \u003c is the same character to JSON
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    page = page.replace(TITLE_MARKER, escape(title)).replace(DATA_MARKER, text)
+    encoded = page.encode("utf-8", errors="replace")
+    if len(encoded) > BUDGET_BYTES:
+        raise ValueError(f"the report has {len(encoded)} bytes; at most {BUDGET_BYTES}: shorten the summary")
+    with atomic_file(path) as partial:
+        partial.write_bytes(encoded)
+
+
+def _page_data(
+    cloud: PointCloud, surfaces: SegmentedMesh, summary: dict[str, Any], rotation: Float[np.ndarray, "3 3"]
+) -> dict[str, Any]:
+    points = _thin(cloud.points)
+    low, high = _joint_bounds(points, surfaces)
+    # binary room: a page's text and the summary take the rest; base64 grows data by a third
+    room = int((BUDGET_BYTES - 300_000 - len(json.dumps(_readable(summary)))) * 3 / 4) - 6 * len(points)
+    shown = _fit(surfaces, float((high - low).max()), room)
+    return {
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "rotation": rotation.tolist(),
+        "cloud": {"count": len(cloud), "shown": len(points), "positions": _base64(_quantize(points, low, high))},
+        "segments": [
+            {
+                "name": full.name,
+                "color": list(full.color),
+                "opacity": 1.0 if opaque else OUTER_OPACITY,
+                "faces": len(full.faces),
+                "positions": _base64(_quantize(part.vertices, low, high)),
+                "indices": _base64(part.faces.astype("<u4")),
+            }
+            for full, part, opaque in zip(surfaces.segments, shown, surfaces.opaque, strict=True)
+        ],
+        "coarsened": any(len(a.faces) != len(b.faces) for a, b in zip(surfaces.segments, shown, strict=True)),
+        "summary": _readable(summary),
+    }
+
+
+def _readable(value: Any) -> Any:
+    """Numpy values as plain ones; NaN and infinity as null."""
+    if isinstance(value, dict):
+        return {str(key): _readable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_readable(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _readable(value.tolist())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value if isinstance(value, str | int | float | bool | None) else str(value)
+
+
+def _thin(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """An evenly spread part of the cloud; a fixed seed, so that the page is the same every time."""
+    if len(points) <= CLOUD_POINTS:
+        return points
+    return points[np.sort(np.random.default_rng(0).choice(len(points), CLOUD_POINTS, replace=False))]
+
+
+def _joint_bounds(
+    points: Float[np.ndarray, "n 3"], surfaces: SegmentedMesh
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    everything = np.concatenate([points, *(segment.vertices for segment in surfaces.segments)])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    return low, np.maximum(high, low + 1e-9 * max(1.0, float(np.abs(low).max())))
+
+
+def _quantize(
+    points: Float[np.ndarray, "n 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+) -> UInt16[np.ndarray, "n 3"]:
+    return np.rint((points - low) / (high - low) * STEPS).astype("<u2")
+
+
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(array.tobytes()).decode("ascii")
+
+
+def _fit(surfaces: SegmentedMesh, extent: float, room_bytes: int) -> list[Segment]:
+    """The segments, coarsened together until they take at most ``room_bytes``."""
+    shown, cells = list(surfaces.segments), 400.0
+    while (size := sum(6 * len(s.vertices) + 12 * len(s.faces) for s in shown)) > room_bytes and cells > 4:
+        shown = [cluster(segment, extent / cells) for segment in surfaces.segments]
+        # a surface meets about cells^2 cells of the grid; the factor keeps the last steps from crawling
+        cells *= min(0.95, max(0.5, (max(room_bytes, 0) / size) ** 0.5))
+    return shown
+
+
+def cluster(segment: Segment, cell: float) -> Segment:
+    """Vertices in the same cell of a cubic grid become their mean; faces that collapse or repeat are dropped.
+
+    J. Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993. Fast and
+    dependency-free; the result is for looking at and need not be closed.
+    """
+    inverse = _same(np.floor((segment.vertices - segment.vertices.min(axis=0)) / cell).astype(np.int64))[1]
+    count = np.bincount(inverse)
+    sums = [np.bincount(inverse, weights=segment.vertices[:, axis], minlength=len(count)) for axis in range(3)]
+    faces: Int[np.ndarray, "f 3"] = inverse[segment.faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    first = _same(np.sort(faces, axis=1))[0]
+    return Segment(segment.name, segment.color, np.stack(sums, axis=1) / count[:, None], faces[np.sort(first)])
+
+
+def _same(rows: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " n"]]:
+    """First place of each different row, and for each row which one it is; packed, because sorting rows is slow."""
+    base = int(rows.max(initial=0)) + 1
+    packed = (rows[:, 0] * base + rows[:, 1]) * base + rows[:, 2]
+    _, first, inverse = np.unique(packed, return_index=True, return_inverse=True)
+    return first, inverse

@@ -1,0 +1,252 @@
+"""A small shaded renderer: rays against triangles by Embree, two-sided Lambert light, smooth normals, dark outlines.
+
+It needs neither a display nor OpenGL. Notation: the view frame is x right, y down, z away from the viewer, as a
+camera's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from embreex import rtcore
+from embreex import rtcore_scene as rtcs
+from embreex.mesh_construction import TriangleMesh
+from jaxtyping import Float, Int, UInt8
+from scipy.sparse import csr_array
+
+from mereo.geometry.camera import Camera
+from mereo.geometry.mesh import Color, SegmentedMesh
+from mereo.geometry.transforms import inverse_rigid, rigid
+
+SUPERSAMPLE = 2
+BACKGROUND = 1.0
+SEE_THROUGH = 0.55
+"""How much of a nested segment shows through the one around it."""
+
+CREASE_COSINE = 0.6
+"""Normals are smoothed across edges flatter than about 53 degrees, so that cuts and box edges stay sharp."""
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A virtual camera: orthographic with ``half_size``, or a pinhole with ``camera``.
+
+    Attributes:
+        T_view_world: rigid transform from the frame of the things shown to the view frame.
+        half_size: half the picture's shorter side, in units; used when ``camera`` is None.
+        camera: intrinsics, scaled to the picture's width.
+    """
+
+    T_view_world: Float[np.ndarray, "4 4"]
+    half_size: float = 1.0
+    camera: Camera | None = None
+
+    @classmethod
+    def along(
+        cls,
+        bounds: Float[np.ndarray, "2 3"],
+        direction: tuple[float, float, float],
+        up: tuple[float, float, float],
+        margin: float = 1.08,
+    ) -> "Viewpoint":
+        """Orthographic along ``direction``, with ``up`` upwards, showing the whole box ``bounds``."""
+        forward = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+        right = np.cross(forward, np.asarray(up, dtype=float))
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        half = np.abs(rotation[:2]) @ (bounds[1] - bounds[0]) / 2
+        return cls(rigid(rotation, -rotation @ bounds.mean(axis=0)), margin * max(float(half.max()), 1e-12))
+
+    @classmethod
+    def through(cls, camera: Camera, T_world_camera: Float[np.ndarray, "4 4"] | None = None) -> "Viewpoint":
+        """What a camera sees; the identity pose is the camera's own frame."""
+        return cls(np.eye(4) if T_world_camera is None else inverse_rigid(T_world_camera), camera=camera)
+
+    def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points in the view frame."""
+        return points @ self.T_view_world[:3, :3].T + self.T_view_world[:3, 3]
+
+    def pixels(self, points_view: Float[np.ndarray, "n 3"], width: int, height: int) -> Float[np.ndarray, "n 2"]:
+        """Column and row (pixel centres at +0.5) of points in the view frame."""
+        if self.camera is not None:
+            return self.camera.project(points_view) * [width / self.camera.width, height / self.camera.height]
+        scale = min(width, height) / (2 * self.half_size)
+        return points_view[:, :2] * scale + [width / 2, height / 2]
+
+    def rays(self, width: int, height: int, back_off: float) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and directions (z = 1) in the view frame through every pixel centre, row by row."""
+        grid_y, grid_x = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
+        pixel = np.stack([grid_x.ravel(), grid_y.ravel()], axis=-1)
+        count = width * height
+        if self.camera is not None:
+            scaled = pixel * [self.camera.width / width, self.camera.height / height]
+            return np.zeros((count, 3)), self.camera.unproject(scaled, np.ones(count))
+        plane = (pixel - [width / 2, height / 2]) * (2 * self.half_size / min(width, height))
+        origins = np.column_stack([plane, np.full(count, -back_off)])
+        return origins, np.tile([0.0, 0.0, 1.0], (count, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """What the renderer draws: triangles with one colour each and a normal at each corner.
+
+    Attributes:
+        vertices: positions.
+        faces: vertex indices.
+        colors: red, green, blue in 0..1 for each face.
+        normals: unit normals at the three corners of each face; their sign is of no consequence.
+        owner: an outline is drawn where this number changes between faces.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    colors: Float[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "f 3 3"]
+    owner: Int[np.ndarray, " f"]
+
+    @classmethod
+    def of(cls, mesh: SegmentedMesh, colors: list[Color] | None = None) -> "Triangles":
+        vertices, faces, owner = mesh.merged()
+        palette = np.asarray(mesh.colors if colors is None else colors, dtype=float).reshape(-1, 3) / 255.0
+        return cls(vertices, faces, palette[owner], corner_normals(vertices, faces), owner)
+
+
+def corner_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
+    """Mean normal, weighted by angle, of those faces around a corner that are not beyond a crease from its own."""
+    edges = [_unit(vertices[np.roll(faces, -k, axis=1)] - vertices[faces]) for k in (1, 2)]
+    angle = np.arccos(np.clip((edges[0] * edges[1]).sum(axis=-1), -1, 1)).ravel()
+    flat = np.repeat(_unit(np.cross(edges[0][:, 0], edges[1][:, 0])), 3, axis=0)
+    corners = np.arange(faces.size)
+    at_vertex = csr_array((np.ones(faces.size), (corners, faces.ravel())), shape=(faces.size, len(vertices)))
+    pairs = (at_vertex @ at_vertex.T).tocoo()
+    same = (flat[pairs.row] * flat[pairs.col]).sum(axis=1) > CREASE_COSINE
+    row, col = pairs.row[same], pairs.col[same]
+    weights = csr_array((angle[col], (row, col)), shape=pairs.shape)
+    return _unit(weights @ flat).reshape(-1, 3, 3)
+
+
+def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+
+
+@dataclass(frozen=True, eq=False)
+class Canvas:
+    """A picture in the making at ``SUPERSAMPLE`` times its size: colours in 0..1 and depth (infinite where empty)."""
+
+    view: Viewpoint
+    rgb: Float[np.ndarray, "h w 3"]
+    depth: Float[np.ndarray, "h w"]
+
+    @classmethod
+    def empty(cls, view: Viewpoint, size: tuple[int, int]) -> "Canvas":
+        """``size`` is (width, height) of the finished picture."""
+        shape = (size[1] * SUPERSAMPLE, size[0] * SUPERSAMPLE)
+        return cls(view, np.full((*shape, 3), BACKGROUND), np.full(shape, np.inf))
+
+    def draw_triangles(self, shown: Triangles) -> None:
+        """Draw what is nearer than everything drawn before."""
+        height, width = self.depth.shape
+        vertices = self.view.apply(shown.vertices)
+        normals = shown.normals @ self.view.T_view_world[:3, :3].T
+        back_off = 2 * float(np.abs(vertices).max(initial=1e-6))
+        origins, directions = self.view.rays(width, height, back_off)
+        face, distance, bary = _cast(vertices, shown.faces, origins, directions)
+        z = (origins[:, 2] + distance).reshape(height, width)
+        nearer = (face >= 0) & (z.ravel() < self.depth.ravel())
+        index = np.flatnonzero(nearer)
+        normal = _unit(np.einsum("nk,nkd->nd", bary[index], normals[face[index]]))
+        light = _light(normal, _unit(directions[index]))
+        rgb, depth = self.rgb.reshape(-1, 3), self.depth.reshape(-1)
+        rgb[index] = np.clip(shown.colors[face[index]] * light[:, :1] + light[:, 1:], 0, 1)
+        depth[index] = z.ravel()[index]
+        part = np.where(nearer, np.append(shown.owner, -1)[face], -1).reshape(height, width)
+        self._outline(part)
+
+    def _outline(self, part: Int[np.ndarray, "h w"]) -> None:
+        """Darken pixels beside another part or beside the background."""
+        edge = np.zeros(part.shape, dtype=bool)
+        for axis in (0, 1):
+            for step in (1, -1):
+                edge |= part != np.roll(part, step, axis=axis)
+        self.rgb[edge & (part >= 0)] *= 0.45
+
+    def draw_points(
+        self, points: Float[np.ndarray, "n 3"], colors: Float[np.ndarray, "n 3"], radius_px: float = 1.2
+    ) -> None:
+        """Draw points as small discs, hidden by whatever is nearer."""
+        height, width = self.depth.shape
+        in_view = self.view.apply(points)
+        if self.view.camera is not None:
+            colors, in_view = colors[in_view[:, 2] > 0], in_view[in_view[:, 2] > 0]
+        center = self.view.pixels(in_view, width, height)
+        radius = radius_px * SUPERSAMPLE
+        steps = np.arange(-int(radius), int(radius) + 1)
+        # all discs, far to near, so that the nearest is written last
+        order = np.argsort(-in_view[:, 2], kind="stable")
+        corner, z = np.floor(center[order]).astype(np.int64), in_view[order, 2]
+        for dx, dy in ((x, y) for x in steps for y in steps if x * x + y * y <= radius * radius):
+            self._put(corner + np.array([dx, dy]), z, colors[order])
+
+    def _put(self, at: Int[np.ndarray, "n 2"], z: Float[np.ndarray, " n"], colors: Float[np.ndarray, "n 3"]) -> None:
+        """Single pixels, ordered far to near."""
+        height, width = self.depth.shape
+        inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
+        column, row = at[inside].T
+        visible = z[inside] <= self.depth[row, column]
+        column, row = column[visible], row[visible]
+        self.rgb[row, column] = colors[inside][visible]
+        self.depth[row, column] = z[inside][visible]
+
+    def picture(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Averaged down to the asked size."""
+        height, width = (side // SUPERSAMPLE for side in self.depth.shape)
+        blocks = self.rgb.reshape(height, SUPERSAMPLE, width, SUPERSAMPLE, 3)
+        return np.rint(255 * blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def _cast(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    origins: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"],
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """For each ray the first face (-1: none), the distance in lengths of its direction, barycentric weights."""
+    if len(faces) == 0:
+        return np.full(len(origins), -1), np.full(len(origins), np.inf), np.zeros((len(origins), 3))
+    device = rtcore.EmbreeDevice()
+    scene = rtcs.EmbreeScene(device)
+    TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
+    hits = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=True)
+    face = hits["primID"].astype(np.int64)
+    face = np.where((face < 0) | (face >= len(faces)), -1, face)
+    u, v = hits["u"].astype(float), hits["v"].astype(float)
+    distance = np.where(face >= 0, hits["tfar"].astype(float), np.inf)
+    return face, distance, np.stack([1 - u - v, u, v], axis=1)
+
+
+def _light(normal: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """Diffuse factor and added highlight: a key light from above left, a fill from the viewer, some ambient."""
+    facing = np.where((normal * ray).sum(axis=1, keepdims=True) > 0, -normal, normal)
+    key = _unit(np.array([-0.5, -0.8, -0.9]))
+    diffuse = 0.34 + 0.52 * np.clip(facing @ key, 0, 1) + 0.26 * np.clip(-facing[:, 2], 0, 1)
+    highlight = 0.16 * np.clip(facing @ _unit(key - np.array([0.0, 0.0, 1.0])), 0, 1) ** 24
+    return np.stack([diffuse, highlight], axis=1)
+
+
+def shade(
+    mesh: SegmentedMesh, view: Viewpoint, size: tuple[int, int], colors: list[Color] | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A shaded picture of ``size`` (width, height) pixels on white, each segment in its colour (or ``colors``).
+
+    Segments that are declared nested shine through those around them.
+    """
+    colors = list(mesh.colors) if colors is None else colors
+    canvas = Canvas.empty(view, size)
+    canvas.draw_triangles(Triangles.of(mesh, colors))
+    inner = sorted({index for index, _ in mesh.nesting})
+    if inner:
+        within = Canvas.empty(view, size)
+        parts = SegmentedMesh(tuple(mesh.segments[index] for index in inner))
+        within.draw_triangles(Triangles.of(parts, [colors[index] for index in inner]))
+        hidden = np.isfinite(within.depth) & (within.depth > canvas.depth + 1e-6)
+        canvas.rgb[hidden] = (1 - SEE_THROUGH) * canvas.rgb[hidden] + SEE_THROUGH * within.rgb[hidden]
+    return canvas.picture()

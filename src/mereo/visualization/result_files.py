@@ -1,0 +1,155 @@
+"""Folders of results: what `mereo reconstruct` and `mereo evaluate` leave on disk."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from mereo.evaluation.scan_scoring import evaluate_scans
+from mereo.evaluation.scoring import CELLS, Evaluation, evaluate, markdown_table, metrics, trained_scene
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.scanner_axes import camera_axes
+from mereo.geometry.transforms import transform_points
+from mereo.io.atomic_files import new_directory, write_json
+from mereo.io.config import DEFAULT_FILES, FilesConfig
+from mereo.io.writers.formats import Results, chosen_formats, write_formats
+from mereo.io.writers.glb import viewer_rotation
+from mereo.models.config import EXACT, InferenceConfig
+from mereo.models.model import Model
+from mereo.models.weights import load_for
+from mereo.reconstruction.pipeline import Reconstruction
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis.config import GenerateConfig
+from mereo.visualization.error_maps import error_picture
+from mereo.visualization.evaluation_report import write_evaluation_report
+from mereo.visualization.previews import render_cloud_and_segments
+from mereo.visualization.reconstruction_report import write_report
+
+
+def evaluate_weights(
+    weights: str | Path,
+    output: str | Path,
+    *,
+    examples: int = 128,
+    seed: int = TEST_SEED_START,
+    scene: str | None = None,
+    cells: int = CELLS,
+    settings: GenerateConfig | None = None,
+    inference: InferenceConfig = EXACT,
+) -> Evaluation:
+    """``mereo evaluate``: write metrics.json, table.md, errors.png, report.html; print the table."""
+    with new_directory(output) as directory:
+        model = load_for(weights, inference)
+        settings = settings or GenerateConfig()
+        evaluation = evaluate(model, scene, examples=examples, seed=seed, cells=cells, progress=True, settings=settings)
+        facts = {
+            "weights": str(weights),
+            "scene": scene or trained_scene(model),
+            "seed": seed,
+            "noise_std": settings.noise_std,
+            "sensor": asdict(settings.sensor),
+            "device": model.device.type,
+            "precision": model.working_precision,
+            "trained": model.provenance,
+        }
+        write_evaluation(directory, evaluation, facts)
+    print(markdown_table(evaluation))
+    print(f"wrote {output}")
+    return evaluation
+
+
+def evaluate_on_scans(
+    model: Model, output: str | Path, *, truths: Sequence[str | Path] = (), cells: int = CELLS
+) -> Evaluation:
+    """``mereo evaluate --scans``: scores on real scans, with the same files as ``evaluate_weights``."""
+    with new_directory(output) as directory:
+        evaluation = evaluate_scans(model, truths=truths, cells=cells)
+        facts = {"scans": list(evaluation.examples), "truths": [str(path) for path in truths]}
+        write_evaluation(directory, evaluation, {**facts, "trained": model.provenance})
+    print(markdown_table(evaluation))
+    return evaluation
+
+
+def write_evaluation(directory: Path, evaluation: Evaluation, facts: dict[str, Any]) -> None:
+    """metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON."""
+    found = metrics(evaluation, facts)
+    write_json(directory / "metrics.json", found)
+    (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
+    error_picture(directory / "errors.png", evaluation.cases)
+    write_evaluation_report(directory / "report.html", found, evaluation.cases[0].colors, directory / "errors.png")
+
+
+def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:
+    """What ``summary.json`` holds: ``facts``, then each segment and the stages' seconds."""
+    segments = [
+        {
+            "name": found.name,
+            "label": found.label,
+            "color": list(color),
+            "volume": found.volume,
+            "centroid": found.centroid.tolist(),
+            "box": found.box.tolist(),
+            "confidence": found.confidence,
+            "voxels": found.voxels,
+            "components": found.components,
+        }
+        for found, color in zip(result.segments, result.surfaces.colors, strict=True)
+    ]
+    return {
+        **facts,
+        "nested": [list(pair) for pair in result.surfaces.nested],
+        "spacing": float(result.labels.spacing[0]),
+        "evaluated_points": result.evaluated,
+        "clipped": result.clipped,
+        "segments": segments,
+        "timings_s": result.timings_s,
+    }
+
+
+def write_reconstruction(
+    result: Reconstruction,
+    cloud: PointCloud,
+    output_dir: str | Path,
+    *,
+    frame: CloudAxes = "camera",
+    files: FilesConfig = DEFAULT_FILES,
+    unit_m: float = 1.0,
+    force: bool = False,
+    **facts: object,
+) -> None:
+    """Write preview.png, report.html and ``files`` into a new directory, all or nothing.
+
+    By default these are segments.glb, labels.npz and summary.json; ``mereo.io.writers.formats.WRITERS`` names all. The
+    format "points" needs ``reconstruct(..., label_points=True)``. ``facts`` (``title``, ``unit``, ...) are added to the
+    summary and shown in the report. Raises ``FileExistsError`` for a directory with content unless ``force``, and
+    ``ImportError`` where a format's extra is missing.
+    """
+    with new_directory(output_dir, force) as directory:
+        write_files(directory, result, cloud, frame, files, unit_m, facts)
+
+
+def write_files(
+    directory: Path,
+    result: Reconstruction,
+    cloud: PointCloud,
+    frame: CloudAxes,
+    files: FilesConfig,
+    unit_m: float,
+    facts: dict[str, object],
+) -> None:
+    """Write what ``write_reconstruction`` does into a directory that is there; ``facts`` go into the summary."""
+    started = time.perf_counter()
+    formats = chosen_formats(files.formats)
+    to_viewer = viewer_rotation(frame)
+    results = Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, unit_m)
+    write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
+    to_camera = camera_axes(frame)
+    seen = PointCloud(transform_points(to_camera, cloud.points))
+    title = str(facts.get("title", "mereo reconstruction"))
+    render_cloud_and_segments(directory / "preview.png", seen, result.surfaces.transformed(to_camera), title)
+    timings_s = {**result.timings_s, "write": time.perf_counter() - started}
+    summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
+    write_report(directory / "report.html", cloud, result.surfaces, summary, to_viewer)
+    write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))

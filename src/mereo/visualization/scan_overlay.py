@@ -1,0 +1,50 @@
+"""Picture of a model placed on a scan."""
+
+import matplotlib
+import numpy as np
+
+from mereo.evaluation.registration.placement import Placement
+from mereo.evaluation.registration.truth_file import ScanFile
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.scanner_axes import camera_axes
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import transform_points
+from mereo.visualization.contact_sheets import Picture, contact_sheet, legend
+from mereo.visualization.previews import CAMERA_VIEWS
+from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
+
+SHOWN_POINTS = 40_000
+
+
+SIZE = 420
+"""Of a picture in pixels."""
+
+
+def overlay(placement: Placement, cloud: PointCloud, scan: ScanFile) -> Picture:
+    """The scan on the placed segments (top), and its distance from them (bottom), as seen by the scanner and others."""
+    to_camera = camera_axes(scan.frame)
+    mesh = placement.mesh.transformed(to_camera)
+    chosen = np.random.default_rng(0).permutation(len(cloud))[:SHOWN_POINTS]
+    points = transform_points(to_camera, cloud.points[chosen])
+    distance = Solids(mesh).nearest(points).distance
+    views = {name: Viewpoint.along(mesh.bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
+    mm = 1000 * UNITS_M[scan.unit] * placement.limit
+    colors = np.asarray(matplotlib.colormaps["viridis"](distance / placement.limit))[:, :3]
+    colors[distance > placement.limit] = (0.85, 0.1, 0.1)
+    ink = np.zeros_like(points)
+    top = [_drawn(view, mesh, points, ink) for view in views.values()]
+    bottom = [_drawn(view, None, points, colors) for view in views.values()]
+    captions = [f"scan on segments, {name}" for name in views]
+    captions += [f"distance 0 (dark) to {mm:.2g} mm (bright), red: more"] * len(views)
+    sheet = contact_sheet(top + bottom, captions, len(views), f"{scan.path.name} on {len(mesh.segments)} segments")
+    return np.concatenate([sheet, legend(mesh.names, mesh.colors, sheet.shape[1])])
+
+
+def _drawn(view: Viewpoint, mesh: SegmentedMesh | None, points: np.ndarray, colors: np.ndarray) -> Picture:
+    canvas = Canvas.empty(view, (SIZE, SIZE))
+    if mesh is not None:
+        canvas.draw_triangles(Triangles.of(mesh))
+    canvas.draw_points(points, colors, 0.5 if mesh is not None else 1.2)
+    return canvas.picture()

@@ -1,0 +1,118 @@
+"""What surfaces are coloured by: one number for each vertex, and the scale that turns numbers into colours."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
+
+from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
+from mereo.geometry.solids import Solids
+from mereo.models.model import Answer
+from mereo.visualization.error_maps import OVER, UNDER
+
+Ask = Callable[[Float[np.ndarray, "n 3"]], Answer]
+"""A model's answers at points in the frame of the surfaces."""
+
+CONFIDENCE_STEP = 0.02
+"""How far to either side of a surface the model is asked, as a share of the object's longest side."""
+
+ERROR_SHARE = 0.05
+"""The scale of errors ends at this share of the true object's longest side."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colours for numbers from ``low`` to ``high``; what lies beyond has the colour of that end.
+
+    Attributes:
+        title: what the numbers are.
+        low, high: ends.
+        stops: colours at equal distances from one end to the other.
+        words: what the two ends mean.
+    """
+
+    title: str
+    low: float
+    high: float
+    stops: tuple[Color, ...]
+    words: tuple[str, str]
+
+    def colors(self, values: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+        """Red, green, blue of each number, linear between the stops; NaN is grey."""
+        places = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0) * (len(self.stops) - 1)
+        stops = np.asarray(self.stops, dtype=float)
+        mixed = np.stack([np.interp(places, np.arange(len(stops)), stops[:, k]) for k in range(3)], axis=1)
+        return np.where(np.isnan(values)[:, None], 128.0, mixed).round().astype(np.uint8)
+
+
+CONFIDENCE = Scale(
+    "confidence of the surface",
+    0.0,
+    1.0,
+    ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)),
+    ("0, a guess", "1, certain"),
+)
+SEEN: tuple[Color, ...] = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122, 24, 70))
+EVEN: Color = (228, 230, 234)
+
+
+def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> Scale:
+    """For ``observed_distance`` of all segments: up to the largest but for a twentieth of the vertices."""
+    joint = np.concatenate([*values, np.zeros(1)])
+    high = max(float(np.quantile(joint, 0.95)), 1e-9)
+    return Scale("distance to the nearest observed point", 0.0, high, SEEN, ("0, seen", f"{high:.3g}{unit}, guessed"))
+
+
+def error_scale(truth: SegmentedMesh, unit: str) -> Scale:
+    """For ``surface_error``: orange where the reconstruction falls short, blue where it goes too far."""
+    high = ERROR_SHARE * float((truth.bounds[1] - truth.bounds[0]).max())
+    words = f"−{high:.2g}{unit}, too little", f"+{high:.2g}{unit}, too much"
+    return Scale("distance to the true surface", -high, high, (UNDER, EVEN, OVER), words)
+
+
+def confidence(surfaces: SegmentedMesh, ask: Ask) -> list[Float[np.ndarray, " _"]]:
+    """How decidedly the model changes its mind across each surface, from 0 to 1, at every vertex.
+
+    On the surface itself the winner's probability says nothing: it is where the winner changes, so that two classes
+    are equally likely there. Here the segment's probability a step inside is compared with that a step outside: 1 means
+    that the border is known to a step of ``CONFIDENCE_STEP`` of the object, 0 that the model has no idea where it is.
+    A segment that holds nested ones counts with all of them.
+    """
+    found = [segment for segment in surfaces.segments if len(segment.vertices)]
+    if not found:
+        return [np.zeros(0) for _ in surfaces.segments]
+    corners = np.concatenate([segment.vertices for segment in found])
+    step = CONFIDENCE_STEP * float((corners.max(axis=0) - corners.min(axis=0)).max())
+    held = [
+        [label, *(i + 1 for i, o in surfaces.nesting if o == label - 1)] for label in range(1, len(surfaces.names) + 1)
+    ]
+    return [_confidence(s, labels, ask, step) for s, labels in zip(surfaces.segments, held, strict=True)]
+
+
+def _confidence(segment: Segment, labels: list[int], ask: Ask, step: float) -> Float[np.ndarray, " v"]:
+    if len(segment.vertices) == 0:
+        return np.zeros(0)
+    offset = step * vertex_normals(segment)
+    inside, outside = (ask(segment.vertices + sign * offset).probability[:, labels].sum(axis=1) for sign in (-1, 1))
+    result: Float[np.ndarray, " v"] = np.clip(inside - outside, 0.0, 1.0).astype(np.float64)
+    return result
+
+
+def observed_distance(surfaces: SegmentedMesh, observed: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, " _"]]:
+    """From every vertex to the nearest observed point: what is far from all of them is a guess."""
+    tree = cKDTree(observed)
+    return [tree.query(s.vertices)[0] if len(s.vertices) else np.zeros(0) for s in surfaces.segments]
+
+
+def surface_error(surfaces: SegmentedMesh, truth: Solids) -> list[Float[np.ndarray, " _"]]:
+    """Signed distance from every vertex to the same segment's true surface: above 0 outside of the true segment."""
+    result = []
+    for index, segment in enumerate(surfaces.segments):
+        if len(segment.vertices) == 0:
+            result.append(np.zeros(0))
+            continue
+        distance = truth.segment_distance(index, segment.vertices)
+        result.append(np.where(truth.inside(index, segment.vertices), -distance, distance))
+    return result

@@ -1,0 +1,144 @@
+"""The page of one frame: what was observed, its reconstruction, and a probe."""
+
+import threading
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mereo.reconstruction.pipeline import segment_names
+from mereo.visualization.vertex_colors import CONFIDENCE, confidence, distance_scale, observed_distance
+from mereo.visualization.viewer import html
+from mereo.visualization.viewer.display import CLOUD_COLOR, CLOUD_SIZE, Display, SegmentControls, SegmentLayer
+from mereo.visualization.viewer.probe import Inspection, first_hit
+
+COLORINGS = ("segment", "confidence", "distance")
+EMPTY_COLOR = (150, 156, 168)
+
+
+class FramePage:
+    """Shows an ``Inspection`` on a server; answers clicks, check boxes and sliders until the server stops."""
+
+    def __init__(self, server: Any, inspection: Inspection, title: str, facts: str, unit: str = "") -> None:
+        self.server, self.inspection, self.unit = server, inspection, f" {unit}" if unit else ""
+        self.mesh = inspection.result.surfaces
+        self._drawing = threading.Lock()
+        scanner = not np.allclose(inspection.T_camera_input, np.eye(4))
+        y, self.toward = (1.0, np.array([0.0, 0.0, 1.0])) if scanner else (-1.0, np.array([0.0, 0.0, -1.0]))
+        self.stage = Display(server, self._bounds(), np.array([0.0, y, 0.0]))
+        self.layer = SegmentLayer(self.stage, "/segments")
+        self._painted: dict[str, tuple[list[UInt8[np.ndarray, "_ 3"]], str]] = {}
+        self._build(title, facts)
+        self._draw()
+        self.stage.look_from(self.toward + 0.28 * np.array([1.0, y, 0.0]), self._bounds())
+
+    def _bounds(self) -> Float[np.ndarray, "2 3"]:
+        corners = [s.vertices for s in self.mesh.segments if len(s.vertices)]
+        joint = np.concatenate([self.inspection.cloud.points, *corners])
+        return np.stack([joint.min(axis=0), joint.max(axis=0)])
+
+    def _build(self, title: str, facts: str) -> None:
+        gui = self.server.gui
+        gui.add_html(html.heading(title, facts))
+        gui.add_html(html.chips(self.mesh.names, self.mesh.colors))
+        self.coloring = gui.add_dropdown("Colour", COLORINGS, initial_value="segment")
+        self.legend = gui.add_html("", visible=False)
+        self.coloring.on_update(lambda _: self._draw())
+        self.controls = SegmentControls(gui, self.mesh, self._draw)
+        with gui.add_folder("Observed points"):
+            cloud_on = gui.add_checkbox("show", True)
+            size = gui.add_slider("size", 0.002, 0.04, 0.001, CLOUD_SIZE)
+        points = self.stage.place(self.inspection.cloud.points)
+        cloud = self.server.scene.add_point_cloud(
+            "/cloud", points, CLOUD_COLOR, point_size=size.value, point_shape="circle", precision="float32"
+        )
+        cloud_on.on_update(lambda _: setattr(cloud, "visible", cloud_on.value))
+        size.on_update(lambda _: setattr(cloud, "point_size", size.value))
+        view = gui.add_button_group("View", ("camera", "side", "behind"))
+        view.on_click(lambda _: self._turn(view.value))
+        self._build_probe()
+
+    def _build_probe(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Probe"):
+            self.probing = gui.add_checkbox("ask at a point", False)
+            self.told = gui.add_html(html.message("Click a surface, or drag the arrows of the probe."))
+        self.gizmo = self.server.scene.add_transform_controls(
+            "/probe", scale=0.35, disable_rotations=True, depth_test=False, visible=False
+        )
+        self.gizmo.on_update(lambda _: self.probe(self.stage.back(np.array(self.gizmo.position))))
+        self.probing.on_update(lambda _: self._switch_probe())
+        self.server.scene.on_click()(self._clicked)
+        self._arrow: Any = None
+
+    # --- drawing ------------------------------------------------------------------------------------------------------
+
+    def _draw(self) -> None:
+        """Callbacks run in several threads; one of them draws at a time."""
+        with self._drawing, self.server.atomic():
+            mode = self.coloring.value
+            if mode == "segment":
+                self.legend.visible = False
+                self.layer.show(self.mesh, self.controls)
+                return
+            colors, self.legend.content = self._colors(mode)
+            self.legend.visible = True
+            self.layer.show(self.mesh, self.controls, colors)
+
+    def _colors(self, mode: str) -> tuple[list[UInt8[np.ndarray, "_ 3"]], str]:
+        """Computed when first asked for."""
+        if mode not in self._painted:
+            if mode == "confidence":
+                values, scale = confidence(self.mesh, self.inspection.ask), CONFIDENCE
+            else:
+                values = observed_distance(self.mesh, self.inspection.cloud.points)
+                scale = distance_scale(values, self.unit)
+            self._painted[mode] = [scale.colors(value) for value in values], html.legend(scale)
+        return self._painted[mode]
+
+    def _turn(self, name: str) -> None:
+        side = np.array([1.0, 0.0, 0.0])
+        self.stage.look_from({"camera": self.toward, "side": side, "behind": -self.toward}[name], self._bounds())
+
+    # --- probing ------------------------------------------------------------------------------------------------------
+
+    def _clicked(self, event: Any) -> None:
+        origin, direction = (np.array(ray, dtype=float) for ray in (event.ray_origin, event.ray_direction))
+        place = first_hit(self.mesh, self.stage.back(origin), direction, self.controls.visible())
+        if place is not None:
+            self._move_probe(place)
+            self.probing.value = True
+
+    def _switch_probe(self) -> None:
+        if self.probing.value and self._arrow is None:
+            self._move_probe(self.stage.center)
+        self._show_probe(bool(self.probing.value))
+
+    def _show_probe(self, shown: bool) -> None:
+        self.gizmo.visible = shown
+        if self._arrow is not None:
+            self._arrow.visible = shown
+
+    def _move_probe(self, place: Float[np.ndarray, "3"]) -> None:
+        self.gizmo.position = tuple(self.stage.place(place))
+        self._show_probe(True)
+        self.probe(place)
+
+    def probe(self, place: Float[np.ndarray, "3"]) -> None:
+        """Say what the model answers at a place of the input's frame, and draw the way to the nearest surface."""
+        answer = self.inspection.ask(place[None])
+        colors = (EMPTY_COLOR, *segment_names(self.inspection.model)[1])
+        self.told.content = html.answer(answer, self.inspection.names, colors, tuple(place), self.unit)
+        distance, direction = float(answer.distance[0]), answer.direction[0]
+        if np.isnan(distance) or np.isnan(direction).any():
+            return
+        start = self.stage.place(place)
+        end = start + max(abs(distance) * self.stage.scale, 0.03) * direction
+        self._arrow = self.server.scene.add_arrows(
+            "/arrow",
+            np.stack([start, end])[None].astype(np.float32),
+            colors[int(answer.label[0])],
+            shaft_radius=0.008,
+            head_radius=0.022,
+            head_length=min(0.06, 0.5 * float(np.linalg.norm(end - start))),
+        )

@@ -1,0 +1,101 @@
+"""Small pieces of HTML for the panels; every text from outside is escaped."""
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from mereo.evaluation.metrics import Scores
+from mereo.geometry.mesh import Color
+from mereo.models.model import Answer
+from mereo.visualization.vertex_colors import Scale
+
+SOFT = "opacity:.62"
+BOX = "padding:2px 0.9em 6px;font-size:0.82em;line-height:1.5"
+
+
+def css(color: Color) -> str:
+    return "rgb({},{},{})".format(*color)
+
+
+def heading(title: str, text: str) -> str:
+    """What the page is about."""
+    return (
+        f'<div style="padding:6px 0.75em 4px"><div style="font-weight:650;font-size:1.05em">{escape(title)}</div>'
+        f'<div style="font-size:0.8em;{SOFT}">{escape(text)}</div></div>'
+    )
+
+
+def message(text: str, bad: bool = False) -> str:
+    """One line on what is going on; "" is an empty line, so that nothing jumps."""
+    color = "color:#e5484d" if bad else SOFT
+    return f'<div style="{BOX};min-height:1.9em;{color}">{escape(text) or "&nbsp;"}</div>'
+
+
+def chips(names: Sequence[str], colors: Sequence[Color]) -> str:
+    """The segments' colours by name."""
+    each = "".join(
+        f'<span style="white-space:nowrap;margin-right:11px"><span style="display:inline-block;width:10px;height:10px;'
+        f'border-radius:3px;background:{css(color)};margin-right:5px"></span>{escape(name)}</span> '
+        for name, color in zip(names, colors, strict=True)
+    )
+    return f'<div style="{BOX}">{each}</div>'
+
+
+def legend(scale: Scale) -> str:
+    """A bar with all colours of a scale, and what its ends mean."""
+    stops = ",".join(css(color) for color in scale.stops)
+    return (
+        f'<div style="{BOX}"><div>{escape(scale.title)}</div><div style="height:9px;border-radius:5px;margin:3px 0;'
+        f'background:linear-gradient(90deg,{stops})"></div><div style="display:flex;justify-content:space-between;'
+        f'{SOFT}"><span>{escape(scale.words[0])}</span><span>{escape(scale.words[1])}</span></div></div>'
+    )
+
+
+def bars(rows: Sequence[tuple[str, Color, float]]) -> str:
+    """Numbers from 0 to 1 as named bars; NaN is a dash."""
+    cells = "".join(
+        f"<div>{escape(name)}</div>"
+        f'<div style="background:rgba(128,128,128,.22);border-radius:4px;height:7px;align-self:center"><div style="'
+        f"width:{0 if np.isnan(value) else 100 * min(max(value, 0.0), 1.0):.1f}%;height:7px;border-radius:4px;"
+        f'background:{css(color)}"></div></div>'
+        f'<div style="text-align:right">{"–" if np.isnan(value) else f"{value:.2f}"}</div>'
+        for name, color, value in rows
+    )
+    grid = "display:grid;grid-template-columns:minmax(4.5em,auto) 1fr 2.4em;gap:1px 9px"
+    return f'<div style="{BOX};font-variant-numeric:tabular-nums;{grid}">{cells}</div>'
+
+
+def scores(found: Scores, names: Sequence[str], colors: Sequence[Color]) -> str:
+    """IoU and mIoU large, each segment below."""
+    big = "".join(
+        f'<div><div style="font-size:2.1em;font-weight:650;line-height:1.15">{_score(value)}</div>'
+        f'<div style="{SOFT}">{label}</div></div>'
+        for label, value in (("IoU, whole object", found.iou), ("mIoU, segments", found.miou))
+    )
+    head = f'<div style="{BOX};display:flex;gap:2em;font-variant-numeric:tabular-nums">{big}</div>'
+    rows = [(name, color, float(value)) for name, color, value in zip(names, colors, found.per_segment, strict=True)]
+    return head + bars(rows)
+
+
+def _score(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.3f}"
+
+
+def answer(found: Answer, names: Sequence[str], colors: Sequence[Color], place: Sequence[float], unit: str) -> str:
+    """What the model says at one place: the likeliest classes, distance and direction."""
+    label, probability = int(found.label[0]), found.probability[0]
+    order = np.argsort(-probability, kind="stable")[:4]
+    rows = [(names[k], colors[k], float(probability[k])) for k in order]
+    distance, direction = float(found.distance[0]), found.direction[0]
+    where = "inside" if distance < 0 else "outside"
+    said = "distance not trained" if np.isnan(distance) else f"{abs(distance):.3g}{unit} {where} the nearest surface"
+    toward = "" if np.isnan(direction).any() else f"towards {_vector(direction.tolist())}"
+    return (
+        f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">at {_vector(place)}{unit}</span></div>'
+        f'{bars(rows)}<div style="{BOX}">{escape(said)}<br><span style="{SOFT}">{toward}</span></div>'
+    )
+
+
+def _vector(values: Sequence[float]) -> str:
+    return ", ".join(f"{float(value):.3g}" for value in values)

@@ -1,0 +1,275 @@
+"""The laboratory's page: sliders for a scene and its camera, what the camera sees, what is made of it, and how good.
+
+Hands only leave wishes; one thread (``LatestWins``) fulfils them, so that the page never waits and never lags behind.
+"""
+
+import threading
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import transform_points
+from mereo.scenes.parameters import Parameter, Played, Refused, parameters, random_state, set_value
+from mereo.synthesis.examples import View
+from mereo.visualization.vertex_colors import (
+    CONFIDENCE,
+    Scale,
+    confidence,
+    distance_scale,
+    error_scale,
+    observed_distance,
+    surface_error,
+)
+from mereo.visualization.viewer import html
+from mereo.visualization.viewer.display import CLOUD_COLOR, CLOUD_SIZE, Display, SegmentControls, SegmentLayer
+from mereo.visualization.viewer.laboratory import Laboratory, Trial, depth_picture
+from mereo.visualization.viewer.latest_request import LatestWins
+from mereo.visualization.viewer.sliders import CameraSliders, ParameterSliders
+
+SHOWN = ("reconstruction", "truth", "side by side")
+COLORINGS = ("segment", "error", "confidence", "distance")
+QUICK, FINE = (32, 24), (96, 64)
+"""Resolution of surfaces and cells of the score, while a slider moves and when it rests."""
+
+HISTORY = 60
+"""Scores that the curve remembers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What the page shows: a state as it is seen, and what has been made of that so far."""
+
+    view: View
+    trial: Trial | None = None
+
+
+class LabPage:
+    """Shows a ``Laboratory`` on a server until ``close``."""
+
+    def __init__(self, server: Any, laboratory: Laboratory, title: str, facts: str, seed: int = 0) -> None:
+        self.server, self.laboratory = server, laboratory
+        self._drawing, self._wishing = threading.Lock(), threading.Lock()
+        self._seeds = np.random.default_rng(seed)
+        self._wishes: dict[tuple[Any, int | None], tuple[Parameter, float]] = {}
+        self._new_seed: int | None = seed
+        self._scores: list[tuple[float, float]] = []
+        self.played: Played | None = None
+        self.moment: Moment | None = None
+        rest = laboratory.scene.rest
+        self.stage = Display(server, rest.bounds, np.asarray(laboratory.scene.workspace.axis, dtype=float))
+        self.found, self.true = SegmentLayer(self.stage, "/found"), SegmentLayer(self.stage, "/true")
+        self._build_results(title, facts)
+        self._build_controls(rest)
+        self._look()
+        self.worker = LatestWins(self._quick, self._fine, self._failed)
+        self.worker.submit(None)
+
+    def close(self) -> None:
+        self.worker.stop()
+
+    # --- panels -------------------------------------------------------------------------------------------------------
+
+    def _build_results(self, title: str, facts: str) -> None:
+        gui, panel = self.server.gui, self.server.gui.add_panel()
+        panel.dock_left()
+        panel.set_width(300)
+        with panel.add_tab("What the camera sees"):
+            gui.add_html(html.heading(title, facts))
+            self._picture = gui.add_image(np.zeros((288, 288, 3), dtype=np.uint8), format="png")
+            self._score = gui.add_html("")
+            axes = ({"show": False}, {"stroke": "#9aa3b2", "grid": {"stroke": "rgba(150,160,175,.18)"}, "size": 34})
+            self._curve = gui.add_uplot(
+                (np.arange(2.0), np.zeros(2), np.zeros(2)),
+                (
+                    {"label": "trial"},
+                    {"label": "IoU", "stroke": "#56b4e9", "width": 2},
+                    {"label": "mIoU", "stroke": "#e69f00", "width": 2},
+                ),
+                axes=axes,
+                scales={"x": {"time": False}, "y": {"range": (0.0, 1.0)}},
+                legend={"show": True, "live": False},
+                height=150,
+                visible=False,
+            )
+            self._status = gui.add_html(html.message("starting"))
+
+    def _build_controls(self, rest: SegmentedMesh) -> None:
+        gui = self.server.gui
+        gui.add_html(html.chips(rest.names, rest.colors))
+        has_model = self.laboratory.model is not None
+        self._shown = gui.add_dropdown("Show", SHOWN, initial_value=SHOWN[0 if has_model else 1], visible=has_model)
+        self._coloring = gui.add_dropdown("Colour", COLORINGS, initial_value="segment", visible=has_model)
+        self._legend = gui.add_html("", visible=False)
+        self._points = gui.add_checkbox("observed points", True)
+        view = gui.add_button_group("View", ("camera", "side", "behind"))
+        view.on_click(lambda _: self._look(view.value))
+        for handle in (self._shown, self._coloring, self._points):
+            handle.on_update(lambda _: self._draw())
+        self._shown.on_update(lambda _: self._look())
+        gui.add_button("Random state").on_click(lambda _: self._wish_anew())
+        with gui.add_folder("Camera"):
+            self._camera = CameraSliders(gui, self.laboratory, lambda: self.worker.submit(None))
+        self._sliders = ParameterSliders(gui, gui.add_folder("Deformation"), self._wish)
+        self.controls = SegmentControls(gui, rest, self._draw)
+
+    def _look(self, name: str = "camera") -> None:
+        """The depth camera's own direction, a little from the side, or another one."""
+        bounds, place = self.laboratory.scene.rest.bounds, self._camera.place()
+        T_world_camera = self.laboratory.pose(bounds.mean(axis=0), place)
+        if self.moment is not None:
+            T_world_camera = self.moment.view.T_world_camera
+            bounds = self.moment.view.mesh.transformed(T_world_camera).bounds
+        toward, right = -T_world_camera[:3, 2], T_world_camera[:3, 0]
+        direction = {"camera": toward + 0.2 * right, "side": right, "behind": -toward}[name]
+        room = 1.35 if self._shown.value != "side by side" else 2.4
+        # up is where the depth image has it, so that a rolled camera's view looks like its image
+        self.stage.look_from(direction, bounds, room, -T_world_camera[:3, 1])
+
+    # --- wishes -------------------------------------------------------------------------------------------------------
+
+    def _wish(self, parameter: Parameter, value: float) -> None:
+        with self._wishing:
+            self._wishes[parameter.key, parameter.index] = (parameter, value)
+        self.worker.submit(None)
+
+    def _wish_anew(self) -> None:
+        with self._wishing:
+            self._new_seed = int(self._seeds.integers(2**31))
+        self.worker.submit(None)
+
+    def _fulfil(self) -> tuple[Played, Refused | None]:
+        """The state that is wished for. Values that the scene refuses are left out, and the last of them is told."""
+        with self._wishing:
+            wishes, seed = list(self._wishes.values()), self._new_seed
+            self._wishes, self._new_seed = {}, None
+        scene, refusal = self.laboratory.scene, None
+        if seed is not None or self.played is None:
+            return random_state(scene, seed or 0), None
+        played = self.played
+        for parameter, value in wishes:
+            if parameter.key not in played.keys:
+                continue  # a slider of a part that has just gone has nothing left to move
+            try:
+                played = set_value(scene, played, parameter, value)
+            except Refused as error:
+                refusal = error
+        return played, refusal
+
+    # --- the worker's thread ------------------------------------------------------------------------------------------
+
+    def _quick(self, _: None) -> None:
+        self.played, refusal = self._fulfil()
+        self._sliders.show(parameters(self.played))
+        view, is_first = self.laboratory.look(self.played, self._camera.place()), self.moment is None
+        self.moment = Moment(view)
+        if is_first:
+            self._look()
+        self._picture.image = depth_picture(view.depth, 3)
+        self._rebuild(*QUICK)
+        if refusal is not None:
+            raise refusal
+
+    def _fine(self, _: None) -> None:
+        if self.laboratory.model is not None:
+            self._rebuild(*FINE)
+
+    def _rebuild(self, resolution: int, cells: int) -> None:
+        assert self.moment is not None
+        if self.laboratory.model is None:
+            self._say(f"{len(self.moment.view.depth.to_points())} points seen; no weights, no reconstruction")
+        else:
+            trial = self.laboratory.rebuild(self.moment.view, resolution, cells)
+            self.moment = replace(self.moment, trial=trial)
+            self._tell(trial)
+        self._draw()
+
+    def _failed(self, error: Exception) -> None:
+        self._say(" ".join(str(error).split()) or type(error).__name__, bad=True)
+        self._draw()
+
+    # --- results ------------------------------------------------------------------------------------------------------
+
+    def _say(self, text: str, bad: bool = False) -> None:
+        self._status.content = html.message(text, bad)
+
+    def _tell(self, trial: Trial) -> None:
+        surfaces = trial.result.surfaces
+        self._score.content = html.scores(trial.scores, surfaces.names, surfaces.colors)
+        self._scores = [*self._scores, (trial.scores.iou, trial.scores.miou)][-HISTORY:]
+        if len(self._scores) > 1:
+            columns = np.array(self._scores).T
+            self._curve.data = (np.arange(len(self._scores), dtype=float), columns[0], columns[1])
+            self._curve.visible = True
+        resolution = int(max(trial.result.labels.labels.shape)) - 1
+        self._say(f"{resolution} cells in {trial.seconds:.2f} s; scored on {trial.cells}³ points")
+
+    def _draw(self) -> None:
+        """Callbacks and the worker draw; one at a time."""
+        moment = self.moment
+        if moment is None:
+            return
+        with self._drawing, self.server.atomic():
+            mode, T_world_camera = self._shown.value, moment.view.T_world_camera
+            # side by side: both give way, along the camera's horizon
+            aside = (1.2 if mode == "side by side" else 0.0) * T_world_camera[:3, 0]
+            self._draw_camera(moment.view, -aside)
+            if mode == "reconstruction":
+                self.true.clear_from()
+            else:
+                self.true.show(moment.view.mesh.transformed(T_world_camera), self.controls, shift=aside)
+            self._legend.visible = False
+            if moment.trial is None or mode == "truth":
+                self.found.clear_from()
+                return
+            colors = self._colors(moment.view, moment.trial)
+            surfaces = moment.trial.result.surfaces.transformed(T_world_camera)
+            self.found.show(surfaces, self.controls, colors, -aside)
+
+    def _draw_camera(self, view: View, shift: Float[np.ndarray, "3"]) -> None:
+        """The observed points, and the camera with its image at its place."""
+        scene, T_world_camera = self.server.scene, view.T_world_camera
+        points = self.stage.place(transform_points(T_world_camera, view.depth.to_points().points))
+        scene.add_point_cloud(
+            "/points",
+            points + shift,
+            CLOUD_COLOR,
+            point_size=CLOUD_SIZE,
+            point_shape="circle",
+            precision="float32",
+            visible=bool(self._points.value),
+        )
+        x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
+        scene.add_camera_frustum(
+            "/camera",
+            self.laboratory.scene.workspace.fov_rad,
+            1.0,
+            scale=0.35,
+            color=(150, 160, 176),
+            image=depth_picture(view.depth),
+            format="png",
+            wxyz=(w, x, y, z),
+            position=tuple(self.stage.place(T_world_camera[:3, 3])),
+        )
+
+    def _colors(self, view: View, trial: Trial) -> list[np.ndarray] | None:
+        """Colours of the reconstruction's vertices, with their legend; None for the segments' own."""
+        mode, surfaces = self._coloring.value, trial.result.surfaces
+        if mode == "segment":
+            return None
+        scale: Scale
+        if mode == "error":
+            values, scale = surface_error(surfaces, Solids(view.mesh)), error_scale(view.mesh, "")
+        elif mode == "confidence":
+            assert self.laboratory.model is not None
+            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.code)), CONFIDENCE
+        else:
+            values = observed_distance(surfaces, view.depth.to_points().points)
+            scale = distance_scale(values, "")
+        self._legend.content, self._legend.visible = html.legend(scale), True
+        return [scale.colors(value) for value in values]

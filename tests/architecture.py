@@ -1,0 +1,298 @@
+"""The rules of the package's rooms, read from its sources alone: nothing is imported or run.
+
+``read_package`` reads a folder, whatever its name; every rule is a function of what it returns, or of files, and
+answers with its violations, one readable sentence each. An empty list means that the rule holds.
+
+A module is called by its file below the package's folder, without ``.py``: ``geometry/mesh``, ``io/writers/__init__``.
+"""
+
+import ast
+import re
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+ROOMS = (
+    "geometry",
+    "io",
+    "deformation",
+    "scenes",
+    "synthesis",
+    "models",
+    "reconstruction",
+    "fitting",
+    "evaluation",
+    "training",
+    "visualization",
+    "experiments",
+    "cli",
+)
+"""From the ground up: a room imports only from itself and from those before it."""
+
+DATA_FOLDERS = ("frames", "states", "weights")
+"""They travel with the package and hold no code."""
+
+ROOT_MODULES = ("__init__", "__main__")
+"""The public names and the entry point, which may import every room."""
+
+MAY_IMPORT_TORCH = ("models/", "training/", "experiments/speed/", "cli/doctor.py")
+
+HEAVY = ("numpy", "torch", "scipy", "trimesh", "matplotlib")
+"""What settings must not load, so that ``--help`` is instant: the two, and libraries that bring them."""
+
+MOST_LINES = 300
+
+TYPES_ONLY = ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+"""Conditions that hold for type checkers and never when a program runs."""
+
+MODULE_NAME = re.compile(r"\w+\.[\w.]*")
+
+ROOM_ROW = re.compile(r"^\| *\[?`(\w+)/`", re.MULTILINE)
+"""How a row of the README's table of rooms begins; the room's name may be a link."""
+
+
+@dataclass(frozen=True)
+class Import:
+    """One place where a module names another one, in an import statement or in a string.
+
+    Attributes:
+        source: the module that imports.
+        line: where, counted from 1.
+        target: the module of the package that is imported, or a library's name (``torch``).
+        at_start: importing ``source`` executes it: it is neither in a function, nor for type checkers only, nor a
+            string.
+    """
+
+    source: str
+    line: int
+    target: str
+    at_start: bool
+
+    @property
+    def edge(self) -> str:
+        """The two modules without the line, which every change above it would move."""
+        return f"{self.source} -> {self.target}"
+
+    @property
+    def place(self) -> str:
+        return f"{self.source}.py:{self.line}"
+
+
+@dataclass(frozen=True)
+class Package:
+    """The modules of a package.
+
+    Attributes:
+        root: its folder.
+        trees: the syntax of each module.
+        imports: all that they import, by module.
+    """
+
+    root: Path
+    trees: Mapping[str, ast.Module]
+    imports: Mapping[str, tuple[Import, ...]]
+
+    def __iter__(self) -> Iterator[Import]:
+        for imports in self.imports.values():
+            yield from imports
+
+    def needs(self, module: str) -> list[str]:
+        """What importing a module imports at once: other modules of the package, and libraries."""
+        return [i.target for i in self.imports.get(module, ()) if i.at_start and i.target != module]
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_package(root: Path) -> Package:
+    """Read every module below ``root``, the package's folder, whose name is the package's."""
+    files = sorted(root.rglob("*.py"))
+    trees = {f.relative_to(root).with_suffix("").as_posix(): ast.parse(f.read_text("utf-8"), str(f)) for f in files}
+    modules = {_dotted(root.name, module): module for module in trees}
+    imports = {m: tuple(dict.fromkeys(_imports(root.name, m, tree, modules))) for m, tree in trees.items()}
+    return Package(root, trees, imports)
+
+
+def _dotted(package: str, module: str) -> str:
+    """``mereo.io.writers`` for ``io/writers/__init__``."""
+    return ".".join([package, *module.split("/")]).removesuffix(".__init__")
+
+
+def _imports(package: str, source: str, tree: ast.Module, modules: Mapping[str, str]) -> Iterator[Import]:
+    folder = [package, *source.split("/")[:-1]]
+    for node, at_start in _nodes(tree):
+        for name in _imported(node, folder):
+            library = name.partition(".")[0]
+            target = _module_of(name, modules) if library == package else library
+            yield Import(source, node.lineno, target, at_start)
+        for target in _spelled(node, package, modules):
+            yield Import(source, node.lineno, target, at_start=False)
+
+
+def _nodes(node: ast.AST, at_start: bool = True) -> Iterator[tuple[ast.stmt | ast.expr, bool]]:
+    """All statements and expressions below a node, with whether importing the module executes them."""
+    if isinstance(node, ast.stmt | ast.expr):
+        yield node, at_start
+    inside = at_start and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+    for_types = node.body if isinstance(node, ast.If) and ast.unparse(node.test) in TYPES_ONLY else []
+    for child in ast.iter_child_nodes(node):
+        yield from _nodes(child, inside and child not in for_types)
+
+
+def _imported(node: ast.AST, folder: list[str]) -> list[str]:
+    """Dotted names of what a statement, or a call of ``import_module`` with a literal, imports."""
+    match node:
+        case ast.Import(names=names):
+            return [alias.name for alias in names]
+        case ast.ImportFrom(module=module, names=names, level=level):
+            base = [*folder[: len(folder) - level + 1], *([module] if module else [])] if level else [module or ""]
+            return [".".join([*base, alias.name]) for alias in names]
+        case ast.Call(func=ast.Name(id=called) | ast.Attribute(attr=called), args=[ast.Constant(value=str(name)), *_]):
+            return [name] if called in ("import_module", "__import__") else []
+    return []
+
+
+def _spelled(node: ast.AST, package: str, modules: Mapping[str, str]) -> list[str]:
+    """The module that a string names: for ``import_module``, in a table, or as the constant start of an f-string.
+
+    Without the package's name, as ``"geometry.mesh"``, it must be a whole module: ``"training.csv"`` is a file. An
+    f-string that goes on right after ``"mereo."`` can mean any room, so it counts as the root.
+    """
+    if not (isinstance(node, ast.Constant) and isinstance(node.value, str) and MODULE_NAME.fullmatch(node.value)):
+        return []
+    name = node.value.rstrip(".")
+    if name.partition(".")[0] != package:
+        return [modules[f"{package}.{name}"]] if f"{package}.{name}" in modules else []
+    target = _module_of(name, modules)
+    return [target] if target != "__init__" or name == package else []
+
+
+def _module_of(name: str, modules: Mapping[str, str]) -> str:
+    """The module that a dotted name lies in: itself, or the longest beginning that is one; else the root."""
+    while name not in modules and name:
+        name = name.rpartition(".")[0]
+    return modules.get(name, "__init__")
+
+
+# --- rules of imports -------------------------------------------------------------------------------------------------
+
+
+def upward_imports(package: Package) -> list[Import]:
+    """Imports from a later room or from the root: lazy ones, those for type checkers and names in strings included."""
+    inside = [i for i in package if i.target in package.trees and i.source not in ROOT_MODULES]
+    return [i for i in inside if _height(i.target) > _height(i.source)]
+
+
+def _height(module: str) -> int:
+    """Place of the module's room in ``ROOMS``; what lies in none of them comes after all."""
+    room = module.partition("/")[0]
+    return ROOMS.index(room) if room in ROOMS else len(ROOMS)
+
+
+def differences(upward: Iterable[Import], exceptions: Collection[str]) -> list[str]:
+    """Upward imports that are no known exception (``Import.edge``), and known exceptions that are no longer there."""
+    new = dict.fromkeys(_upward_sentence(i) for i in upward if i.edge not in exceptions)
+    stale = sorted(set(exceptions) - {i.edge for i in upward})
+    return [*new, *(f"{edge} is listed as an exception and no longer there: delete it" for edge in stale)]
+
+
+def _upward_sentence(found: Import) -> str:
+    rule = "a later room" if "/" in found.target else "the root, which lies above all rooms"
+    return f"{found.place} imports {found.target.replace('/', '.')}, {rule}"
+
+
+def torch_imports(package: Package) -> list[str]:
+    """Imports of torch, lazy ones included, in rooms that do without."""
+    return [
+        f"{i.place} imports torch, which only {', '.join(MAY_IMPORT_TORCH)} may"
+        for i in package
+        if i.target == "torch" and not f"{i.source}.py".startswith(MAY_IMPORT_TORCH)
+    ]
+
+
+def heavy_settings(package: Package) -> list[str]:
+    """Modules of settings and conventions that load a heavy library, by themselves or through others."""
+    light = [m for m in package.trees if m.rpartition("/")[2] == "config" or m == "geometry/conventions"]
+    chains = [_chain_to_heavy(package, module) for module in light]
+    return [f"{chain[0]}.py loads {chain[-1]}: {' -> '.join(chain)}" for chain in chains if chain]
+
+
+def _chain_to_heavy(package: Package, module: str) -> list[str]:
+    """A shortest chain of imports from a module to a heavy library; empty where there is none."""
+    chains, seen = deque([[module]]), {module}
+    while chains:
+        chain = chains.popleft()
+        if chain[-1] in HEAVY:
+            return chain
+        for name in package.needs(chain[-1]):
+            if name not in seen:
+                seen.add(name)
+                chains.append([*chain, name])
+    return []
+
+
+def cycles(package: Package) -> list[str]:
+    """Circles of modules that import each other at the start; cutting those named would leave none."""
+    graph = {module: {name for name in package.needs(module) if name in package.trees} for module in package.trees}
+    found: list[str] = []
+    while True:
+        try:
+            TopologicalSorter(graph).prepare()
+        except CycleError as error:
+            circle = error.args[1][::-1]  # now each imports the next
+            found.append(" -> ".join(circle))
+            graph[circle[0]].discard(circle[1])
+        else:
+            return found
+
+
+# --- rules of files ---------------------------------------------------------------------------------------------------
+
+
+def bad_init_files(package: Package) -> list[str]:
+    """Folders of modules below the root whose ``__init__.py`` is missing or is not just a docstring."""
+    folders = sorted({module.rpartition("/")[0] for module in package.trees if "/" in module})
+    faults = {folder: _init_fault(package.trees.get(f"{folder}/__init__")) for folder in folders}
+    return [f"{folder}/__init__.py {fault}" for folder, fault in faults.items() if fault]
+
+
+def _init_fault(tree: ast.Module | None) -> str:
+    if tree is None:
+        return "is missing"
+    if ast.get_docstring(tree) is None:
+        return "has no docstring"
+    return "holds more than its docstring" if len(tree.body) > 1 else ""
+
+
+def misplaced(package: Package) -> list[str]:
+    """Folders that are neither a room nor data, code among the data, and modules at the root that belong in a room."""
+    strange = [folder for folder in _folders(package) if folder not in (*ROOMS, *DATA_FOLDERS)]
+    code = [module for module in package.trees if module.startswith(tuple(f"{d}/" for d in DATA_FOLDERS))]
+    loose = [module for module in package.trees if "/" not in module and module not in ROOT_MODULES]
+    return [
+        *(f"{folder}/ is neither a room nor a folder of data" for folder in strange),
+        *(f"{module}.py is code in a folder of data" for module in code),
+        *(f"{module}.py lies at the root and not in a room" for module in loose),
+    ]
+
+
+def _folders(package: Package) -> list[str]:
+    """Folders directly below the root that hold files; caches that deleted modules left do not count."""
+    files = [file.relative_to(package.root).parts for file in package.root.rglob("*") if file.is_file()]
+    return sorted({parts[0] for parts in files if len(parts) > 1 and "__pycache__" not in parts})
+
+
+def rooms_unlike_readme(package: Package, readme: str) -> list[str]:
+    """Rooms that the README's table of rooms leaves out, and rows of it that are no room of the package."""
+    named, there = set(ROOM_ROW.findall(readme)), {f for f in _folders(package) if f in ROOMS}
+    missing = [f"the README's table of rooms leaves out {room}/" for room in sorted(there - named)]
+    return missing + [f"the README's table of rooms names {room}/, which is no room" for room in sorted(named - there)]
+
+
+def long_files(top: Path, folders: Iterable[str]) -> list[str]:
+    """Python files in these folders of ``top`` that are too long to be read in one go."""
+    files = [file for folder in folders for file in sorted((top / folder).rglob("*.py"))]
+    lines = {file.relative_to(top).as_posix(): len(file.read_text("utf-8").splitlines()) for file in files}
+    return [f"{path} has {n} lines, more than {MOST_LINES}: split it" for path, n in lines.items() if n > MOST_LINES]

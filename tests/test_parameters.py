@@ -1,0 +1,183 @@
+"""Every number that a scene draws can be moved, within the scene's bounds, and nothing else moves with it."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+from toy_scene import rest_mesh, toy_scene
+
+from mereo.deformation.maps import Deformation, Rigid
+from mereo.scenes.draw_recorder import Recorder
+from mereo.scenes.parameters import Parameter, Played, Refused, parameters, play, random_state, set_value, turned
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+
+STILL = np.zeros(3)
+
+
+def scene_of(sample: Callable[[np.random.Generator], tuple[Deformation, ...]]) -> Scene:
+    return Scene("drawn", rest_mesh(), sample)
+
+
+def shifted(*values: float) -> tuple[Deformation, ...]:
+    """One rigid shift for all four segments of the toy."""
+    return (Rigid(STILL, np.array([*values, 0.0, 0.0, 0.0][:3]), STILL),) * 4
+
+
+def named(played: Played, name: str) -> Parameter:
+    return next(parameter for parameter in parameters(played) if parameter.name == name)
+
+
+def shift_of(played: Played) -> np.ndarray:
+    return played.deformations[0](np.zeros((1, 3)))[0]
+
+
+@pytest.mark.parametrize(
+    "draw, cdf",
+    [
+        (lambda rng: rng.uniform(2.0, [3.0, 5.0], size=(2000, 2))[:, 1], ("uniform", (2.0, 3.0))),
+        (lambda rng: rng.random(2000), ("uniform", ())),
+        (lambda rng: rng.normal(1.0, 2.0, size=2000), ("norm", (1.0, 2.0))),
+        (lambda rng: rng.standard_normal(2000), ("norm", ())),
+        (lambda rng: rng.triangular(0.0, 1.0, 4.0, size=2000), ("triang", (0.25, 0.0, 4.0))),
+    ],
+)
+def test_a_recorder_draws_from_the_distribution_that_is_asked_for(draw: Callable, cdf: tuple) -> None:
+    name, parameters = cdf
+    assert kstest(draw(Recorder(3, {})), name, parameters).pvalue > 0.01
+
+
+def test_a_recorder_draws_whole_numbers_and_choices_as_numpy_does() -> None:
+    recorder = Recorder(0, {})
+    assert set(recorder.integers(2, 5, size=200)) == {2, 3, 4}
+    assert set(recorder.integers(2, size=200, endpoint=True)) == {0, 1, 2}
+    chosen = recorder.choice(["a", "b"], size=2000, p=[0.9, 0.1])
+    assert 0.86 < (chosen == "a").mean() < 0.94
+    assert sorted(recorder.permutation(5)) == [0, 1, 2, 3, 4]
+    assert isinstance(recorder.uniform(), float) and isinstance(recorder.integers(3), int)
+    assert recorder.gamma(2.0) > 0  # what is not recorded still works
+
+
+def test_moving_one_number_moves_nothing_else() -> None:
+    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        along, across = rng.uniform(-5.0, 5.0), rng.uniform(1.0, 2.0)
+        return shifted(along, across, rng.normal())
+
+    scene = scene_of(sample)
+    played = random_state(scene, 4)
+    before = shift_of(played)
+    moved = set_value(scene, played, named(played, "along"), 3.25)
+    np.testing.assert_allclose(shift_of(moved), [3.25, *before[1:]], atol=1e-12)
+    assert named(moved, "along").value == pytest.approx(3.25)
+    beyond = set_value(scene, moved, named(moved, "across"), 99.0)
+    np.testing.assert_allclose(shift_of(beyond), [3.25, 2.0, before[2]], atol=1e-8)
+
+
+def test_draws_that_a_choice_brings_come_and_go_and_come_back_the_same() -> None:
+    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        first = rng.uniform(0.0, 1.0) if rng.random() < 0.5 else 7.0 + rng.normal()
+        last = rng.uniform(0.0, 1.0)
+        return shifted(first, last)
+
+    scene = scene_of(sample)
+    played = random_state(scene, 0)
+    switch = parameters(played)[0]
+    low = set_value(scene, played, switch, 0.2)
+    high = set_value(scene, low, parameters(low)[0], 0.8)
+    back = set_value(scene, high, parameters(high)[0], 0.3)
+    assert low.keys != high.keys
+    assert shift_of(low)[0] < 1 < 2 < shift_of(high)[0]
+    np.testing.assert_array_equal(shift_of(back), shift_of(low))
+    assert shift_of(high)[1] == shift_of(low)[1]  # drawn after the choice, and not touched by it
+
+
+def rejecting(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    while True:
+        one, other = rng.uniform(0.0, 1.0), rng.uniform(0.0, 1.0)
+        if one + other > 1.5:
+            break
+    return shifted(one, other, rng.uniform(0.0, 1.0))
+
+
+def test_attempts_that_the_scene_threw_away_have_no_sliders() -> None:
+    scene = scene_of(rejecting)
+    attempts = []
+    for seed in range(20):
+        recorder, _ = play(scene, seed, {}, None)
+        attempts.append(len(recorder.calls))
+        played = random_state(scene, seed)
+        assert len(parameters(played)) == 3
+        # what is kept leads to the same state at once
+        again, deformations = play(scene, seed, {c.key: c.shares for c in played.calls}, None)
+        assert len(again.calls) == 3
+        np.testing.assert_array_equal(deformations[0](np.zeros((1, 3)))[0], shift_of(played))
+    assert max(attempts) > 9
+
+
+def test_a_refused_value_is_said_and_an_allowed_one_taken() -> None:
+    scene = scene_of(rejecting)
+    played = set_value(scene, random_state(scene, 1), named(random_state(scene, 1), "one"), 0.99)
+    played = set_value(scene, played, named(played, "other"), 0.6)
+    np.testing.assert_allclose(shift_of(played)[:2], [0.99, 0.6], atol=1e-8)
+    with pytest.raises(Refused, match="the scene refuses this value of 'other'"):
+        set_value(scene, played, named(played, "other"), 0.4)
+
+
+def test_loops_that_keep_what_they_draw_keep_their_sliders() -> None:
+    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        steps = [rng.uniform(0.0, 1.0) for _ in range(3)]
+        while rng.random() < 0.8:
+            steps.append(rng.uniform(0.0, 1.0))
+        return shifted(sum(steps))
+
+    scene = scene_of(sample)
+    for seed in range(5):
+        recorder, deformations = play(scene, seed, {}, None)
+        played = random_state(scene, seed)
+        assert len(played.calls) == len(recorder.calls)
+        np.testing.assert_array_equal(deformations[0](np.zeros((1, 3)))[0], shift_of(played))
+
+
+def test_many_numbers_move_together_and_stay_as_random_as_they_were() -> None:
+    shares = np.random.default_rng(0).random(4000)
+    for turn in (0.1, 0.3, 0.77):
+        moved = turned(shares, turn, 5)
+        assert kstest(moved, "uniform").pvalue > 0.01
+    np.testing.assert_allclose(turned(shares, 1.0, 5), shares, atol=1e-9)
+    assert np.abs(turned(shares, 0.01, 5) - shares).max() < 0.1
+    assert np.abs(np.corrcoef(turned(shares, 0.25, 5), shares)[0, 1]) < 0.05
+
+
+def test_an_array_of_many_numbers_has_one_slider() -> None:
+    scene = scene_of(lambda rng: shifted(float(rng.normal(size=(4, 3)).sum())))
+    played = random_state(scene, 0)
+    (whole,) = parameters(played)
+    assert (whole.index, whole.low, whole.high, whole.value) == (None, 0.0, 1.0, 0.0)
+    moved = set_value(scene, played, whole, 0.2)
+    assert shift_of(moved)[0] != shift_of(played)[0]
+    home = set_value(scene, moved, parameters(moved)[0], 1.0)
+    np.testing.assert_allclose(shift_of(home), shift_of(played), atol=1e-6)
+
+
+def test_the_toy_scene_has_a_slider_for_every_number_it_draws() -> None:
+    scene = toy_scene()
+    played = random_state(scene, 0)
+    found = parameters(played)
+    assert [(f.low, f.high) for f in found] == [(-1.0, 1.0)] * 3 + [(0.5, 3.0)]
+    assert found[-1].name == "lift"
+    for parameter in found:
+        moved = set_value(scene, played, parameter, parameter.high)
+        points = scene.rest.segments[3].vertices
+        assert np.abs(moved.deformations[3](points) - played.deformations[3](points)).max() > 0.01
+
+
+def test_built_in_scenes_name_their_sliders() -> None:
+    robot = [(f.group, f.name, f.low, f.high) for f in parameters(random_state(load_scene("robot"), 0))]
+    assert [name for _, name, _, _ in robot] == [*(f"angles {k}" for k in range(1, 7)), "opening"]
+    assert robot[0][2:] == (-170.0, 170.0)
+    (cycle,) = parameters(random_state(load_scene("engine"), 0))
+    assert (cycle.name, cycle.unit) == ("cycle", "°")
+    assert (cycle.low, cycle.high) == pytest.approx((0.0, 720.0))
+    rope = parameters(random_state(load_scene("rope"), 3))
+    assert {"coil start", "coil rate", "coil pitch"} <= {f.name for f in rope}
