@@ -45,7 +45,8 @@ def align_file(
         start: the start file, see ``rough_start``; either this or ``weights``.
         weights: a shipped name or a file, from which a start is made.
         scene_unit_mm: millimetres per scene unit, where the scene does not say.
-        as_one, hold: see ``placement.place``.
+        as_one: see ``placement.place``.
+        hold: see ``placement.place``.
         force: replace an existing folder.
     """
     if (start is None) == (weights is None):

@@ -59,7 +59,8 @@ def extract(
         field: logits of empty space and of each segment, in this order.
         box: lower and upper corner of the region; a segment that leaves it is closed half a voxel outside.
         resolution: cells along the longest side; voxels are cubes.
-        names, colors: of the segments.
+        names: of the segments.
+        colors: of the segments.
         nested: which of them lie inside another; the outer one's surface is then that of both together.
 
     Raises ``ValueError`` for a resolution below 4, an empty box, or a grid over ``MAX_NODES`` nodes.

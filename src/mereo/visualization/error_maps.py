@@ -36,7 +36,8 @@ def error_picture(
     Args:
         path: the .png file.
         cases: the rows.
-        direction, up: how to look, in the cases' frame; the default is the camera's view.
+        direction: where to look, in the cases' frame; the default is the camera's view.
+        up: what is up in the picture, in the same frame.
         size: width and height of each picture in pixels.
     """
     images: list[Picture] = []
