@@ -89,9 +89,11 @@ def _packages(folder: Path) -> Iterator[Path]:
 
 
 def _rooms(folder: Path) -> list[Any]:
-    """The navigation of the folders below this one; a room with rooms in it is a section."""
+    """The navigation of the folders below this one, in the README's order; a room with rooms in it is a section."""
+    order = re.findall(r"^\| `(\w+)/` \|", (ROOT / "README.md").read_text(), re.MULTILINE)
     found: list[Any] = []
-    for package in (p for p in _packages(folder) if p.parent == folder):
+    rooms = (package for package in _packages(folder) if package.parent == folder)
+    for package in sorted(rooms, key=lambda room: order.index(room.name) if room.name in order else len(order)):
         inner = _rooms(package)
         found.append({package.name: [_page_of(package), *inner]} if inner else _page_of(package))
     return found
