@@ -21,6 +21,7 @@ FENCE = re.compile(r"^ *```(\w*)[^\n]*\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 RELEASED = [page for page in PAGES if page != EXPERIMENTS]
 """Pages about the code as it is; an experiment is about the code of its commit."""
+ROOMS = "|".join(init.parent.name for init in sorted(ROOT.glob("src/mereo/*/__init__.py")))
 
 
 def prose(page: Path) -> str:
@@ -113,6 +114,33 @@ def test_imports_in_python_blocks_exist() -> None:
                 if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mereo"):
                     module = importlib.import_module(node.module)
                     assert all(hasattr(module, alias.name) for alias in node.names), f"{page}: {ast.unparse(node)}"
+
+
+def exists(name: str) -> bool:
+    """Whether this is a module of mereo or a definition in one, as ``models.decoder.LocalAttention`` is."""
+    parts = name.split(".")
+    depth = next(n for n in range(len(parts), 0, -1) if is_module(ROOT.joinpath("src", "mereo", *parts[:n])))
+    if depth == len(parts):
+        return True  # not imported: Triton's kernels cannot be everywhere
+    found: object = importlib.import_module(".".join(["mereo", *parts[:depth]]))
+    for part in parts[depth:]:
+        if not hasattr(found, part) and part not in getattr(found, "__annotations__", {}):
+            return False
+        found = getattr(found, part, None)
+    return True
+
+
+def is_module(path: Path) -> bool:
+    return path.is_dir() or path.with_suffix(".py").is_file()
+
+
+def test_modules_and_definitions_that_pages_name_exist() -> None:
+    assert exists("synthesis.examples.LabelledPoints.rest")  # a field without a default
+    assert not exists("synthesis.examples.LabelledPoints.nothing")
+    assert not exists("synthesis.nothing")
+    for page in RELEASED:
+        named = re.findall(rf"`(?:mereo\.)?((?:{ROOMS})(?:\.\w+)+)[(`]", page.read_text())
+        assert [name for name in named if not exists(name)] == [], page
 
 
 def test_citation_is_of_this_version() -> None:
