@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.geometry.camera import Camera
-from mereo.io.atomic_files import atomic_file, new_directory, write_camera, write_json
-from mereo.io.readers import read_camera
+from mereo.io.atomic_files import atomic_file, new_directory, write_json
 
 INTERRUPTIONS = [ValueError("no"), KeyboardInterrupt(), SystemExit(1)]
 
@@ -101,9 +99,3 @@ def test_json_knows_arrays_and_has_no_nan(tmp_path: Path) -> None:
     )
     loaded = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert loaded == {"a": [0, 1, 2], "b": [0.5, None], "c": "x", "é": True}
-
-
-def test_intrinsics_come_back_exactly(tmp_path: Path) -> None:
-    camera = Camera(96, 64, 101.123456789, 99.1, 48.25, 31.5)
-    write_camera(tmp_path / "c.json", camera)
-    assert read_camera(tmp_path / "c.json") == camera

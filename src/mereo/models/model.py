@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.downsampling import random_subset
 from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.geometry.mesh import Color
 from mereo.geometry.normalizer import Normalizer
@@ -138,7 +139,7 @@ class Model:
         points = checked_points(cloud)
         normalizer = Normalizer.fit(points)
         limit = self.network.config.points
-        normalized = normalizer.apply(thin(points, limit * DENSE_FACTOR)).astype(np.float32)
+        normalized = normalizer.apply(random_subset(points, limit * DENSE_FACTOR)).astype(np.float32)
         seen = normalized[farthest_point_order(normalized, limit)]
         return torch.from_numpy(seen[np.arange(limit) % len(seen)][None]), normalizer
 
@@ -246,10 +247,3 @@ def checked_points(cloud: PointCloud) -> Float[np.ndarray, "n 3"]:
             "be in a camera frame (x right, y down, z forward): turn it, or pass --frame scanner for y-up scans"
         )
     return points
-
-
-def thin(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.ndarray, "m 3"]:
-    """At most ``limit`` of the points, chosen at random but always the same way."""
-    if len(points) <= limit:
-        return points
-    return points[np.random.default_rng(0).choice(len(points), limit, replace=False)]

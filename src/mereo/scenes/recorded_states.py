@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.deformation.surface_driven import Surface, SurfaceMap
 from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
@@ -59,7 +60,7 @@ class States:
 
     def sample(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
         """The deformations of one frame, each as likely as the other."""
-        return self.frames.deformations(int(rng.integers(self.first, self.end)))
+        return self.frames.deformations(int(named(rng, "frame").integers(self.first, self.end)))
 
 
 @dataclass(frozen=True, eq=False)

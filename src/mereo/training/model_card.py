@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from mereo.evaluation.metrics import format_score
 from mereo.io.atomic_files import new_directory
 from mereo.models.model import Model
 from mereo.models.network import config_from_dict
@@ -122,12 +123,8 @@ def _result(test: dict[str, Any]) -> str:
         )
     names = ["IoU", "mIoU", *segments]
     values = [test["iou"], test["miou"], *segments.values()]
-    rows = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}", f"| {' | '.join(_rounded(v) for v in values)} |"]
+    rows = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}", f"| {' | '.join(format_score(v) for v in values)} |"]
     return "\n".join([f"{title}:\n", *rows, ""])
-
-
-def _rounded(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
 
 
 def _limits(model: Model, tests: Sequence[dict[str, Any]]) -> str:

@@ -11,7 +11,7 @@ OBJECTS = ("rope", "shapes", "lizard", "robot", "human")
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
-    """Two trainings per object that differ in nothing else."""
+    """Result of two trainings per object, with and without the encoding, that differ in nothing else."""
     rows, holds = [], {}
     for scene in scale.choose(OBJECTS):
         paper = published()["positional-encoding"].get(scene, {})

@@ -1,4 +1,4 @@
-"""The straightforward implementation of the same network, to compare with: what one writes first.
+"""Baseline of speed: the straightforward implementation of the same network, which is what one writes first.
 
 Float32, eager; the code is concatenated to every query instead of being multiplied once per cloud; normalization is a
 layer of its own; farthest-point sampling inside the network, and the encoder run again for every chunk of queries. It
@@ -17,11 +17,18 @@ from mereo.models.model import Model
 from mereo.models.network import Network
 
 CHUNK = 50_000
-"""Queries at once."""
+"""Number of queries that are answered at once."""
 
 
 class Rival:
-    """A model's answers about one cloud. ``cloud`` and ``viewpoint`` are normalized, one cloud, any order."""
+    """Straightforward implementation of a model's answers about one cloud.
+
+    Attributes:
+        model: the model whose weights are taken.
+        cloud: normalized points of the cloud, in any order.
+        normalizer: the way from the user's frame to normalized coordinates.
+        viewpoint: the normalized place of the camera.
+    """
 
     def __init__(self, model: Model, cloud: Float[Tensor, "1 n 3"], normalizer: Normalizer) -> None:
         self.model, self.cloud, self.normalizer = model, cloud, normalizer
@@ -51,7 +58,7 @@ class Rival:
 
 
 def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, " m"]:
-    """Greedy farthest-point sampling from the first point on, one point after the other; repeated points last."""
+    """Rows of points by greedy farthest-point sampling from the first one on; repeated points come last."""
     distance = torch.full((len(points),), torch.inf, device=points.device)
     chosen = [torch.zeros((), dtype=torch.long, device=points.device)]
     while len(chosen) < count:
@@ -62,7 +69,7 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, " m
 
 
 def decode(decoder: Decoder, code: Code, latent: Float[Tensor, "1 z"], queries: Float[Tensor, "1 q 3"]) -> Prediction:
-    """As ``Decoder.forward``, with the latent vector at every query; the layers are the decoder's own."""
+    """Prediction as of ``Decoder.forward``, with the latent vector at every query; the layers are the decoder's own."""
     config = decoder.config
     everywhere = latent[:, None].expand(-1, queries.shape[1], -1)
     placed = queries if code.alignment is None else code.alignment.apply(queries)

@@ -16,7 +16,7 @@ Turns = tuple[tuple[str, float, float], ...]
 
 
 @dataclass(frozen=True)
-class Joint:
+class BodyJoint:
     """What turns about one point.
 
     Attributes:
@@ -52,24 +52,24 @@ class Joint:
 FACE = ("head", "jaw", "eye", "tongue", "levator", "oculi", "orbicularis", "oris", "risorius", "special")
 
 
-def _trunk() -> Iterator[Joint]:
+def _trunk() -> Iterator[BodyJoint]:
     bend: Turns = (("y", -15, 15), ("z", -12, 12), ("x", -10, 22))
-    yield Joint("waist", "", "spine04", "spine02____head", (("spine04", "spine03"), ""), 2.5, bend)
+    yield BodyJoint("waist", "", "spine04", "spine02____head", (("spine04", "spine03"), ""), 2.5, bend)
     chest = ("spine02", "spine01", "clavicle", "breast", "shoulder01")
-    yield Joint("chest", "waist", "spine02", "neck01____head", (chest, ""), 2.5, bend)
+    yield BodyJoint("chest", "waist", "spine02", "neck01____head", (chest, ""), 2.5, bend)
     turns: Turns = (("y", -25, 25), ("z", -10, 10), ("x", -12, 15))
-    yield Joint("neck", "chest", "neck01", "head____head", (("neck",), ""), 1.6, turns)
-    yield Joint("head", "neck", "head", "head____tail", (FACE, ""), 2.0, turns)
+    yield BodyJoint("neck", "chest", "neck01", "head____head", (("neck",), ""), 1.6, turns)
+    yield BodyJoint("head", "neck", "head", "head____tail", (FACE, ""), 2.0, turns)
 
 
-def _limbs(side: str) -> Iterator[Joint]:
+def _limbs(side: str) -> Iterator[BodyJoint]:
     """Of one side, `L` or `R`; the limits are those of the left side and mirrored for the right one."""
 
     def limb(
         name: str, parent: str, bone: str, tip: str, skin: tuple[str, ...], softness: float, turns: Turns
-    ) -> Joint:
+    ) -> BodyJoint:
         above = parent if parent in ("chest", "") else f"{parent}.{side}"
-        return Joint(
+        return BodyJoint(
             f"{name}.{side}", above, f"{bone}.{side}", f"{tip}.{side}____head", (skin, f".{side}"), softness, turns
         )
 
@@ -110,7 +110,20 @@ def turn_limits() -> Float[np.ndarray, "2 j 3"]:
     return limits
 
 
-def _axis(joint: Joint, name: str) -> Float[np.ndarray, "3"]:
+@cache
+def turn_names() -> tuple[str, ...]:
+    """Name of each turn, joint by joint in the order of ``turn_limits``; "" where there is none."""
+    about = {"bone": "twist", "hinge": "bend", "x": "about x", "y": "about y", "z": "about z"}
+    names = []
+    for joint in JOINTS:
+        part, _, side = joint.name.replace("_", " ").partition(".")
+        owner = f"{'left ' if side == 'L' else 'right ' if side else ''}{part}"
+        turns = [f"{owner} {about[axis]}" for axis, _, _ in joint.turns]
+        names += [*turns, *("" for _ in range(3 - len(turns)))]
+    return tuple(names)
+
+
+def _axis(joint: BodyJoint, name: str) -> Float[np.ndarray, "3"]:
     right = joint.name.endswith("R")
     if name == "bone":  # a turn about a mirrored bone is mirrored by turning the other way
         return joint.direction * (-1.0 if right else 1.0)

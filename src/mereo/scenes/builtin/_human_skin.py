@@ -137,8 +137,8 @@ def _extended(shares: Float[np.ndarray, "r j"], number: Int[np.ndarray, "x y z"]
 class PosedBody:
     """The body's shape, then its pose: every joint turns each point by the point's share of the joint's angle.
 
-    Angles are blended, not matrices, so limbs do not collapse (see ``skeleton``). Joints turn from the leaves to the
-    root, in rest coordinates.
+    Angles are blended, not matrices, so every step stays a rotation and limbs do not collapse (cf. Kavan & Zara,
+    "Spherical blend skinning", 2005). Joints turn from the leaves to the root, in rest coordinates.
 
     Attributes:
         rotations: of each joint, axis times radians.

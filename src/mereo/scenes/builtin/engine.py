@@ -34,6 +34,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation, Identity, Rigid, smooth_step
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.scenes.builtin import _engine_parts as parts
@@ -145,7 +146,7 @@ def deformations_at(crank_rad: float) -> tuple[Deformation, ...]:
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """A crank angle uniform over the cycle."""
-    return deformations_at(rng.uniform(0.0, CYCLE_RAD))
+    return deformations_at(named(rng, "crank angle", "rad").uniform(0.0, CYCLE_RAD))
 
 
 def scene() -> Scene:

@@ -23,6 +23,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
@@ -58,6 +59,7 @@ MIDDLE_LINK = 3
 SPINE_LIMIT_RAD = np.array([0.23 if number in STIFF_HINGES else 0.36 for number in range(len(SPINE))])
 SWING_RAD, FOOT_RAD = 0.36, 0.28
 SPINE_PLAY_RAD, LEG_PLAY_RAD = 0.025, 0.05
+PLAYS = ("about x", "about y")
 HARMONICS = 3
 GAP = 0.2
 """Least distance between links that are not neighbours, in the plane."""
@@ -77,10 +79,12 @@ def sample_spine(rng: np.random.Generator) -> Float[np.ndarray, "h 3"]:
     """Rotation vectors of the knuckles: a smooth curve about the vertical, scaled to a random share of the limits."""
     k = np.arange(HARMONICS + 1)[:, None]
     along = np.arange(len(SPINE)) / (len(SPINE) - 1)
-    waves = rng.normal(size=k.shape) / (1 + k) * np.cos(np.pi * k * along + rng.uniform(0, 2 * np.pi, size=k.shape))
-    curve = waves.sum(axis=0)
-    yaw = SPINE_LIMIT_RAD * curve * rng.uniform(0.35, 1.0) / np.abs(curve).max()
-    play = rng.uniform(-SPINE_PLAY_RAD, SPINE_PLAY_RAD, size=(len(SPINE), 2))
+    amplitudes = named(rng, "harmonics").normal(size=k.shape) / (1 + k)
+    phases = named(rng, "phase", "rad").uniform(0, 2 * np.pi, size=k.shape)
+    curve = (amplitudes * np.cos(np.pi * k * along + phases)).sum(axis=0)
+    yaw = SPINE_LIMIT_RAD * curve * named(rng, "bend").uniform(0.35, 1.0) / np.abs(curve).max()
+    names = tuple(f"play of knuckle {number} {about}" for number in range(1, len(SPINE) + 1) for about in PLAYS)
+    play = named(rng, names, "rad").uniform(-SPINE_PLAY_RAD, SPINE_PLAY_RAD, size=(len(SPINE), 2))
     return np.column_stack([play, yaw])
 
 
@@ -144,9 +148,10 @@ def is_clear(spine: Float[np.ndarray, "k 4 4"], legs: dict[str, Float[np.ndarray
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """One map for each segment: its inner knuckles turn, then it follows the link that carries it."""
     while True:
-        vectors = sample_spine(rng)
+        with part(rng, "spine"):
+            vectors = sample_spine(rng)
         spine = spine_motions(vectors)
-        swings = {name: _leg_vectors(rng) for name in LEGS}
+        swings = {name: _leg_vectors(rng, name) for name in LEGS}
         legs = {name: _leg_motions(name, spine, swing) for name, swing in swings.items()}
         if is_clear(spine, legs):
             break
@@ -160,10 +165,13 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     return tuple(maps)
 
 
-def _leg_vectors(rng: np.random.Generator) -> Float[np.ndarray, "2 3"]:
+def _leg_vectors(rng: np.random.Generator, name: str) -> Float[np.ndarray, "2 3"]:
     """Rotation vectors at the root and at the ankle."""
-    play = rng.uniform(-LEG_PLAY_RAD, LEG_PLAY_RAD, size=(2, 2))
-    return np.column_stack([play, rng.uniform(-1.0, 1.0, size=2) * (SWING_RAD, FOOT_RAD)])
+    names = tuple(f"play of the {place} {about}" for place in ("leg", "foot") for about in PLAYS)
+    with part(rng, name.replace("_", " ")):
+        play = named(rng, names, "rad").uniform(-LEG_PLAY_RAD, LEG_PLAY_RAD, size=(2, 2))
+        turns = named(rng, ("swing", "swing of the foot")).uniform(-1.0, 1.0, size=2) * (SWING_RAD, FOOT_RAD)
+    return np.column_stack([play, turns])
 
 
 def _leg_motions(
