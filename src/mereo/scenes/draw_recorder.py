@@ -79,11 +79,12 @@ class Recorder(NamedGenerator):
         self._given, self._most = given, most
         self._fresh = np.random.default_rng([seed, 0])
         self._seen: Counter[Place] = Counter()
+        self._ends: Any = None
 
     def __reduce__(self) -> Any:
         raise TypeError("a Recorder belongs to one run of a scene and cannot be copied")
 
-    def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any, ends: Any = None) -> Shares:
+    def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any) -> Shares:
         if self._most is not None and len(self.calls) >= self._most:
             raise OutOfDraws
         trail, name = _trail(), self.take_name()
@@ -97,7 +98,8 @@ class Recorder(NamedGenerator):
             shares = self._fresh.random(size)
         shares = np.clip(shares, SMALLEST_SHARE, 1 - SMALLEST_SHARE)
         bounds = [np.broadcast_to(np.asarray(bound, dtype=float), shape).ravel() for bound in (low, high)]
-        self.calls.append(Call(key, trail, name, kind, shares, bounds[0], bounds[1], shape, ends))
+        self.calls.append(Call(key, trail, name, kind, shares, bounds[0], bounds[1], shape, self._ends))
+        self._ends = None
         return shares
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
@@ -147,8 +149,8 @@ class Recorder(NamedGenerator):
             return super().choice(a, size, replace, p, axis, shuffle)
         options = np.arange(a) if np.ndim(a) == 0 else np.asarray(a)
         count, shape = options.shape[axis], _shape(size)
-        ends = np.cumsum(np.full(count, 1 / count) if p is None else p)
-        shares = self._take("choice", shape, 0, count, ends).reshape(shape)
+        self._ends = ends = np.cumsum(np.full(count, 1 / count) if p is None else p)
+        shares = self._take("choice", shape, 0, count).reshape(shape)
         index = np.minimum(np.searchsorted(ends, shares, side="right"), count - 1)
         chosen = np.take(options, index, axis=axis)
         return _plain(chosen)

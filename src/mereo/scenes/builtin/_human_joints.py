@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin._human_parts import joints
 
 Turns = tuple[tuple[str, float, float], ...]
@@ -98,7 +99,7 @@ def turn_axes() -> Float[np.ndarray, "j 3 3"]:
     for index, joint in enumerate(JOINTS):
         for place, (name, _, _) in enumerate(joint.turns):
             axes[index, place] = _axis(joint, name)
-    return axes
+    return read_only(axes)
 
 
 @cache
@@ -107,7 +108,7 @@ def turn_limits() -> Float[np.ndarray, "2 j 3"]:
     limits = np.zeros((2, len(JOINTS), 3))
     for index, joint in enumerate(JOINTS):
         limits[:, index, : len(joint.turns)] = np.deg2rad([turn[1:] for turn in joint.turns]).T
-    return limits
+    return read_only(limits)
 
 
 @cache
@@ -142,7 +143,7 @@ def part_axes() -> tuple[Float[np.ndarray, "j 3 3"], Float[np.ndarray, "j 3"]]:
     """For each part the projection across its axis, and the joint at which it begins."""
     directions = np.stack([joint.direction for joint in JOINTS])
     projections = np.eye(3) - directions[:, :, None] * directions[:, None]
-    return projections, np.stack([joint.head for joint in JOINTS])
+    return read_only(projections), read_only(np.stack([joint.head for joint in JOINTS]))
 
 
 def rotations(angles_rad: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3"]:

@@ -15,6 +15,7 @@ from scipy.sparse import csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from mereo.geometry.read_only import read_only
 from mereo.geometry.solids import label_grid
 from mereo.scenes.builtin._human_joints import JOINTS, PARENTS, part_axes
 from mereo.scenes.builtin._human_parts import base, rest_mesh, skin_weights, to_scene
@@ -186,4 +187,4 @@ def _own_shares() -> Float[np.ndarray, "j j"]:
     for child, parent in enumerate(PARENTS):
         if parent >= 0:
             own[child, parent] = -1.0
-    return own
+    return read_only(own)

@@ -17,6 +17,7 @@ from mereo.deformation.warps import Bend, FreeFormLattice, Squash, Twist
 from mereo.geometry.manifold import Faces, Vertices, solid_of
 from mereo.geometry.mesh import PALETTE, Segment, vertex_normals
 from mereo.geometry.mesh_repair import close_holes, largest_piece
+from mereo.geometry.read_only import read_only
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes import assets
 from mereo.scenes.builtin._real_meshes import main_part, simplified
@@ -112,7 +113,7 @@ EDGE_SHARE = 0.12
 def _places() -> dict[str, tuple[Vertices, Vertices]]:
     """Where each kind of instrument may be, with outward normals."""
     liver, gallbladder = organs()
-    normals = [vertex_normals(part) for part in (liver, gallbladder)]
+    normals = [read_only(vertex_normals(part)) for part in (liver, gallbladder)]
     tree = cKDTree(liver.vertices)
     around = tree.query_ball_point(liver.vertices, 25.0 * MM)
     mean = np.stack([liver.vertices[rows].mean(axis=0) for rows in around])
@@ -120,7 +121,7 @@ def _places() -> dict[str, tuple[Vertices, Vertices]]:
     height = np.einsum("ni,ni->n", normals[0], liver.vertices - mean)
     edge = height > np.quantile(height, 1 - EDGE_SHARE)
     return {
-        "edge": (liver.vertices[edge], normals[0][edge]),
+        "edge": (read_only(liver.vertices[edge]), read_only(normals[0][edge])),
         "gallbladder": (gallbladder.vertices, normals[1]),
         "surface": (liver.vertices, normals[0]),
     }

@@ -20,6 +20,7 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, smooth_step, turn
 from mereo.deformation.warps import SmoothField, Squash
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes import assets
 from mereo.scenes.builtin._solids import Vector
 from mereo.scenes.scene import WHOLE_SPHERE_RAD, Scene, Workspace
@@ -50,7 +51,7 @@ def model_to_scene() -> tuple[Float[np.ndarray, "3"], float]:
     """``scene = (model - center) * scale`` takes the metres of bunny.off to scene units."""
     vertices = _load().vertices
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return (low + high) / 2, float(SHORTEST_SIDE / (high - low).min())
+    return read_only((low + high) / 2), float(SHORTEST_SIDE / (high - low).min())
 
 
 @cache

@@ -38,6 +38,7 @@ from scipy.spatial.distance import cdist
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, jacobian_determinant
 from mereo.deformation.warps import SmoothField
+from mereo.geometry.read_only import read_only
 from mereo.geometry.solids import label_grid
 from mereo.scenes.builtin._human_joints import JOINTS, NAMES, part_axes, rotations, turn_limits, turn_names
 from mereo.scenes.builtin._human_parts import SCALE, base, rest_mesh, to_scene
@@ -91,7 +92,8 @@ def balls() -> Balls:
         if (np.linalg.norm(centers - vertex, axis=1) - radii).min() > BARE:
             centers, radii = np.concatenate([centers, vertex[None]]), np.append(radii, 0.0)
     touching = radii[:, None] + radii
-    return Balls(centers, np.where(cdist(centers, centers) - touching > APART, touching + LEAST_GAP, -1.0))
+    apart = np.where(cdist(centers, centers) - touching > APART, touching + LEAST_GAP, -1.0)
+    return Balls(read_only(centers), read_only(apart))
 
 
 def is_clear(posed: Deformation) -> bool:
@@ -110,7 +112,7 @@ def critical_points() -> Float[np.ndarray, "n 3"]:
     lever = np.linalg.norm(vertices[:, None] - part_axes()[1], axis=2)
     largest = np.abs(turn_limits()).max(axis=(0, 2))
     pressed = (np.linalg.norm(slope, axis=2) * lever * largest).max(axis=1)
-    return vertices[np.argsort(-pressed, kind="stable")[:CRITICAL]]
+    return read_only(vertices[np.argsort(-pressed, kind="stable")[:CRITICAL]])
 
 
 def sample_body(rng: np.random.Generator) -> PosedBody:

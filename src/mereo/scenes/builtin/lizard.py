@@ -26,6 +26,7 @@ from jaxtyping import Float
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.scenes.builtin._hinges import Hinged, follow, rigid_map
 from mereo.scenes.builtin._lizard_parts import (
@@ -56,7 +57,7 @@ LEGS = {
 """Plan, side, and the link that carries it."""
 
 MIDDLE_LINK = 3
-SPINE_LIMIT_RAD = np.array([0.23 if number in STIFF_HINGES else 0.36 for number in range(len(SPINE))])
+SPINE_LIMIT_RAD = read_only(np.array([0.23 if number in STIFF_HINGES else 0.36 for number in range(len(SPINE))]))
 SWING_RAD, FOOT_RAD = 0.36, 0.28
 SPINE_PLAY_RAD, LEG_PLAY_RAD = 0.025, 0.05
 PLAYS = ("about x", "about y")
@@ -105,7 +106,7 @@ def _spine_discs() -> tuple[tuple[int, Float[np.ndarray, "d 4"]], ...]:
     for link in range(1, len(ends) - 1):
         stations = np.arange(ends[link] + 0.7, ends[link + 1] + 1.0, 1.5)
         discs.append((link, np.array([[NOSE - s, 0.0, 2.0, half_width(s) + 0.4] for s in stations])))
-    return tuple(discs)
+    return tuple((link, read_only(covering)) for link, covering in discs)
 
 
 @cache
@@ -117,7 +118,7 @@ def _leg_discs(name: str) -> tuple[Float[np.ndarray, "u 4"], Float[np.ndarray, "
     vertices = np.array(leg(plan, side).foot.to_mesh().vert_properties[:, :3], dtype=float)
     x, y, _ = leg(plan, side).ankle.pivot
     far = vertices[np.hypot(vertices[:, 0] - x, vertices[:, 1] - y) > 1.0][::7]
-    return np.array([knee]), np.column_stack([far, np.zeros(len(far))])
+    return read_only(np.array([knee])), read_only(np.column_stack([far, np.zeros(len(far))]))
 
 
 def _moved(discs: Float[np.ndarray, "d 4"], motion: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "d 3"]:

@@ -34,6 +34,7 @@ from jaxtyping import Float
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin import _robot_parts as parts
 from mereo.scenes.builtin._solids import Vector, segment
 from mereo.scenes.scene import Scene, Workspace
@@ -90,7 +91,7 @@ COLUMN = (
 )
 UPPER_ARM = (Bulk(2, (3.5, 5.4, 19.0), (3.5, 5.4, 37.0), 4.4, 9),)
 
-FOOT = np.array([[-10.6, -10.0, -50.0], [10.0, 10.0, 10.4]])
+FOOT = read_only(np.array([[-10.6, -10.0, -50.0], [10.0, 10.0, 10.4]]))
 """A box around the base and the turntable."""
 
 

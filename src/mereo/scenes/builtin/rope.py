@@ -27,6 +27,7 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation, Identity
 from mereo.deformation.warps import CurveSweep
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.scene import Scene, Workspace
 
 SEGMENTS = 8
@@ -104,7 +105,7 @@ def rest_mesh() -> SegmentedMesh:
     return SegmentedMesh((_base(), *(_piece(number) for number in range(SEGMENTS))))
 
 
-NODES = np.linspace(0.0, LENGTH, 97)
+NODES = read_only(np.linspace(0.0, LENGTH, 97))
 
 COILS = 1 / 3
 """The share of ropes that coil."""

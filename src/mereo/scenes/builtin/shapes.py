@@ -30,6 +30,7 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Rigid
 from mereo.deformation.warps import Bend, SmoothField, Squash, Taper, Twist
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin import _shapes_parts as solid
 from mereo.scenes.builtin._solids import segment
 from mereo.scenes.scene import Scene, Workspace
@@ -38,7 +39,7 @@ LONGEST_EDGE = 1.15
 GAP = 0.1
 """Air between a solid and the one that it stands on."""
 
-UP = np.array([0.0, 0.0, 1.0])
+UP = read_only(np.array([0.0, 0.0, 1.0]))
 CELLS = {"box": (45.0, 20.0), "star": (135.0, 0.0), "wedge": (225.0, 80.0), "arch": (315.0, -35.0)}
 """Where each of the four around the post stands and how far it is turned at rest, in degrees."""
 

@@ -32,10 +32,11 @@ from scipy.spatial import cKDTree
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Rigid, smooth_step
 from mereo.deformation.warps import Bend, CurveSweep, SmoothField, Twist
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin._sheet_parts import LARGEST_OFFSET, middle_points, rest_mesh
 from mereo.scenes.scene import Scene, Workspace
 
-NODES = np.linspace(-42.0, 42.0, 169)
+NODES = read_only(np.linspace(-42.0, 42.0, 169))
 """Stations along the sweep's curve; the sheet reaches 34 units from its middle."""
 
 GENTLE = 0.05
@@ -140,7 +141,7 @@ def _turned(heading: float) -> Rigid:
 
 @cache
 def _middle() -> Float[np.ndarray, "k 3"]:
-    return middle_points()
+    return read_only(middle_points())
 
 
 def _do_not_meet(corners: list[Bend]) -> bool:
