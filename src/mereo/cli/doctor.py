@@ -23,6 +23,7 @@ PURPOSES: dict[str, str] = {
     "simulation": "states from finite elements",
     "cluster": "data generation on several machines",
     "align": "ground truth from scans",
+    "docs": "the documentation as pages",
     "dev": "tests and checks",
 }
 """Purpose of each extra of pyproject.toml; which packages it means is read from the installed metadata."""

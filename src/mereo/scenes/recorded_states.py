@@ -98,7 +98,8 @@ def load_states(
     Args:
         path: an NPZ file or a directory, see docs/design/0008-simulated-states.md.
         rest: the object at rest, in scene units.
-        scale, shift: ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
+        scale: ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
+        shift: see ``scale``.
         held_out: the share of frames, the last ones, kept for testing: from 0 to less than 1.
 
     Raises:

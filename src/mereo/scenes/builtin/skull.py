@@ -119,7 +119,8 @@ def jaw_state(opening: float, forward: float, side: float) -> tuple[float, float
     Closed teeth hold the jaw, and so do its ligaments when the mouth is wide open: Posselt's envelope, roughly.
 
     Args:
-        opening, forward: 0 to 1.
+        opening: 0 to 1.
+        forward: 0 to 1.
         side: -1 to 1.
     """
     open_rad = opening * OPEN_RAD
