@@ -5,7 +5,6 @@ from collections.abc import Callable
 import numpy as np
 
 from mereo.deformation.maps import Compose, Deformation, Identity, Localized, Rigid
-from mereo.deformation.skeleton import Bone, Hinge, Skeleton
 from mereo.deformation.warps import Bend, CurveSweep, FreeFormLattice, SmoothField, Squash, Taper, Twist
 
 HALF = 10.0
@@ -13,16 +12,6 @@ HALF = 10.0
 
 REACH = HALF * 3**0.5
 BOX = np.array([[-HALF] * 3, [HALF] * 3])
-
-ARM = Skeleton(
-    (
-        Bone(-1, (-10.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        Bone(0, (0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (Hinge((0, 0, 1), -1.2, 1.2), Hinge((1, 0, 0), -0.5, 0.5))),
-        Bone(1, (10.0, 0.0, 0.0), (18.0, 0.0, 0.0), (Hinge((0, 1, 0), -0.8, 1.0),)),
-        Bone(0, (-10.0, 0.0, 0.0), (-10.0, 12.0, 0.0), (Hinge((0, 0, 1), -0.4, 0.4),)),
-    ),
-    width=2.0,
-)
 
 
 def direction(rng: np.random.Generator) -> np.ndarray:
@@ -74,10 +63,6 @@ def make_sweep(rng: np.random.Generator) -> Deformation:
     )
 
 
-def make_bones(rng: np.random.Generator) -> Deformation:
-    return ARM.sample(rng)
-
-
 MAKERS: dict[str, Callable[[np.random.Generator], Deformation]] = {
     "identity": lambda rng: Identity(),
     "rigid": make_rigid,
@@ -89,22 +74,9 @@ MAKERS: dict[str, Callable[[np.random.Generator], Deformation]] = {
     "lattice": make_lattice,
     "window": make_window,
     "sweep": make_sweep,
-    "bones": make_bones,
     "composition": lambda rng: Compose((make_field(rng), make_rigid(rng), make_squash(rng), make_taper(rng))),
 }
 
 
 def cube(rng: np.random.Generator, count: int = 300) -> np.ndarray:
     return rng.uniform(*BOX, size=(count, 3))
-
-
-def near_bones(rng: np.random.Generator, count: int = 300) -> np.ndarray:
-    """Points within two widths of the arm: limbs have an extent, and the levers of the bound with it."""
-    bones = [ARM.bones[i] for i in rng.integers(len(ARM.bones), size=count)]
-    heads, tips = np.array([bone.head for bone in bones]), np.array([bone.tip for bone in bones])
-    offset = np.stack([direction(rng) for _ in range(count)]) * rng.uniform(0, 2 * ARM.width, size=(count, 1))
-    return heads + rng.uniform(size=(count, 1)) * (tips - heads) + offset
-
-
-def points_for(name: str, rng: np.random.Generator) -> np.ndarray:
-    return near_bones(rng) if name == "bones" else cube(rng)

@@ -12,7 +12,6 @@ from safetensors.torch import save_file
 
 from mereo import __main__ as command_line
 from mereo.geometry.mesh import Segment, SegmentedMesh, check_segment
-from mereo.geometry.overlap import check_overlap
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model, save_model
@@ -137,16 +136,6 @@ def test_bad_segments_are_named_with_the_cure() -> None:
     for text, segment in cases.items():
         with pytest.raises(ValueError, match=text):
             check_segment(segment)
-
-
-def test_overlapping_segments_are_named() -> None:
-    apart = SegmentedMesh((sphere(), sphere(center=(2.1, 0, 0), name="other")))
-    check_overlap(apart)
-    crossing = SegmentedMesh((sphere(), sphere(center=(1.0, 0, 0), name="other")))
-    with pytest.raises(
-        ValueError, match=r"segments '\w+' and '\w+' overlap in .* 31 % of .*subtract one from the other"
-    ):
-        check_overlap(crossing)  # two unit balls one radius apart share 5/16 of each
 
 
 def test_segment_names_are_unique_and_few() -> None:

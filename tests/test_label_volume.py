@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from jaxtyping import Int
+from overlapping import check_overlap
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids
 from mereo.io.label_volumes import is_volume, read_label_volume, segment_surfaces
 from mereo.scenes.registry import load_scene

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from overlapping import check_overlap
 
 from mereo.deformation.maps import jacobian_determinant
 from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh_repair import close_holes, largest_piece
-from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids
 from mereo.scenes.builtin import _liver_parts, skull, tumor
 from mereo.scenes.registry import load_scene
@@ -90,22 +90,22 @@ def test_teeth_keep_their_roots_and_bone_its_volume() -> None:
 
 @pytest.mark.usefixtures("bones")
 def test_the_condyles_are_level_and_apart() -> None:
-    joint = skull.joint()
-    across = joint.left - joint.right
+    condyles = skull.condyles()
+    across = condyles.left - condyles.right
     assert -14.0 < across[1] < -12.0 and np.abs(across[[0, 2]]).max() < 0.06 * np.linalg.norm(across)
     mandible = Solids(skull.rest_mesh())
-    assert mandible.segment_distance(3, np.stack([joint.left, joint.right])).max() < 0.6
+    assert mandible.segment_distance(3, np.stack([condyles.left, condyles.right])).max() < 0.6
 
 
 @pytest.mark.usefixtures("bones")
 def test_the_jaw_never_touches_the_skull() -> None:
     """At the corners of the range of motion: closed, ajar, wide; forward; to both sides."""
-    rest, joint = skull.rest_mesh(), skull.joint()
+    rest, condyles = skull.rest_mesh(), skull.condyles()
     upper, cranium = rest.segments[:2]
     still = Solids(rest)
     for share, forward, side in product((0.0, 0.1, 0.21, 0.6, 1.0), (0, 1), (-1, 0, 1)):
         open_rad, protrusion, lateral_rad = skull.jaw_state(share, forward, side)
-        jaw = skull.jaw_motion(joint, open_rad, protrusion, lateral_rad)
+        jaw = skull.jaw_motion(condyles, open_rad, protrusion, lateral_rad)
         state = rest.with_vertices([s.vertices if i < 2 else jaw(s.vertices) for i, s in enumerate(rest.segments)])
         moved = [segment.vertices for segment in state.segments[2:]]
         assert min(signed(still, index, points).min() for index in (0, 1) for points in moved) > 0.09

@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+import yaml
+from overlapping import check_overlap
 from scene_files import write_bar, write_mesh
 from shapes import ball, box, knobbly_torus, segment
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import examine, likely_unit
 from mereo.geometry.mesh_repair import repaired, without_overlaps
-from mereo.geometry.overlap import check_overlap, overlaps
+from mereo.geometry.overlap import overlaps
+from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.registry import load_scene
 
@@ -158,7 +161,7 @@ def test_likely_units() -> None:
 def test_check_counts_faults_and_repair_leaves_the_users_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = write_bar(tmp_path, "# kept comment\nsize: 15\n")
+    path = write_bar(tmp_path, "# kept here\nsize: 15\n")
     check_scene(str(path))
     assert "bar: 2 segments, closed, outward oriented, without overlap" in capsys.readouterr().out
     part = trimesh.load_mesh(tmp_path / "left.stl")
@@ -174,26 +177,38 @@ def test_check_counts_faults_and_repair_leaves_the_users_files(
     assert "repaired left: filled 1 hole" in printed and "cut out" in printed
     assert {file: file.read_bytes() for file in before} == before
     fixed = (tmp_path / "bar-repaired.yaml").read_text()
-    assert "# kept comment" in fixed and "left-repaired.ply" in fixed
-    load_scene(tmp_path / "bar-repaired.yaml").rest.check()
+    assert fixed.startswith("# bar.yaml with repaired meshes, written by `mereo scene check bar.yaml --repair`.\n")
+    assert "kept here" not in fixed and "left-repaired.ply" in fixed
+    scene = load_scene(tmp_path / "bar-repaired.yaml")
+    scene.rest.check()
+    with pytest.warns(MeshWarning, match="6 open edges"):
+        assert scene.definition == load_scene(path).definition  # all but the meshes is what it was
     with pytest.raises(FileExistsError, match="bar-repaired.yaml exists; it is not overwritten"):
         check_scene(str(path), repair=True)
 
 
 def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path) -> None:
     scene = trimesh.Scene()
-    for name, low in (("a", 0.0), ("b b", 1.5)):
-        part = box((low, 0, 0), (low + 2, 2, 2))
+    parts = {
+        "a": box((0, 0, 0), (2, 2, 2)),
+        "core": box((2.5, 0.8, 0.8), (2.9, 1.2, 1.2)),
+        "b b": box((1.5, 0, 0), (3.5, 2, 2)),
+    }
+    for name, part in parts.items():
         scene.add_geometry(trimesh.Trimesh(part.vertices, part.faces), node_name=name, geom_name=name)
     scene.export(tmp_path / "model.glb")
     path = tmp_path / "two.yaml"
     path.write_text(
-        "name: two\nunits: m\nmodel: model.glb  # from CAD\n\nparts:\n  - name: a\n  - name: b b\n\nsize: 12 # s\n"
+        "name: two\nunits: m\nmodel: model.glb  # from CAD\n\nparts:\n"
+        "  - name: a\n  - {name: core, nested_in: b b}\n  - {name: b b, color: [1, 2, 3]}\n\nsize: 12 # s\n"
     )
     check_scene(str(path), repair=True)
-    text = (tmp_path / "two-repaired.yaml").read_text()
-    assert "model" not in text and "parts" not in text and "file: b_b-repaired.ply" in text and "size: 12 # s" in text
-    check_overlap(load_scene(tmp_path / "two-repaired.yaml").rest)
+    data = yaml.safe_load((tmp_path / "two-repaired.yaml").read_text())
+    assert list(data) == ["name", "units", "segments", "size"] and data["size"] == 12
+    assert [block["file"] for block in data["segments"]] == ["a-repaired.ply", "core-repaired.ply", "b_b-repaired.ply"]
+    rest = load_scene(tmp_path / "two-repaired.yaml").rest
+    assert (rest.nested, rest.colors[2]) == ((("core", "b b"),), (1, 2, 3))
+    check_overlap(rest)
 
 
 def test_a_mesh_without_an_inside_is_reported_and_turned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -207,6 +222,8 @@ def test_a_mesh_without_an_inside_is_reported_and_turned(tmp_path: Path, capsys:
     assert "left                     192 faces\n  fault: it has 100% of its surface facing" in capsys.readouterr().out
     check_scene(str(path), repair=True)
     assert "repaired left: turned 192 faces around" in capsys.readouterr().out
+    files = [block["file"] for block in yaml.safe_load((tmp_path / "bar-repaired.yaml").read_text())["segments"]]
+    assert files == ["left-repaired.ply", "right.stl"]
 
 
 def test_only_yaml_files_are_repaired() -> None:

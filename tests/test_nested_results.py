@@ -10,6 +10,7 @@ import pytest
 import safetensors.torch
 from analytic import AnalyticModel, logits_of, untrained
 from analytic import ball as distance_to_ball
+from overlapping import check_overlap
 from PIL import Image
 from safetensors import safe_open
 from test_reconstruction import front
@@ -18,7 +19,6 @@ from test_training import SMALL
 from toy_data import write_toy_dataset
 
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids
 from mereo.io.writers.glb import OUTER_OPACITY
 from mereo.models.weights import load_model, save_model

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import kstest
 from toy_scene import rest_mesh, toy_scene
 
+from mereo.deformation.draw_names import DrawName, named, part
 from mereo.deformation.maps import Deformation, Rigid
 from mereo.scenes.draw_recorder import Recorder
 from mereo.scenes.parameters import Parameter, Played, Refused, parameters, play, random_state, set_value, turned
@@ -25,7 +26,7 @@ def shifted(*values: float) -> tuple[Deformation, ...]:
     return (Rigid(STILL, np.array([*values, 0.0, 0.0, 0.0][:3]), STILL),) * 4
 
 
-def named(played: Played, name: str) -> Parameter:
+def slider(played: Played, name: str) -> Parameter:
     return next(parameter for parameter in parameters(played) if parameter.name == name)
 
 
@@ -61,16 +62,16 @@ def test_a_recorder_draws_whole_numbers_and_choices_as_numpy_does() -> None:
 
 def test_moving_one_number_moves_nothing_else() -> None:
     def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
-        along, across = rng.uniform(-5.0, 5.0), rng.uniform(1.0, 2.0)
+        along, across = named(rng, "along").uniform(-5.0, 5.0), named(rng, "across").uniform(1.0, 2.0)
         return shifted(along, across, rng.normal())
 
     scene = scene_of(sample)
     played = random_state(scene, 4)
     before = shift_of(played)
-    moved = set_value(scene, played, named(played, "along"), 3.25)
+    moved = set_value(scene, played, slider(played, "along"), 3.25)
     np.testing.assert_allclose(shift_of(moved), [3.25, *before[1:]], atol=1e-12)
-    assert named(moved, "along").value == pytest.approx(3.25)
-    beyond = set_value(scene, moved, named(moved, "across"), 99.0)
+    assert slider(moved, "along").value == pytest.approx(3.25)
+    beyond = set_value(scene, moved, slider(moved, "across"), 99.0)
     np.testing.assert_allclose(shift_of(beyond), [3.25, 2.0, before[2]], atol=1e-8)
 
 
@@ -94,7 +95,7 @@ def test_draws_that_a_choice_brings_come_and_go_and_come_back_the_same() -> None
 
 def rejecting(rng: np.random.Generator) -> tuple[Deformation, ...]:
     while True:
-        one, other = rng.uniform(0.0, 1.0), rng.uniform(0.0, 1.0)
+        one, other = named(rng, "one").uniform(0.0, 1.0), named(rng, "other").uniform(0.0, 1.0)
         if one + other > 1.5:
             break
     return shifted(one, other, rng.uniform(0.0, 1.0))
@@ -117,11 +118,11 @@ def test_attempts_that_the_scene_threw_away_have_no_sliders() -> None:
 
 def test_a_refused_value_is_said_and_an_allowed_one_taken() -> None:
     scene = scene_of(rejecting)
-    played = set_value(scene, random_state(scene, 1), named(random_state(scene, 1), "one"), 0.99)
-    played = set_value(scene, played, named(played, "other"), 0.6)
+    played = set_value(scene, random_state(scene, 1), slider(random_state(scene, 1), "one"), 0.99)
+    played = set_value(scene, played, slider(played, "other"), 0.6)
     np.testing.assert_allclose(shift_of(played)[:2], [0.99, 0.6], atol=1e-8)
     with pytest.raises(Refused, match="the scene refuses this value of 'other'"):
-        set_value(scene, played, named(played, "other"), 0.4)
+        set_value(scene, played, slider(played, "other"), 0.4)
 
 
 def test_loops_that_keep_what_they_draw_keep_their_sliders() -> None:
@@ -165,19 +166,110 @@ def test_the_toy_scene_has_a_slider_for_every_number_it_draws() -> None:
     played = random_state(scene, 0)
     found = parameters(played)
     assert [(f.low, f.high) for f in found] == [(-1.0, 1.0)] * 3 + [(0.5, 3.0)]
-    assert found[-1].name == "lift"
+    assert [(f.group, f.name) for f in found] == [
+        *(("whole", f"shear {axis}") for axis in "xyz"),
+        ("ball", "lift"),
+    ]
     for parameter in found:
         moved = set_value(scene, played, parameter, parameter.high)
         points = scene.rest.segments[3].vertices
         assert np.abs(moved.deformations[3](points) - played.deformations[3](points)).max() > 0.01
 
 
+def test_bounds_in_either_order_are_one_slider() -> None:
+    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        return shifted(named(rng, "down").uniform(5.0, -1.0), *named(rng, "mixed").uniform([0.0, 4.0], [2.0, 3.0]))
+
+    scene = scene_of(sample)
+    played = random_state(scene, 0)
+    assert [(f.low, f.high) for f in parameters(played)] == [(-1.0, 5.0), (0.0, 2.0), (3.0, 4.0)]
+    np.testing.assert_allclose([f.value for f in parameters(played)], shift_of(played), atol=1e-8)
+    moved = set_value(scene, set_value(scene, played, slider(played, "down"), 4.5), slider(played, "mixed 2"), 3.1)
+    np.testing.assert_allclose(shift_of(moved)[[0, 2]], [4.5, 3.1], atol=1e-8)
+    assert slider(moved, "down").value == pytest.approx(4.5)
+
+
+def test_a_choice_of_unequal_options_is_the_option_that_its_slider_shows() -> None:
+    scene = scene_of(lambda rng: shifted(float(rng.choice(4, p=[0.1, 0.35, 0.25, 0.3]))))
+    for seed in range(10):
+        played = random_state(scene, seed)
+        (option,) = parameters(played)
+        assert (option.low, option.high, option.value) == (0.0, 3.0, shift_of(played)[0])
+        for wanted in range(4):
+            moved = set_value(scene, played, option, wanted)
+            assert shift_of(moved)[0] == parameters(moved)[0].value == wanted
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_names_its_draws_and_the_source_names_the_others() -> None:
+    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        with part(rng, "arm"):
+            with part(rng, "left"):
+                first = named(rng, "bend", "rad").uniform(0.0, np.pi)
+            first += named(rng, ("swing", "play"), "rad").uniform(0.0, 1.0, size=2).sum()
+        offset = rng.uniform(0.0, 1.0)
+        return shifted(first, offset, rng.uniform(0.0, 1.0))
+
+    found = parameters(random_state(scene_of(sample), 0))
+    assert [(f.group, f.name, f.unit) for f in found] == [
+        ("arm", "left bend", "°"),
+        ("arm", "swing", "°"),
+        ("arm", "play", "°"),
+        ("whole", "offset", ""),
+        ("whole", "sample", ""),
+    ]
+    assert found[0].high == pytest.approx(180.0)
+
+
+def test_draws_of_one_name_are_counted() -> None:
+    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        first, *others = (named(rng, "step").uniform(0.0, 1.0, size=2) for _ in range(3))
+        return shifted(first[0], sum(step.sum() for step in others), named(rng, "other").uniform())
+
+    names = [f.name for f in parameters(random_state(scene_of(sample), 0))]
+    assert names == ["step 1 1", "step 1 2", "step 2 1", "step 2 2", "step 3 1", "step 3 2", "other"]
+
+
+def test_names_change_no_number_and_are_taken_once() -> None:
+    plain, told = np.random.default_rng(5), np.random.default_rng(5)
+    with part(told, "arm"):
+        assert plain.uniform() == named(told, "bend").uniform()
+    recorder = Recorder(0, {})
+    with pytest.raises(RuntimeError), part(recorder, "arm"):
+        named(recorder, "bend").uniform()
+        recorder.uniform()
+        raise RuntimeError
+    recorder.uniform()
+    assert [call.name for call in recorder.calls] == [DrawName(("arm",), "bend"), DrawName(("arm",)), DrawName()]
+
+
+def test_draws_keep_their_values_with_their_names() -> None:
+    """Two tools take turns at one line of the source; each is remembered by its name, not by its turn."""
+
+    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        order = ("hook", "probe") if named(rng, "probe first above 0.5").random() < 0.5 else ("probe", "hook")
+        depth = {}
+        for tool in order:
+            with part(rng, tool):
+                depth[tool] = named(rng, "depth").uniform(0.0, 1.0)
+        return shifted(depth["hook"], depth["probe"])
+
+    scene = scene_of(sample)
+    played = random_state(scene, 0)
+    before = shift_of(played)
+    for value in (0.2, 0.8):
+        played = set_value(scene, played, parameters(played)[0], value)
+        np.testing.assert_array_equal(shift_of(played), before)
+
+
 def test_built_in_scenes_name_their_sliders() -> None:
-    robot = [(f.group, f.name, f.low, f.high) for f in parameters(random_state(load_scene("robot"), 0))]
-    assert [name for _, name, _, _ in robot] == [*(f"angles {k}" for k in range(1, 7)), "opening"]
-    assert robot[0][2:] == (-170.0, 170.0)
+    robot = [(f.name, f.unit, f.low, f.high) for f in parameters(random_state(load_scene("robot"), 0))]
+    assert [name for name, *_ in robot] == ["turn", "lean", "fold", "roll", "pitch", "spin", "opening"]
+    assert robot[0][1:] == ("°", -170.0, 170.0)
     (cycle,) = parameters(random_state(load_scene("engine"), 0))
-    assert (cycle.name, cycle.unit) == ("cycle", "°")
+    assert (cycle.name, cycle.unit) == ("crank angle", "°")
     assert (cycle.low, cycle.high) == pytest.approx((0.0, 720.0))
     rope = parameters(random_state(load_scene("rope"), 3))
-    assert {"coil start", "coil rate", "coil pitch"} <= {f.name for f in rope}
+    assert {"start", "turn per unit", "pitch"} <= {f.name for f in rope if f.group == "coil"}

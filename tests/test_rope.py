@@ -4,10 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from overlapping import check_overlap
 
 from mereo.deformation.maps import jacobian_determinant
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids
 from mereo.scenes.builtin import rope
 from mereo.scenes.registry import load_scene

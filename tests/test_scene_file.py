@@ -14,7 +14,9 @@ from mereo.deformation.maps import jacobian_determinant
 from mereo.deformation.samplers import RandomMotion
 from mereo.deformation.warps import FreeFormLattice
 from mereo.geometry.mesh import PALETTE
-from mereo.scenes.files.schema import Deformation, SceneFile
+from mereo.scenes.files.deformation_blocks import AnyDeformation
+from mereo.scenes.files.schema import SceneFile
+from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.registry import SCENES, load_scene
 
 EVERYTHING = """
@@ -63,6 +65,17 @@ def test_every_deformation_keeps_space_from_folding(tmp_path: Path) -> None:
             assert jacobian_determinant(deformation, np.concatenate([inner, segment.vertices])).min() > 0
             moved = max(moved, float(np.abs(deformation(inner) - inner).max()))
     assert moved > 10
+
+
+def test_sliders_are_named_after_the_files_deformations(tmp_path: Path) -> None:
+    found = parameters(random_state(load_scene(write_bar(tmp_path, EVERYTHING)), 0))
+    assert list(dict.fromkeys(f.group for f in found)) == [
+        *("1 joint of right", "2 lattice", "3 waves", "4 squash", "5 twist", "6 taper", "7 bend", "8 push")
+    ]
+    names = [(f.group, f.name) for f in found]
+    assert len(set(names)) == len(names)
+    joint = [(f.name, f.unit) for f in found if f.group.startswith("1")]
+    assert joint == [("angle", "°"), ("slide", ""), ("shift x", ""), ("shift y", ""), ("shift z", "")]
 
 
 def test_a_joint_turns_about_the_place_that_the_file_names(tmp_path: Path) -> None:
@@ -221,7 +234,7 @@ def test_a_scene_from_a_python_file(tmp_path: Path) -> None:
 def test_every_key_and_every_deformation_is_documented() -> None:
     text = (Path(__file__).parent.parent / "docs" / "own-object.md").read_text("utf-8")
     assert [key for key in SceneFile.model_fields if f"| `{key}` |" not in text] == []
-    for block in get_args(Deformation):
+    for block in get_args(AnyDeformation):
         (kind,) = get_args(block.model_fields["type"].annotation)
         row = next(line for line in text.splitlines() if line.startswith(f"| `{kind}` |"))
         assert [key for key in block.model_fields if key not in ("type", "segments") and f"`{key}`" not in row] == []

@@ -1,11 +1,13 @@
 """Every built-in scene in many random states: closed, positive, apart, in view, and invertible."""
 
+import re
 from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
+from overlapping import check_overlap
 from scipy.spatial import ConvexHull, cKDTree
 from solid_pairs import crowded
 
@@ -13,9 +15,9 @@ from mereo.deformation.maps import invert, jacobian_determinant
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.overlap import check_overlap
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
+from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.scenes.registry import SCENES, load_scene
 from mereo.scenes.scene import Scene, State, Workspace
 from mereo.synthesis.config import GenerateConfig
@@ -248,3 +250,30 @@ def test_look_at_straight_along_up_is_still_a_rotation() -> None:
 def test_unknown_scene_is_named() -> None:
     with pytest.raises(ValueError, match=f"scene 'hare' is unknown; it must be one of {', '.join(SCENES)}"):
         load_scene("hare")
+
+
+# --- sliders ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_every_number_that_a_scene_draws_has_a_name_of_its_own(scene: Scene, seed: int) -> None:
+    played = random_state(scene, seed)
+    assert [call.key for call in played.calls if not call.name.name] == [], "the scene does not say what it draws"
+    found = parameters(played)
+    names = [(f.group, f.name, f.unit) for f in found]
+    assert found and len({(group, name) for group, name, _ in names}) == len(names)
+    assert all(re.fullmatch(r"[a-z0-9][\w ,/.]*[\w]", name) and "_" not in name for _, name, _ in names), names
+    # the same sliders keep their names when one of them moves
+    moved = {f.key: f.name for f in parameters(set_value(scene, played, found[0], found[0].value))}
+    assert moved == {f.key: f.name for f in found}
+
+
+# --- shared arrays ----------------------------------------------------------------------------------------------------
+
+
+def test_nobody_changes_the_rest_pose_or_a_state_in_place(scene: Scene) -> None:
+    for segment in (*scene.rest.segments, *scene.sample_state(np.random.default_rng(0)).mesh.segments):
+        with pytest.raises(ValueError, match="read-only"):
+            segment.vertices += 1.0
+        with pytest.raises(ValueError, match="read-only"):
+            segment.faces[:] = 0

@@ -8,7 +8,7 @@ import trimesh
 from shapes import ball, box, knobbly_torus, one, segment
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.overlap import check_overlap
+from mereo.geometry.overlap import overlaps
 from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
 
 
@@ -185,24 +185,28 @@ def test_a_large_grid_takes_a_fraction_of_a_second() -> None:
 # --- overlap ----------------------------------------------------------------------------------------------------------
 
 
-def test_overlap_names_both_segments_the_volume_and_the_cure() -> None:
-    mesh = SegmentedMesh((box((0, 0, 0), (4, 4, 4), "liver"), box((3, 0, 0), (5, 4, 4), "vein", 1)))
-    with pytest.raises(ValueError, match=r"'vein' and 'liver' overlap in a volume of 16, 50 % of 'vein'.*subtract one"):
-        check_overlap(mesh)
+def test_overlap_names_both_segments_the_smaller_one_first() -> None:
+    (found,) = overlaps(SegmentedMesh((box((0, 0, 0), (4, 4, 4), "liver"), box((3, 0, 0), (5, 4, 4), "vein", 1))))
+    assert (found.small, found.large, found.share) == ("vein", "liver", 0.5)
+    assert str(found) == "vein and liver overlap in 50.00% of vein"
 
 
 def test_a_part_within_a_part_overlaps() -> None:
-    with pytest.raises(ValueError, match="'inner' and 'outer' overlap"):
-        check_overlap(SegmentedMesh((ball((0, 0, 0), 2.0, "outer"), ball((0, 0, 0), 0.5, "inner", 1))))
+    (found,) = overlaps(SegmentedMesh((ball((0, 0, 0), 2.0, "outer"), ball((0, 0, 0), 0.5, "inner", 1))))
+    assert (found.small, found.large, found.share) == ("inner", "outer", 1.0)
+
+
+def test_two_unit_balls_one_radius_apart_share_five_sixteenths() -> None:
+    (found,) = overlaps(SegmentedMesh((ball((0, 0, 0), 1.0), ball((1, 0, 0), 1.0, "other"))))
+    assert found.share == pytest.approx(5 / 16, abs=0.01)
 
 
 def test_touching_and_distant_segments_do_not_overlap() -> None:
     cubes = [box((i, 0, 0), (i + 1, 1, 1), f"cube_{i}", i) for i in range(3)]
-    check_overlap(SegmentedMesh((*cubes, ball((0, 9, 0), 1.0))))
+    assert overlaps(SegmentedMesh((*cubes, ball((0, 9, 0), 1.0)))) == ()
 
 
 def test_overlap_up_to_the_tolerance_is_allowed() -> None:
     mesh = SegmentedMesh((box((0, 0, 0), (4, 4, 4), "a"), box((3.96, 0, 0), (7.96, 4, 4), "b", 1)))
-    check_overlap(mesh, tolerance=0.02)
-    with pytest.raises(ValueError, match="overlap"):
-        check_overlap(mesh, tolerance=0.005)
+    assert overlaps(mesh, tolerance=0.02, cells=64) == ()
+    assert len(overlaps(mesh, tolerance=0.005, cells=64)) == 1

@@ -4,14 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from deformation_examples import ARM, cube, make_lattice, make_squash, make_twist
+from deformation_examples import cube, make_lattice, make_squash, make_twist
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from mereo.deformation.maps import Identity, Localized, Rigid, jacobian_determinant, smooth_step
-from mereo.deformation.skeleton import Bone, Skeleton
 from mereo.deformation.warps import (
     Bend,
     CurveSweep,
@@ -171,16 +170,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         ),
         "curvature .* times radius 2 is .*; it must be below 1",
     ),
-    "width": (lambda: Skeleton((), 0.0), "the skeleton's width is 0; it must be above 0: use the limbs' thickness"),
-    "parent": (
-        lambda: Skeleton((Bone(1, (0, 0, 0), (1, 0, 0)), Bone(-1, (0, 0, 0), (1, 0, 0))), 1.0),
-        "bone 0 hangs from bone 1; a parent comes before its children, .*: reorder the bones",
-    ),
-    "angle": (
-        lambda: ARM.pose(np.array([0.0, 0.0, 1.4, 0.0])),
-        r"hinge 2 is set to 1.4 rad; its limits are -0.8 to 1: clip the angle",
-    ),
-    "angles": (lambda: ARM.pose(np.zeros(3)), "the pose has 3 angles for 4 hinges; it needs one for each"),
 }
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from shapes import ball, box
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.scenes.scene import Scene, Workspace
@@ -42,8 +43,10 @@ class Lift:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    shear = Shear(*(rng.uniform(-1, 1, size=3) * [3.0, 0.3, 0.2]))
-    return (shear, shear, shear, Lift(float(rng.uniform(0.5, 3.0)), shear))
+    shear = Shear(*(named(rng, "shear").uniform(-1, 1, size=3) * [3.0, 0.3, 0.2]))
+    with part(rng, "ball"):
+        lift = Lift(float(named(rng, "lift").uniform(0.5, 3.0)), shear)
+    return (shear, shear, shear, lift)
 
 
 def rest_mesh() -> SegmentedMesh:

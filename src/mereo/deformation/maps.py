@@ -2,7 +2,7 @@
 
 A deformation moves any point, not only a mesh's vertices. The rest position of a point inside a deformed segment is
 therefore known: it is the map's inverse there. This module has the protocol, rigid motion, composition, windows and the
-inverse; ``warps`` has the shapes of deformation and ``skeleton`` the skinned bones.
+inverse; ``warps`` has the shapes of deformation.
 
 Notation: ``f`` maps rest points ``x`` to deformed points; ``u = f(x) - x`` is the displacement; J is the 3x3 matrix of
 derivatives of f. Lengths share one unit, angles are in radians.

@@ -10,15 +10,16 @@ its axis: the angle is drawn from what that leaves of its range. Lengths are in 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 
 Range = tuple[float, float]
 Vector = Float[np.ndarray, "3"]
@@ -31,14 +32,14 @@ FOLD_SHARE = 0.9
 
 
 @runtime_checkable
-class Draw(Protocol):
+class DeformationSampler(Protocol):
     """The bounds of one deformation."""
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation: ...
 
 
 @dataclass(frozen=True, eq=False)
-class DrawLattice:
+class LatticeSampler:
     """A free-form lattice over a box; the control points move by at most ``strength`` of what is injective."""
 
     bounds: Float[np.ndarray, "2 3"]
@@ -50,7 +51,7 @@ class DrawLattice:
 
 
 @dataclass(frozen=True)
-class DrawWaves:
+class WavesSampler:
     """A smooth field whose gradient is at most ``strength``, which is uniform up to the bound."""
 
     wavelength: Range
@@ -58,11 +59,12 @@ class DrawWaves:
     modes: int
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        return SmoothField.sample(rng, rng.uniform(0.0, self.strength), self.wavelength, self.modes)
+        strength = named(rng, "strength").uniform(0.0, self.strength)
+        return SmoothField.sample(rng, strength, self.wavelength, self.modes)
 
 
 @dataclass(frozen=True, eq=False)
-class DrawBend:
+class BendSampler:
     """A bend about an axis, to a random side where ``toward`` is None."""
 
     origin: Vector
@@ -72,15 +74,15 @@ class DrawBend:
     toward: Vector | None
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        toward = rng.normal(size=3) if self.toward is None else self.toward
+        toward = named(rng, "toward").normal(size=3) if self.toward is None else self.toward
         radius = distance_from_line(surface()[0], self.origin, self.axis)
         most = FOLD_SHARE * self.length / max(radius, 1e-12)
-        angle = rng.uniform(*np.clip(self.angle_rad, -most, most))
+        angle = named(rng, "angle", "rad").uniform(*np.clip(self.angle_rad, -most, most))
         return Bend(self.origin, self.axis, toward, self.length, angle, radius)
 
 
 @dataclass(frozen=True, eq=False)
-class DrawTwist:
+class TwistSampler:
     """A twist about an axis, any angle of which preserves volume."""
 
     origin: Vector
@@ -89,11 +91,11 @@ class DrawTwist:
     angle_rad: Range
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        return Twist(self.origin, self.axis, self.length, rng.uniform(*self.angle_rad))
+        return Twist(self.origin, self.axis, self.length, named(rng, "angle", "rad").uniform(*self.angle_rad))
 
 
 @dataclass(frozen=True, eq=False)
-class DrawTaper:
+class TaperSampler:
     """Factors are uniform in their logarithm, so that a half is as likely as a double."""
 
     origin: Vector
@@ -102,11 +104,11 @@ class DrawTaper:
     factor: Range
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        return Taper(self.origin, self.axis, self.length, float(np.exp(rng.uniform(*np.log(self.factor)))))
+        return Taper(self.origin, self.axis, self.length, _factor(rng, self.factor))
 
 
 @dataclass(frozen=True, eq=False)
-class DrawSquash:
+class SquashSampler:
     """Along a random axis where ``axis`` is None; factors are uniform in their logarithm."""
 
     center: Vector
@@ -114,12 +116,12 @@ class DrawSquash:
     factor: Range
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
-        axis = rng.normal(size=3) if self.axis is None else self.axis
-        return Squash(self.center, axis, float(np.exp(rng.uniform(*np.log(self.factor)))))
+        axis = named(rng, "axis").normal(size=3) if self.axis is None else self.axis
+        return Squash(self.center, axis, _factor(rng, self.factor))
 
 
 @dataclass(frozen=True, eq=False)
-class DrawJoint:
+class JointSampler:
     """A rigid motion: a turn about an axis, a slide along it, and a shift of at most ``shift`` along x, y, z."""
 
     pivot: Vector
@@ -130,12 +132,13 @@ class DrawJoint:
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
         axis = unit(self.axis)
-        rotation = axis * rng.uniform(*self.angle_rad)
-        return Rigid(rotation, axis * rng.uniform(*self.slide) + rng.uniform(-self.shift, self.shift), self.pivot)
+        rotation = axis * named(rng, "angle", "rad").uniform(*self.angle_rad)
+        slide = axis * named(rng, "slide").uniform(*self.slide)
+        return Rigid(rotation, slide + named(rng, "shift").uniform(-self.shift, self.shift), self.pivot)
 
 
 @dataclass(frozen=True)
-class DrawPush:
+class PushSampler:
     """An instrument moves the tissue around a random vertex, within 30 degrees or so of its normal.
 
     The map's Jacobian is at least 1 - 15/8 |distance| / (reach - tip), which the schema keeps above 0.05.
@@ -147,9 +150,9 @@ class DrawPush:
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
         vertices, normals = surface()
-        index = rng.integers(len(vertices))
-        direction = unit(normals[index] + 0.35 * rng.normal(size=3))
-        pull = Rigid(np.zeros(3), direction * rng.uniform(*self.distance), vertices[index])
+        index = named(rng, "vertex").integers(len(vertices))
+        direction = unit(normals[index] + 0.35 * named(rng, "slant").normal(size=3))
+        pull = Rigid(np.zeros(3), direction * named(rng, "distance").uniform(*self.distance), vertices[index])
         return Localized(pull, vertices[index], self.tip, self.reach)
 
 
@@ -159,42 +162,49 @@ class RandomMotion:
 
     Attributes:
         rest: the segments at rest.
-        steps: what to draw, and the indices of the segments that it moves.
+        steps: samplers, and the indices of the segments that it moves.
 
     Segments with the same steps share one map and so stay in contact.
     """
 
     rest: SegmentedMesh
-    steps: tuple[tuple[Draw, tuple[int, ...]], ...]
+    steps: tuple[tuple[DeformationSampler, tuple[int, ...]], ...]
 
     def __call__(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
         chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
-        for draw, members in self.steps:
+        for number, (sampler, members) in enumerate(self.steps, start=1):
 
             def surface(members: tuple[int, ...] = members) -> tuple[np.ndarray, np.ndarray]:
                 return _surface(self.rest, chains, members)
 
-            drawn = draw(rng, surface)
+            with part(rng, self._title(number, sampler, members)):
+                drawn = sampler(rng, surface)
             for index in members:
                 chains[index] = (*chains[index], drawn)
         shared: dict[tuple[int, ...], Compose] = {}
         return tuple(shared.setdefault(tuple(id(part) for part in chain), Compose(chain)) for chain in chains)
 
+    def _title(self, number: int, sampler: DeformationSampler, members: tuple[int, ...]) -> str:
+        """A step as people know it from their file, for example "2 joint of hand, arm"."""
+        kind = type(sampler).__name__.removesuffix("Sampler").lower()
+        whole = len(members) == len(self.rest.names)
+        return f"{number} {kind}" + ("" if whole else f" of {', '.join(self.rest.names[i] for i in members)}")
+
+
+def _factor(rng: np.random.Generator, bounds: Range) -> float:
+    """A factor, uniform in its logarithm."""
+    return float(np.exp(named(rng, "factor", "log").uniform(*np.log(bounds))))
+
 
 def _surface(
     rest: SegmentedMesh, chains: Sequence[tuple[Deformation, ...]], members: Sequence[int]
 ) -> tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]:
-    """Vertices of segments after their maps so far, and their normals, weighted by area."""
-    vertices, normals = [], []
+    """Vertices of segments after their maps so far, and their normals."""
+    moved = []
     for index in members:
-        moved, faces = Compose(chains[index])(rest.segments[index].vertices), rest.segments[index].faces
-        a, b, c = (moved[faces[:, k]] for k in range(3))
-        normal = np.zeros_like(moved)
-        for k in range(3):
-            np.add.at(normal, faces[:, k], np.cross(b - a, c - a))
-        vertices.append(moved)
-        normals.append(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30))
-    return np.concatenate(vertices), np.concatenate(normals)
+        segment = rest.segments[index]
+        moved.append(replace(segment, vertices=Compose(chains[index])(segment.vertices)))
+    return np.concatenate([s.vertices for s in moved]), np.concatenate([vertex_normals(s) for s in moved])
 
 
 def distance_from_line(points: Float[np.ndarray, "n 3"], origin: Vector, axis: Vector) -> float:

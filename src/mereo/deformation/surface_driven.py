@@ -22,6 +22,7 @@ from scipy.spatial.distance import cdist
 from mereo.deformation.maps import smooth_step
 from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.geometry.mesh import barycentric
+from mereo.geometry.read_only import read_only, read_only_view
 
 CONTROLS = 100
 """Vertices that the spline goes through: more cost time in proportion, fewer leave more to the closest point."""
@@ -34,8 +35,8 @@ class Surface:
     """A closed surface at rest with its search tree and the spline's system, which all of its states share."""
 
     def __init__(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
-        self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
+        self.vertices = read_only_view(np.ascontiguousarray(vertices, dtype=np.float64))
+        self.faces = read_only_view(np.ascontiguousarray(faces, dtype=np.int64))
         self.center = vertices.mean(axis=0)
         self.controls = farthest_point_order(self.vertices, CONTROLS)
         knots = self.vertices[self.controls]
@@ -64,7 +65,7 @@ class Surface:
     @cached_property
     def vertex_basis(self) -> Float[np.ndarray, "v k"]:
         """The basis at all vertices at rest."""
-        return self._basis(self.vertices)
+        return read_only(self._basis(self.vertices))
 
     def _basis(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p k"]:
         local = points - self.center

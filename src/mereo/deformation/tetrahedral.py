@@ -19,6 +19,7 @@ from scipy.sparse import coo_array, csr_array
 
 from mereo.deformation.maps import newton
 from mereo.geometry.mesh import barycentric
+from mereo.geometry.read_only import read_only, read_only_view
 
 
 class Tetrahedra:
@@ -41,8 +42,8 @@ class Tetrahedra:
                 f"a tetrahedron refers to node {int(elements.max() if elements.min() >= 0 else elements.min())}, but "
                 f"there are {len(nodes)}; indices run from 0: subtract 1 where they were counted from 1"
             )
-        self.nodes = np.ascontiguousarray(nodes, dtype=np.float64)
-        self.elements = np.ascontiguousarray(elements, dtype=np.int64)
+        self.nodes = read_only_view(np.ascontiguousarray(nodes, dtype=np.float64))
+        self.elements = read_only_view(np.ascontiguousarray(elements, dtype=np.int64))
         edges = _edges(self.nodes, self.elements)
         self.volumes = np.linalg.det(edges) / 6
         size = float(np.ptp(self.nodes, axis=0).max())
@@ -64,7 +65,7 @@ class Tetrahedra:
     def surface(self) -> Int[np.ndarray, "f 3"]:
         """The faces that one tetrahedron has alone, counter-clockwise from outside."""
         outward = np.where((self.volumes < 0)[:, None], self.elements[:, [1, 0, 2, 3]], self.elements)
-        return np.ascontiguousarray(igl.boundary_facets(outward)[0].astype(np.int64))
+        return read_only(np.ascontiguousarray(igl.boundary_facets(outward)[0].astype(np.int64)))
 
     @cached_property
     def _surface_tree(self) -> igl.AABB:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
 
+from mereo.deformation.draw_names import named
 from mereo.deformation.maps import smooth_step, turn, unit
 
 LATTICE_LIMIT = 1 / 2.48
@@ -150,11 +151,12 @@ class SmoothField:
         cls, rng: np.random.Generator, strength: float, wavelength: tuple[float, float], modes: int = 4
     ) -> "SmoothField":
         """``modes`` waves in random directions, wavelengths uniform in a range, with gradient bound ``strength``."""
-        directions, amplitudes = rng.normal(size=(2, modes, 3))
+        directions, amplitudes = named(rng, "pattern").normal(size=(2, modes, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        frequencies = directions * 2 * np.pi / rng.uniform(*wavelength, size=(modes, 1))
+        frequencies = directions * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
         shares = np.linalg.norm(amplitudes, axis=1) @ np.linalg.norm(frequencies, axis=1)
-        return cls(amplitudes * (strength / shares), frequencies, rng.uniform(0, 2 * np.pi, size=modes))
+        phases = named(rng, "phase", "rad").uniform(0, 2 * np.pi, size=modes)
+        return cls(amplitudes * (strength / shares), frequencies, phases)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         return points + np.sin(points @ self.frequencies.T + self.phases) @ self.amplitudes
@@ -193,7 +195,7 @@ class FreeFormLattice:
         spacing = (bounds[1] - bounds[0]) / np.array(cells)
         shape = (cells[0] + 3, cells[1] + 3, cells[2] + 3, 3)
         limit = strength * LATTICE_LIMIT * spacing
-        return cls(bounds[0] - spacing, spacing, rng.uniform(-limit, limit, size=shape))
+        return cls(bounds[0] - spacing, spacing, named(rng, "control points").uniform(-limit, limit, size=shape))
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         at = ((points - self.origin) / self.spacing).T

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from mereo.geometry.read_only import read_only_view
+
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
 
@@ -48,6 +50,11 @@ class Segment:
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     solid: bool = True
+
+    def __post_init__(self) -> None:
+        # segments are shared by scenes, states and results: a change of one would be a change of all
+        for name in ("vertices", "faces"):
+            object.__setattr__(self, name, read_only_view(getattr(self, name)))
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
@@ -165,7 +172,7 @@ class SegmentedMesh:
         """Raise ``ValueError`` unless every segment is finite, closed, outward oriented and of positive volume.
 
         Of a segment that is marked as no solid, only finite vertices and existing indices are asked.
-        Overlap between segments needs inside tests, see ``mereo.geometry.overlap.check_overlap``.
+        Overlap between segments needs inside tests, see ``mereo.geometry.overlap.overlaps``.
         """
         for segment in self.segments:
             check_segment(segment)

@@ -1,6 +1,6 @@
-"""Volume that segments share, measured on a grid over the smaller one: listed, or refused."""
+"""Volume that segments share, measured on a grid over the smaller one."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -23,14 +23,12 @@ class Overlap:
     Attributes:
         small, large: names; the smaller one, or the inner one, first.
         share: of the smaller segment's volume.
-        volume: the same in cubic units.
         nested: whether the pair is declared nested; then ``share`` lies outside of the outer one.
     """
 
     small: str
     large: str
     share: float
-    volume: float
     nested: bool = False
 
     def __str__(self) -> str:
@@ -40,44 +38,29 @@ class Overlap:
 
 
 def overlaps(mesh: SegmentedMesh, tolerance: float = TOLERANCE, cells: int = CELLS) -> tuple[Overlap, ...]:
-    """All pairs that share more than ``tolerance``; segments may be no solids, so their boxes say which is smaller."""
-    return tuple(found for found in _pairs(mesh, cells, _box_volume) if found.share > tolerance)
+    """Pairs of segments that share more than ``tolerance`` of the smaller one, or nest with as much outside.
 
+    Segments that touch share no volume. Segments may be no solids, so their boxes say which of two is smaller.
 
-def check_overlap(mesh: SegmentedMesh, tolerance: float = TOLERANCE, cells: int = 64) -> None:
-    """Raise ``ValueError`` naming two segments whose common volume exceeds ``tolerance`` of the smaller one.
-
-    Segments that touch share no volume. A pair that ``mesh.nested`` declares may share any, but at most ``tolerance``
-    of the inner segment may lie outside the outer one. Volumes are measured on a grid of ``cells`` per axis over the
-    first segment's box.
+    Args:
+        mesh: any unit.
+        tolerance: share of a segment's volume, from 0 to 1.
+        cells: of the grid along each side of a segment's box.
     """
-    pairs = sorted(_pairs(mesh, cells, lambda segment: abs(segment.volume)), key=lambda pair: not pair.nested)
-    for pair in pairs:
-        if pair.share > tolerance and pair.nested:
-            raise ValueError(
-                f"segment {pair.small!r} is declared nested in {pair.large!r}, but {100 * pair.share:.2g} % of it lies "
-                f"outside; at most {100 * tolerance:.2g} % is allowed: move it, or cut it off at the outer surface"
-            )
-        if pair.share > tolerance:
-            raise ValueError(
-                f"segments {pair.small!r} and {pair.large!r} overlap in a volume of {pair.volume:.3g}, "
-                f"{100 * pair.share:.2g} % of {pair.small!r}; at most {100 * tolerance:.2g} % is allowed: "
-                "subtract one from the other (for example trimesh.boolean.difference), or declare the inner one nested"
-            )
+    return tuple(found for found in _pairs(mesh, cells) if found.share > tolerance)
 
 
-def _pairs(mesh: SegmentedMesh, cells: int, size: Callable[[Segment], float]) -> Iterator[Overlap]:
+def _pairs(mesh: SegmentedMesh, cells: int) -> Iterator[Overlap]:
     """Every two segments, smaller ones first."""
     nesting = set(mesh.nesting)
-    order = sorted(range(len(mesh.segments)), key=lambda index: size(mesh.segments[index]))
+    order = sorted(range(len(mesh.segments)), key=lambda index: _box_volume(mesh.segments[index]))
     grids = {index: _Filled(mesh.segments[index], cells) for index in order}
     for small, large in combinations(order, 2):
         first, second = sorted((small, large))
         nested = (first, second) in nesting
         inner, outer = (first, second) if nested else (small, large)
         share = grids[inner].share_in(mesh.segments[outer])
-        share = 1.0 - share if nested else share
-        yield Overlap(mesh.names[inner], mesh.names[outer], share, share * grids[inner].volume, nested)
+        yield Overlap(mesh.names[inner], mesh.names[outer], 1.0 - share if nested else share, nested)
 
 
 def _box_volume(segment: Segment) -> float:

@@ -5,9 +5,10 @@ from jaxtyping import Float
 
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import rigid
 
-SCANNER_TO_CAMERA = np.diag([1.0, -1.0, -1.0])
+SCANNER_TO_CAMERA = read_only(np.diag([1.0, -1.0, -1.0]))
 """Half a turn about x; its own inverse."""
 
 

@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.raycasting import Hits, first_hits, ray_scene, toward
+from mereo.geometry.read_only import read_only
 from mereo.geometry.winding_number import winding_grid
 
-_DIRECTIONS = np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32)
+_DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32))
 """Two generic directions: not along any axis, face diagonal or each other."""
 
 

@@ -18,11 +18,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtri
 
+from mereo.deformation.draw_names import DrawName, NamedGenerator
+
 Trail = tuple[tuple[CodeType, int], ...]
 """The calls that led to a draw, outermost first: code, and the instruction within it."""
 
-Key = tuple[tuple[tuple[str, int, int], ...], int]
-"""Which draw it is: the trail, and how many draws there were with the same trail before it."""
+Place = tuple[tuple[tuple[str, int, int], ...], DrawName]
+"""Where a draw comes from: its trail, and what the scene calls it."""
+
+Key = tuple[Place, int]
+"""Which draw it is: its place, and how many draws there were from the same place before it."""
 
 Shares = Float[np.ndarray, " n"]
 
@@ -40,23 +45,27 @@ class Call:
 
     Attributes:
         key, trail: where it came from.
+        name: what the scene calls it.
         kind: the method's name.
         shares: of each number, in C order.
         low, high: bounds of each number: of "uniform" and "integers" (high excluded) as drawn, of "normal" in standard
             deviations (infinite), of "choice" the positions in what is chosen from.
         shape: of the result; () for a single number.
+        ends: of "choice", the share at which each option ends; options need not be equally likely.
     """
 
     key: Key
     trail: Trail
+    name: DrawName
     kind: str
     shares: Shares
     low: Shares
     high: Shares
     shape: tuple[int, ...]
+    ends: Float[np.ndarray, " o"] | None = None
 
 
-class Recorder(np.random.Generator):
+class Recorder(NamedGenerator):
     """A generator that records its draws, and takes those that it is given.
 
     Methods that are not here (``gamma``, ``spawn``, ...), choices without replacement and draws into an array that is
@@ -69,7 +78,8 @@ class Recorder(np.random.Generator):
         self.calls: list[Call] = []
         self._given, self._most = given, most
         self._fresh = np.random.default_rng([seed, 0])
-        self._seen: Counter[Any] = Counter()
+        self._seen: Counter[Place] = Counter()
+        self._ends: Any = None
 
     def __reduce__(self) -> Any:
         raise TypeError("a Recorder belongs to one run of a scene and cannot be copied")
@@ -77,8 +87,9 @@ class Recorder(np.random.Generator):
     def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any) -> Shares:
         if self._most is not None and len(self.calls) >= self._most:
             raise OutOfDraws
-        trail = _trail()
-        place = tuple((code.co_filename, code.co_firstlineno, instruction) for code, instruction in trail)
+        trail, name = _trail(), self.take_name()
+        steps = tuple((code.co_filename, code.co_firstlineno, instruction) for code, instruction in trail)
+        place = (steps, name)
         key = (place, self._seen[place])
         self._seen[place] += 1
         size = int(np.prod(shape))
@@ -87,11 +98,14 @@ class Recorder(np.random.Generator):
             shares = self._fresh.random(size)
         shares = np.clip(shares, SMALLEST_SHARE, 1 - SMALLEST_SHARE)
         bounds = [np.broadcast_to(np.asarray(bound, dtype=float), shape).ravel() for bound in (low, high)]
-        self.calls.append(Call(key, trail, kind, shares, bounds[0], bounds[1], shape))
+        self.calls.append(Call(key, trail, name, kind, shares, bounds[0], bounds[1], shape, self._ends))
+        self._ends = None
         return shares
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
         shape = _shape(size, low, high)
+        # numpy takes the bounds in either order; a share counts from the lower one, as a slider does
+        low, high = np.minimum(low, high), np.maximum(low, high)
         shares = self._take("uniform", shape, low, high).reshape(shape)
         return _plain(np.asarray(low, dtype=float) + shares * (np.asarray(high, dtype=float) - low))
 
@@ -135,9 +149,9 @@ class Recorder(np.random.Generator):
             return super().choice(a, size, replace, p, axis, shuffle)
         options = np.arange(a) if np.ndim(a) == 0 else np.asarray(a)
         count, shape = options.shape[axis], _shape(size)
-        edges = np.cumsum(np.full(count, 1 / count) if p is None else p)
+        self._ends = ends = np.cumsum(np.full(count, 1 / count) if p is None else p)
         shares = self._take("choice", shape, 0, count).reshape(shape)
-        index = np.minimum(np.searchsorted(edges, shares, side="right"), count - 1)
+        index = np.minimum(np.searchsorted(ends, shares, side="right"), count - 1)
         chosen = np.take(options, index, axis=axis)
         return _plain(chosen)
 

@@ -5,6 +5,8 @@
 See ``mereo.scenes.draw_recorder`` for how draws are recorded, and docs/design/0013-viewer.md.
 """
 
+import linecache
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +17,7 @@ from jaxtyping import Float
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
-from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Recorder, Shares
-from mereo.scenes.parameter_names import name_of
+from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Place, Recorder, Shares, Trail
 from mereo.scenes.scene import Scene
 
 MANY = 48
@@ -68,7 +69,7 @@ class Parameter:
     Attributes:
         key, index: which draw, and which of its numbers; None for all of them together.
         group, name, unit: for people.
-        low, high, value: as the scene draws them, angles in degrees; a normal draw in standard deviations, many
+        low, high, value: as the scene draws them, radians in degrees; a normal draw in standard deviations, many
             numbers together in turns.
         whole: whether only whole numbers mean something.
     """
@@ -117,7 +118,7 @@ def _played(
 
 def _renumbered(calls: Sequence[Call]) -> tuple[Call, ...]:
     """Keys counted anew where calls were left out."""
-    seen: Counter[object] = Counter()
+    seen: Counter[Place] = Counter()
     result = []
     for call in calls:
         place = call.key[0]
@@ -174,37 +175,62 @@ def _witness(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.nd
 def parameters(played: Played) -> tuple[Parameter, ...]:
     """What can be moved in this state, in the order in which it is drawn, with names that differ within a group."""
     found: list[Parameter] = []
-    names = [name_of(call.trail) for call in played.calls]
-    repeated = Counter(names)
-    seen: Counter[tuple[str, str, str]] = Counter()
-    for call, named in zip(played.calls, names, strict=True):
-        seen[named] += 1
-        group, name, unit = named
-        name = f"{name} {seen[named]}" if repeated[named] > 1 else name
-        if _together(call):
-            turn = played.turns.get(call.key, (0.0, call.shares))[0]
-            found.append(Parameter(call.key, None, group, name, " turns", 0.0, 1.0, turn))
-        else:
-            found += [_parameter(call, index, group, name, unit) for index in range(len(call.shares))]
+    titles = [_title(call) for call in played.calls]
+    repeated = Counter(titles)
+    seen: Counter[tuple[str, tuple[str, ...]]] = Counter()
+    for call, title in zip(played.calls, titles, strict=True):
+        seen[title] += 1
+        group, names = title
+        if repeated[title] > 1:
+            names = tuple(f"{name} {seen[title]}" for name in names)
+        found += _parameters_of(call, group, names, played.turns.get(call.key, (0.0, call.shares))[0])
     return tuple(parameter for parameter in found if parameter.high > parameter.low)
 
 
-def _together(call: Call) -> bool:
-    return len(call.shares) > (MANY_NORMAL if call.kind == "normal" else MANY)
+def _title(call: Call) -> tuple[str, tuple[str, ...]]:
+    """Group of a draw, and its name or those of its numbers: as the scene calls them, else as the source does."""
+    group, *inner = call.name.parts or ("whole",)
+    names = (call.name.name,) if isinstance(call.name.name, str) else call.name.name
+    return group, tuple(" ".join([*inner, name or _source_name(call.trail)]) for name in names)
 
 
-def _parameter(call: Call, index: int, group: str, name: str, unit: str) -> Parameter:
-    if len(call.shares) > 1:
-        name = f"{name} {'xyz'[index] if call.shape == (3,) and call.kind != 'permutation' else index + 1}"
+def _parameters_of(call: Call, group: str, names: tuple[str, ...], turn: float) -> list[Parameter]:
+    """The sliders of one draw: one for each number, or one for many together."""
+    if len(call.shares) > (MANY_NORMAL if call.kind == "normal" else MANY):
+        return [Parameter(call.key, None, group, names[0], "turns", 0.0, 1.0, turn)]
+    return [_parameter(call, index, group, name) for index, name in enumerate(_numbered(call, names))]
+
+
+def _source_name(trail: Trail) -> str:
+    """The variable that a draw's source line assigns, as words; where there is none, the function that draws."""
+    code, instruction = trail[-1]
+    line = list(code.co_positions())[instruction // 2][0]
+    assigned = re.match(r"\s*(\w+)\s*(:[^=]+)?[-+*/]?=(?!=)", linecache.getline(code.co_filename, line or 0))
+    name = assigned[1] if assigned else re.sub("<.*>", "draw", code.co_name)
+    return name.strip("_").replace("_", " ")
+
+
+def _numbered(call: Call, names: tuple[str, ...]) -> tuple[str, ...]:
+    """A name for each number of a draw: x, y and z of a vector, else a count, where they share one."""
+    count = len(call.shares)
+    if len(names) == count:
+        return names
+    ends = "xyz" if call.shape == (3,) and call.kind != "permutation" else range(1, count + 1)
+    return tuple(f"{names[0]} {end}" for end in ends)
+
+
+def _parameter(call: Call, index: int, group: str, name: str) -> Parameter:
     low, high, share = float(call.low[index]), float(call.high[index]), float(call.shares[index])
     if call.kind == "normal":
         value = float(np.clip(ndtri(share), -NORMAL_REACH, NORMAL_REACH))
-        return Parameter(call.key, index, group, name, " σ", -NORMAL_REACH, NORMAL_REACH, value)
+        return Parameter(call.key, index, group, name, "σ", -NORMAL_REACH, NORMAL_REACH, value)
     if call.kind in ("integers", "choice"):
         value = low + np.floor(share * (high - low))
+        if call.ends is not None:
+            value = np.minimum(np.searchsorted(call.ends, share, side="right"), high - 1)
         return Parameter(call.key, index, group, name, "", low, high - 1, float(value), whole=True)
-    factor = 180 / np.pi if unit == "°" else 1.0
-    low, high = sorted((low * factor, high * factor))
+    factor, unit = (180 / np.pi, "°") if call.name.unit == "rad" else (1.0, call.name.unit)
+    low, high = low * factor, high * factor
     return Parameter(call.key, index, group, name, unit, low, high, low + share * (high - low))
 
 
@@ -222,7 +248,7 @@ def set_value(scene: Scene, played: Played, parameter: Parameter, value: float) 
         shares = turned(start, value, crc32(repr(call.key).encode()) + played.seed)
     else:
         shares = call.shares.copy()
-        shares[parameter.index] = _share(call.kind, parameter, value)
+        shares[parameter.index] = _share(call, parameter, value)
     given = {**played.remembered, call.key: shares}
     try:
         result = _played(scene, played.seed, given, turns, played)
@@ -246,11 +272,13 @@ def turned(shares: Shares, turn: float, seed: int) -> Shares:
     return moved
 
 
-def _share(kind: str, parameter: Parameter, value: float) -> float:
+def _share(call: Call, parameter: Parameter, value: float) -> float:
     value = min(max(value, parameter.low), parameter.high)
-    if kind == "normal":
+    if call.kind == "normal":
         return float(ndtr(value))
-    if kind in ("integers", "choice"):
+    if call.ends is not None:  # the middle of the option's share
+        return float(np.interp(round(value) + 0.5, np.arange(len(call.ends) + 1), [0.0, *call.ends]))
+    if call.kind == "integers":
         return float((np.rint(value) - parameter.low + 0.5) / (parameter.high - parameter.low + 1))
     return float((value - parameter.low) / (parameter.high - parameter.low))
 

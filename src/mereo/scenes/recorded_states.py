@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.deformation.surface_driven import Surface, SurfaceMap
 from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
@@ -59,7 +60,7 @@ class States:
 
     def sample(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
         """The deformations of one frame, each as likely as the other."""
-        return self.frames.deformations(int(rng.integers(self.first, self.end)))
+        return self.frames.deformations(int(named(rng, "frame").integers(self.first, self.end)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,8 @@ def load_states(
     Args:
         path: an NPZ file or a directory, see docs/design/0008-simulated-states.md.
         rest: the object at rest, in scene units.
-        scale, shift: ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
+        scale: ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
+        shift: see ``scale``.
         held_out: the share of frames, the last ones, kept for testing: from 0 to less than 1.
 
     Raises:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin._human_parts import joints
 
 Turns = tuple[tuple[str, float, float], ...]
@@ -16,7 +17,7 @@ Turns = tuple[tuple[str, float, float], ...]
 
 
 @dataclass(frozen=True)
-class Joint:
+class BodyJoint:
     """What turns about one point.
 
     Attributes:
@@ -52,24 +53,24 @@ class Joint:
 FACE = ("head", "jaw", "eye", "tongue", "levator", "oculi", "orbicularis", "oris", "risorius", "special")
 
 
-def _trunk() -> Iterator[Joint]:
+def _trunk() -> Iterator[BodyJoint]:
     bend: Turns = (("y", -15, 15), ("z", -12, 12), ("x", -10, 22))
-    yield Joint("waist", "", "spine04", "spine02____head", (("spine04", "spine03"), ""), 2.5, bend)
+    yield BodyJoint("waist", "", "spine04", "spine02____head", (("spine04", "spine03"), ""), 2.5, bend)
     chest = ("spine02", "spine01", "clavicle", "breast", "shoulder01")
-    yield Joint("chest", "waist", "spine02", "neck01____head", (chest, ""), 2.5, bend)
+    yield BodyJoint("chest", "waist", "spine02", "neck01____head", (chest, ""), 2.5, bend)
     turns: Turns = (("y", -25, 25), ("z", -10, 10), ("x", -12, 15))
-    yield Joint("neck", "chest", "neck01", "head____head", (("neck",), ""), 1.6, turns)
-    yield Joint("head", "neck", "head", "head____tail", (FACE, ""), 2.0, turns)
+    yield BodyJoint("neck", "chest", "neck01", "head____head", (("neck",), ""), 1.6, turns)
+    yield BodyJoint("head", "neck", "head", "head____tail", (FACE, ""), 2.0, turns)
 
 
-def _limbs(side: str) -> Iterator[Joint]:
+def _limbs(side: str) -> Iterator[BodyJoint]:
     """Of one side, `L` or `R`; the limits are those of the left side and mirrored for the right one."""
 
     def limb(
         name: str, parent: str, bone: str, tip: str, skin: tuple[str, ...], softness: float, turns: Turns
-    ) -> Joint:
+    ) -> BodyJoint:
         above = parent if parent in ("chest", "") else f"{parent}.{side}"
-        return Joint(
+        return BodyJoint(
             f"{name}.{side}", above, f"{bone}.{side}", f"{tip}.{side}____head", (skin, f".{side}"), softness, turns
         )
 
@@ -98,7 +99,7 @@ def turn_axes() -> Float[np.ndarray, "j 3 3"]:
     for index, joint in enumerate(JOINTS):
         for place, (name, _, _) in enumerate(joint.turns):
             axes[index, place] = _axis(joint, name)
-    return axes
+    return read_only(axes)
 
 
 @cache
@@ -107,10 +108,23 @@ def turn_limits() -> Float[np.ndarray, "2 j 3"]:
     limits = np.zeros((2, len(JOINTS), 3))
     for index, joint in enumerate(JOINTS):
         limits[:, index, : len(joint.turns)] = np.deg2rad([turn[1:] for turn in joint.turns]).T
-    return limits
+    return read_only(limits)
 
 
-def _axis(joint: Joint, name: str) -> Float[np.ndarray, "3"]:
+@cache
+def turn_names() -> tuple[str, ...]:
+    """Name of each turn, joint by joint in the order of ``turn_limits``; "" where there is none."""
+    about = {"bone": "twist", "hinge": "bend", "x": "about x", "y": "about y", "z": "about z"}
+    names = []
+    for joint in JOINTS:
+        part, _, side = joint.name.replace("_", " ").partition(".")
+        owner = f"{'left ' if side == 'L' else 'right ' if side else ''}{part}"
+        turns = [f"{owner} {about[axis]}" for axis, _, _ in joint.turns]
+        names += [*turns, *("" for _ in range(3 - len(turns)))]
+    return tuple(names)
+
+
+def _axis(joint: BodyJoint, name: str) -> Float[np.ndarray, "3"]:
     right = joint.name.endswith("R")
     if name == "bone":  # a turn about a mirrored bone is mirrored by turning the other way
         return joint.direction * (-1.0 if right else 1.0)
@@ -129,7 +143,7 @@ def part_axes() -> tuple[Float[np.ndarray, "j 3 3"], Float[np.ndarray, "j 3"]]:
     """For each part the projection across its axis, and the joint at which it begins."""
     directions = np.stack([joint.direction for joint in JOINTS])
     projections = np.eye(3) - directions[:, :, None] * directions[:, None]
-    return projections, np.stack([joint.head for joint in JOINTS])
+    return read_only(projections), read_only(np.stack([joint.head for joint in JOINTS]))
 
 
 def rotations(angles_rad: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3"]:

@@ -15,6 +15,7 @@ from scipy.sparse import csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from mereo.geometry.read_only import read_only
 from mereo.geometry.solids import label_grid
 from mereo.scenes.builtin._human_joints import JOINTS, PARENTS, part_axes
 from mereo.scenes.builtin._human_parts import base, rest_mesh, skin_weights, to_scene
@@ -137,8 +138,8 @@ def _extended(shares: Float[np.ndarray, "r j"], number: Int[np.ndarray, "x y z"]
 class PosedBody:
     """The body's shape, then its pose: every joint turns each point by the point's share of the joint's angle.
 
-    Angles are blended, not matrices, so limbs do not collapse (see ``skeleton``). Joints turn from the leaves to the
-    root, in rest coordinates.
+    Angles are blended, not matrices, so every step stays a rotation and limbs do not collapse (cf. Kavan & Zara,
+    "Spherical blend skinning", 2005). Joints turn from the leaves to the root, in rest coordinates.
 
     Attributes:
         rotations: of each joint, axis times radians.
@@ -186,4 +187,4 @@ def _own_shares() -> Float[np.ndarray, "j j"]:
     for child, parent in enumerate(PARENTS):
         if parent >= 0:
             own[child, parent] = -1.0
-    return own
+    return read_only(own)

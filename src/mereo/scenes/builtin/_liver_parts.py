@@ -11,11 +11,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid
 from mereo.deformation.warps import Bend, FreeFormLattice, Squash, Twist
 from mereo.geometry.manifold import Faces, Vertices, solid_of
-from mereo.geometry.mesh import PALETTE, Segment
+from mereo.geometry.mesh import PALETTE, Segment, vertex_normals
 from mereo.geometry.mesh_repair import close_holes, largest_piece
+from mereo.geometry.read_only import read_only
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes import assets
 from mereo.scenes.builtin._real_meshes import main_part, simplified
@@ -86,9 +88,9 @@ class Instrument(NamedTuple):
 
     def sample(self, rng: np.random.Generator, tip: Vertices, normal: Vertices) -> Localized:
         """At one of the given places, within 30 degrees of its normal or so."""
-        index = rng.integers(len(tip))
-        direction = normal[index] + 0.35 * rng.normal(size=3)
-        direction *= rng.uniform(*self.shift_mm) * MM / np.linalg.norm(direction)
+        index = named(rng, "place").integers(len(tip))
+        direction = normal[index] + 0.35 * named(rng, "slant").normal(size=3)
+        direction *= named(rng, "shift", "mm").uniform(*self.shift_mm) * MM / np.linalg.norm(direction)
         pull = Rigid(np.zeros(3), direction, tip[index])
         return Localized(pull, tip[index], self.tip_mm * MM, self.reach_mm * MM)
 
@@ -96,6 +98,9 @@ class Instrument(NamedTuple):
 GRASPER = Instrument((10.0, 32.0), tip_mm=14.0, reach_mm=94.0)
 RETRACTOR = Instrument((5.0, 16.0), tip_mm=14.0, reach_mm=80.0)
 PROBE = Instrument((-16.0, -5.0), tip_mm=8.0, reach_mm=70.0)
+
+INSTRUMENTS = {"grasper": ("edge", GRASPER), "retractor": ("gallbladder", RETRACTOR), "probe": ("surface", PROBE)}
+"""Where each may be, and what it does there."""
 
 BEND_RAD, TWIST_RAD, SQUASH = 0.5, 0.6, 0.12
 LATTICE_CELLS, LATTICE_STRENGTH = (3, 3, 3), 0.4
@@ -108,7 +113,7 @@ EDGE_SHARE = 0.12
 def _places() -> dict[str, tuple[Vertices, Vertices]]:
     """Where each kind of instrument may be, with outward normals."""
     liver, gallbladder = organs()
-    normals = [_normals(part) for part in (liver, gallbladder)]
+    normals = [read_only(vertex_normals(part)) for part in (liver, gallbladder)]
     tree = cKDTree(liver.vertices)
     around = tree.query_ball_point(liver.vertices, 25.0 * MM)
     mean = np.stack([liver.vertices[rows].mean(axis=0) for rows in around])
@@ -116,28 +121,24 @@ def _places() -> dict[str, tuple[Vertices, Vertices]]:
     height = np.einsum("ni,ni->n", normals[0], liver.vertices - mean)
     edge = height > np.quantile(height, 1 - EDGE_SHARE)
     return {
-        "edge": (liver.vertices[edge], normals[0][edge]),
+        "edge": (read_only(liver.vertices[edge]), read_only(normals[0][edge])),
         "gallbladder": (gallbladder.vertices, normals[1]),
         "surface": (liver.vertices, normals[0]),
     }
 
 
-def _normals(segment: Segment) -> Vertices:
-    """Unit normals of vertices, weighted by area."""
-    a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
-    normal = np.zeros_like(segment.vertices)
-    for k in range(3):
-        np.add.at(normal, segment.faces[:, k], np.cross(b - a, c - a))
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-
-
 def sample_field(rng: np.random.Generator) -> Compose:
     """One random deformation of all tissue: instruments first, then posture and breathing."""
     places = _places()
-    kinds = [("edge", GRASPER), ("gallbladder", RETRACTOR), ("surface", PROBE)]
-    chosen = [kinds[index] for index in rng.permutation(3)[: rng.integers(0, 4)]]
-    instruments: list[Deformation] = [tool.sample(rng, *places[place]) for place, tool in chosen]
-    return Compose((*instruments, *_posture(rng)))
+    names = tuple(INSTRUMENTS)
+    order = named(rng, tuple(f"order of the {name}" for name in names)).permutation(3)
+    instruments: list[Deformation] = []
+    for index in order[: named(rng, "instruments").integers(0, 4)]:
+        place, tool = INSTRUMENTS[names[index]]
+        with part(rng, names[index]):
+            instruments.append(tool.sample(rng, *places[place]))
+    with part(rng, "posture"):
+        return Compose((*instruments, *_posture(rng)))
 
 
 def _posture(rng: np.random.Generator) -> list[Deformation]:
@@ -146,11 +147,11 @@ def _posture(rng: np.random.Generator) -> list[Deformation]:
     low, high = liver.bounds
     length = float(high[1] - low[1])
     end, axis = np.array([0.0, low[1], 0.0]), np.array([0.0, 1.0, 0.0])
-    toward = np.array([rng.normal(), 0.0, rng.normal()])
+    toward = np.array([named(rng, "bend toward x").normal(), 0.0, named(rng, "bend toward z").normal()])
     radius = float(np.linalg.norm(liver.vertices[:, [0, 2]], axis=1).max())
-    return [
-        FreeFormLattice.sample(rng, liver.bounds, LATTICE_CELLS, LATTICE_STRENGTH),
-        Squash(np.zeros(3), rng.normal(size=3), float(np.exp(rng.uniform(-SQUASH, SQUASH)))),
-        Twist(end, axis, length, rng.uniform(-TWIST_RAD, TWIST_RAD)),
-        Bend(end, axis, toward, length, rng.uniform(-BEND_RAD, BEND_RAD), 1.3 * radius),
-    ]
+    lattice = FreeFormLattice.sample(rng, liver.bounds, LATTICE_CELLS, LATTICE_STRENGTH)
+    squash_along = named(rng, "squash along").normal(size=3)
+    squash = Squash(np.zeros(3), squash_along, float(np.exp(named(rng, "squash", "log").uniform(-SQUASH, SQUASH))))
+    twist = Twist(end, axis, length, named(rng, "twist", "rad").uniform(-TWIST_RAD, TWIST_RAD))
+    bend_rad = named(rng, "bend", "rad").uniform(-BEND_RAD, BEND_RAD)
+    return [lattice, squash, twist, Bend(end, axis, toward, length, bend_rad, 1.3 * radius)]

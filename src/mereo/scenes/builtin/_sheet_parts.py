@@ -13,10 +13,11 @@ from scipy.spatial import Delaunay, cKDTree
 
 from mereo.deformation.maps import smooth_step
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.read_only import read_only
 
 LENGTH, WIDTH = 52.0, 38.0
 COLUMNS, ROWS = 3, 2
-HALF = np.array([LENGTH / 2, WIDTH / 2])
+HALF = read_only(np.array([LENGTH / 2, WIDTH / 2]))
 CORNER = 4.0
 """Radius of the rounded corners."""
 
@@ -84,7 +85,7 @@ def _product(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"]) -> Float[np
 def _tab_rows() -> Float[np.ndarray, " r"]:
     """The rows of the sheet's edge from which the tab goes on."""
     y = _ticks(HALF[1], ROWS)
-    return y[(y > TAB_ROWS[0]) & (y < TAB_ROWS[1])]
+    return read_only(y[(y > TAB_ROWS[0]) & (y < TAB_ROWS[1])])
 
 
 def _tab_box() -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:

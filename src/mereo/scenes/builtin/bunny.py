@@ -16,9 +16,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, smooth_step, turn
 from mereo.deformation.warps import SmoothField, Squash
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes import assets
 from mereo.scenes.builtin._solids import Vector
 from mereo.scenes.scene import WHOLE_SPHERE_RAD, Scene, Workspace
@@ -49,7 +51,7 @@ def model_to_scene() -> tuple[Float[np.ndarray, "3"], float]:
     """``scene = (model - center) * scale`` takes the metres of bunny.off to scene units."""
     vertices = _load().vertices
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return (low + high) / 2, float(SHORTEST_SIDE / (high - low).min())
+    return read_only((low + high) / 2), float(SHORTEST_SIDE / (high - low).min())
 
 
 @cache
@@ -126,10 +128,11 @@ class JointBounds:
     def sample(self, rng: np.random.Generator) -> SoftJoint:
         """Twist about ``direction`` and bend about a random axis across it, each uniform within its bound."""
         direction = np.array(self.direction) / np.linalg.norm(self.direction)
-        across = np.cross(direction, rng.normal(size=3))
+        across = np.cross(direction, named(rng, "bend about").normal(size=3))
         across /= np.linalg.norm(across)
-        vector = across * rng.uniform(0.0, self.bend_rad) + direction * rng.uniform(-self.twist_rad, self.twist_rad)
-        return SoftJoint(np.array(self.center), direction, self.length, vector)
+        bend = across * named(rng, "bend", "rad").uniform(0.0, self.bend_rad)
+        twist = direction * named(rng, "twist", "rad").uniform(-self.twist_rad, self.twist_rad)
+        return SoftJoint(np.array(self.center), direction, self.length, bend + twist)
 
 
 def _beyond(cut: Cut, distance: float) -> Vector:
@@ -139,31 +142,44 @@ def _beyond(cut: Cut, distance: float) -> Vector:
 
 
 # distal joints first: each is evaluated in the rest pose of what it moves
-EAR_LEFT_JOINTS = (
-    JointBounds(_beyond(EAR_LEFT, 4.0), EAR_LEFT.direction, length=5.0, twist_rad=0.35, bend_rad=0.7),
-    JointBounds(EAR_LEFT.origin, EAR_LEFT.direction, length=5.0, twist_rad=0.35, bend_rad=0.6),
-)
-EAR_RIGHT_JOINTS = (
-    JointBounds(_beyond(EAR_RIGHT, 4.0), EAR_RIGHT.direction, length=5.0, twist_rad=0.35, bend_rad=0.7),
-    JointBounds(EAR_RIGHT.origin, EAR_RIGHT.direction, length=5.0, twist_rad=0.35, bend_rad=0.6),
-)
+EAR_LEFT_JOINTS = {
+    "tip": JointBounds(_beyond(EAR_LEFT, 4.0), EAR_LEFT.direction, length=5.0, twist_rad=0.35, bend_rad=0.7),
+    "root": JointBounds(EAR_LEFT.origin, EAR_LEFT.direction, length=5.0, twist_rad=0.35, bend_rad=0.6),
+}
+EAR_RIGHT_JOINTS = {
+    "tip": JointBounds(_beyond(EAR_RIGHT, 4.0), EAR_RIGHT.direction, length=5.0, twist_rad=0.35, bend_rad=0.7),
+    "root": JointBounds(EAR_RIGHT.origin, EAR_RIGHT.direction, length=5.0, twist_rad=0.35, bend_rad=0.6),
+}
 HEAD_JOINT = JointBounds(NECK.origin, NECK.direction, length=9.0, twist_rad=0.45, bend_rad=0.25)
 TAIL_JOINT = JointBounds(TAIL.origin, TAIL.direction, length=4.0, twist_rad=0.15, bend_rad=0.2)
 SPINE_JOINT = JointBounds((-10.0, -4.0, 2.0), (1.0, 0.0, 0.0), length=24.0, twist_rad=0.35, bend_rad=0.35)
 
 
+def _joint(rng: np.random.Generator, name: str, bounds: JointBounds) -> SoftJoint:
+    with part(rng, name):
+        return bounds.sample(rng)
+
+
+def _ear(rng: np.random.Generator, name: str, joints: dict[str, JointBounds]) -> list[Deformation]:
+    with part(rng, name):
+        return [_joint(rng, place, bounds) for place, bounds in joints.items()]
+
+
 def squash_and_wobble(rng: np.random.Generator) -> list[Deformation]:
     """Squeeze along a random axis by up to 18 percent at constant volume, then smooth random waves."""
-    squash = Squash(np.zeros(3), rng.normal(size=3), float(np.exp(rng.uniform(-0.18, 0.18))))
-    frequencies = rng.normal(size=(4, 3))
-    frequencies *= 2 * np.pi / rng.uniform(25.0, 45.0, size=(4, 1)) / np.linalg.norm(frequencies, axis=1, keepdims=True)
-    amplitudes = rng.normal(size=(4, 3))
+    squash_along = named(rng, "squash along").normal(size=3)
+    squash = Squash(np.zeros(3), squash_along, float(np.exp(named(rng, "squash", "log").uniform(-0.18, 0.18))))
+    frequencies = named(rng, "wave directions").normal(size=(4, 3))
+    wavelengths = named(rng, "wavelength").uniform(25.0, 45.0, size=(4, 1))
+    frequencies *= 2 * np.pi / wavelengths / np.linalg.norm(frequencies, axis=1, keepdims=True)
+    amplitudes = named(rng, "wave motions").normal(size=(4, 3))
     amplitudes *= (
-        rng.uniform(0.0, 0.3 / 4)
+        named(rng, "wave strength").uniform(0.0, 0.3 / 4)
         / np.linalg.norm(frequencies, axis=1).max()
         / np.linalg.norm(amplitudes, axis=1, keepdims=True)
     )
-    return [squash, SmoothField(amplitudes, frequencies, rng.uniform(0, 2 * np.pi, size=4))]
+    phases = named(rng, "wave phase", "rad").uniform(0, 2 * np.pi, size=4)
+    return [squash, SmoothField(amplitudes, frequencies, phases)]
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
@@ -171,10 +187,11 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
     A joint leaves its own plane where it is, so neighbours stay in contact along the cut.
     """
-    ear_left = [joint.sample(rng) for joint in EAR_LEFT_JOINTS]
-    ear_right = [joint.sample(rng) for joint in EAR_RIGHT_JOINTS]
-    head, tail, spine = HEAD_JOINT.sample(rng), TAIL_JOINT.sample(rng), SPINE_JOINT.sample(rng)
-    body = [*squash_and_wobble(rng), spine]
+    ear_left, ear_right = _ear(rng, "left ear", EAR_LEFT_JOINTS), _ear(rng, "right ear", EAR_RIGHT_JOINTS)
+    head, tail = _joint(rng, "head", HEAD_JOINT), _joint(rng, "tail", TAIL_JOINT)
+    spine = _joint(rng, "spine", SPINE_JOINT)
+    with part(rng, "body"):
+        body = [*squash_and_wobble(rng), spine]
     chains = (body, [head, *body], [*ear_left, head, *body], [*ear_right, head, *body], [tail, *body])
     return tuple(Compose(tuple(chain)) for chain in chains)
 

@@ -34,8 +34,10 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation, Identity, Rigid, smooth_step
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin import _engine_parts as parts
 from mereo.scenes.builtin._engine_block import block
 from mereo.scenes.builtin._machine_parts import segment, union
@@ -86,7 +88,7 @@ def valve_places() -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"], Fl
             (parts.EXHAUST_AT, parts.EXHAUST_RADIUS, EXHAUST_PEAK_RAD),
         )
     ]
-    x, radius, peak = np.array(rows).T
+    x, radius, peak = read_only(np.array(rows)).T
     return x, radius, peak
 
 
@@ -145,7 +147,7 @@ def deformations_at(crank_rad: float) -> tuple[Deformation, ...]:
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """A crank angle uniform over the cycle."""
-    return deformations_at(rng.uniform(0.0, CYCLE_RAD))
+    return deformations_at(named(rng, "crank angle", "rad").uniform(0.0, CYCLE_RAD))
 
 
 def scene() -> Scene:

@@ -35,10 +35,12 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, jacobian_determinant
 from mereo.deformation.warps import SmoothField
+from mereo.geometry.read_only import read_only
 from mereo.geometry.solids import label_grid
-from mereo.scenes.builtin._human_joints import JOINTS, NAMES, part_axes, rotations, turn_limits
+from mereo.scenes.builtin._human_joints import JOINTS, NAMES, part_axes, rotations, turn_limits, turn_names
 from mereo.scenes.builtin._human_parts import SCALE, base, rest_mesh, to_scene
 from mereo.scenes.builtin._human_skin import PosedBody, share_field
 from mereo.scenes.scene import Scene, Workspace
@@ -58,11 +60,11 @@ BARE = 0.7
 CRITICAL = 200
 LEAST_DETERMINANT = 0.12
 
-GIRTH_GROUPS = (
-    ("waist", "chest"),
-    ("upper_arm.L", "forearm.L", "upper_arm.R", "forearm.R"),
-    ("thigh.L", "shin.L", "thigh.R", "shin.R"),
-)
+GIRTH_GROUPS = {
+    "trunk": ("waist", "chest"),
+    "arms": ("upper_arm.L", "forearm.L", "upper_arm.R", "forearm.R"),
+    "legs": ("thigh.L", "shin.L", "thigh.R", "shin.R"),
+}
 """Parts that are stout or thin together."""
 
 
@@ -90,7 +92,8 @@ def balls() -> Balls:
         if (np.linalg.norm(centers - vertex, axis=1) - radii).min() > BARE:
             centers, radii = np.concatenate([centers, vertex[None]]), np.append(radii, 0.0)
     touching = radii[:, None] + radii
-    return Balls(centers, np.where(cdist(centers, centers) - touching > APART, touching + LEAST_GAP, -1.0))
+    apart = np.where(cdist(centers, centers) - touching > APART, touching + LEAST_GAP, -1.0)
+    return Balls(read_only(centers), read_only(apart))
 
 
 def is_clear(posed: Deformation) -> bool:
@@ -109,16 +112,21 @@ def critical_points() -> Float[np.ndarray, "n 3"]:
     lever = np.linalg.norm(vertices[:, None] - part_axes()[1], axis=2)
     largest = np.abs(turn_limits()).max(axis=(0, 2))
     pressed = (np.linalg.norm(slope, axis=2) * lever * largest).max(axis=1)
-    return vertices[np.argsort(-pressed, kind="stable")[:CRITICAL]]
+    return read_only(vertices[np.argsort(-pressed, kind="stable")[:CRITICAL]])
 
 
 def sample_body(rng: np.random.Generator) -> PosedBody:
     """A random shape in a random pose within the limits of each joint."""
     girth = np.zeros(len(JOINTS))
-    common = rng.uniform(-0.1, 0.14)
-    for group in GIRTH_GROUPS:
-        girth[[NAMES.index(name) for name in group]] = common + rng.uniform(-0.04, 0.04)
-    return PosedBody(rotations(rng.uniform(*turn_limits())), girth, float(np.exp(rng.uniform(-0.05, 0.05))))
+    with part(rng, "shape"):
+        common = named(rng, "girth").uniform(-0.1, 0.14)
+        for group, names in GIRTH_GROUPS.items():
+            more = named(rng, f"girth of the {group}").uniform(-0.04, 0.04)
+            girth[[NAMES.index(name) for name in names]] = common + more
+    with part(rng, "pose"):
+        pose = rotations(named(rng, turn_names(), "rad").uniform(*turn_limits()))
+    with part(rng, "shape"):
+        return PosedBody(pose, girth, float(np.exp(named(rng, "height", "log").uniform(-0.05, 0.05))))
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
@@ -126,7 +134,8 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     for _ in range(ATTEMPTS):
         body = sample_body(rng)
         if is_clear(body) and jacobian_determinant(body, critical_points()).min() > LEAST_DETERMINANT:
-            waves = SmoothField.sample(rng, rng.uniform(0.0, 0.1), (25.0, 60.0))
+            with part(rng, "waves"):
+                waves = SmoothField.sample(rng, named(rng, "strength").uniform(0.0, 0.1), (25.0, 60.0))
             return (Compose((body, waves)),) * len(rest_mesh().segments)
     raise ValueError(f"no pose in {ATTEMPTS} draws keeps the body's parts apart: narrow the joints' limits")
 

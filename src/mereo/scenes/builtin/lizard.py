@@ -23,8 +23,10 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.scenes.builtin._hinges import Hinged, follow, rigid_map
 from mereo.scenes.builtin._lizard_parts import (
@@ -55,9 +57,10 @@ LEGS = {
 """Plan, side, and the link that carries it."""
 
 MIDDLE_LINK = 3
-SPINE_LIMIT_RAD = np.array([0.23 if number in STIFF_HINGES else 0.36 for number in range(len(SPINE))])
+SPINE_LIMIT_RAD = read_only(np.array([0.23 if number in STIFF_HINGES else 0.36 for number in range(len(SPINE))]))
 SWING_RAD, FOOT_RAD = 0.36, 0.28
 SPINE_PLAY_RAD, LEG_PLAY_RAD = 0.025, 0.05
+PLAYS = ("about x", "about y")
 HARMONICS = 3
 GAP = 0.2
 """Least distance between links that are not neighbours, in the plane."""
@@ -77,10 +80,12 @@ def sample_spine(rng: np.random.Generator) -> Float[np.ndarray, "h 3"]:
     """Rotation vectors of the knuckles: a smooth curve about the vertical, scaled to a random share of the limits."""
     k = np.arange(HARMONICS + 1)[:, None]
     along = np.arange(len(SPINE)) / (len(SPINE) - 1)
-    waves = rng.normal(size=k.shape) / (1 + k) * np.cos(np.pi * k * along + rng.uniform(0, 2 * np.pi, size=k.shape))
-    curve = waves.sum(axis=0)
-    yaw = SPINE_LIMIT_RAD * curve * rng.uniform(0.35, 1.0) / np.abs(curve).max()
-    play = rng.uniform(-SPINE_PLAY_RAD, SPINE_PLAY_RAD, size=(len(SPINE), 2))
+    amplitudes = named(rng, "harmonics").normal(size=k.shape) / (1 + k)
+    phases = named(rng, "phase", "rad").uniform(0, 2 * np.pi, size=k.shape)
+    curve = (amplitudes * np.cos(np.pi * k * along + phases)).sum(axis=0)
+    yaw = SPINE_LIMIT_RAD * curve * named(rng, "bend").uniform(0.35, 1.0) / np.abs(curve).max()
+    names = tuple(f"play of knuckle {number} {about}" for number in range(1, len(SPINE) + 1) for about in PLAYS)
+    play = named(rng, names, "rad").uniform(-SPINE_PLAY_RAD, SPINE_PLAY_RAD, size=(len(SPINE), 2))
     return np.column_stack([play, yaw])
 
 
@@ -101,7 +106,7 @@ def _spine_discs() -> tuple[tuple[int, Float[np.ndarray, "d 4"]], ...]:
     for link in range(1, len(ends) - 1):
         stations = np.arange(ends[link] + 0.7, ends[link + 1] + 1.0, 1.5)
         discs.append((link, np.array([[NOSE - s, 0.0, 2.0, half_width(s) + 0.4] for s in stations])))
-    return tuple(discs)
+    return tuple((link, read_only(covering)) for link, covering in discs)
 
 
 @cache
@@ -113,7 +118,7 @@ def _leg_discs(name: str) -> tuple[Float[np.ndarray, "u 4"], Float[np.ndarray, "
     vertices = np.array(leg(plan, side).foot.to_mesh().vert_properties[:, :3], dtype=float)
     x, y, _ = leg(plan, side).ankle.pivot
     far = vertices[np.hypot(vertices[:, 0] - x, vertices[:, 1] - y) > 1.0][::7]
-    return np.array([knee]), np.column_stack([far, np.zeros(len(far))])
+    return read_only(np.array([knee])), read_only(np.column_stack([far, np.zeros(len(far))]))
 
 
 def _moved(discs: Float[np.ndarray, "d 4"], motion: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "d 3"]:
@@ -144,9 +149,10 @@ def is_clear(spine: Float[np.ndarray, "k 4 4"], legs: dict[str, Float[np.ndarray
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """One map for each segment: its inner knuckles turn, then it follows the link that carries it."""
     while True:
-        vectors = sample_spine(rng)
+        with part(rng, "spine"):
+            vectors = sample_spine(rng)
         spine = spine_motions(vectors)
-        swings = {name: _leg_vectors(rng) for name in LEGS}
+        swings = {name: _leg_vectors(rng, name) for name in LEGS}
         legs = {name: _leg_motions(name, spine, swing) for name, swing in swings.items()}
         if is_clear(spine, legs):
             break
@@ -160,10 +166,13 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     return tuple(maps)
 
 
-def _leg_vectors(rng: np.random.Generator) -> Float[np.ndarray, "2 3"]:
+def _leg_vectors(rng: np.random.Generator, name: str) -> Float[np.ndarray, "2 3"]:
     """Rotation vectors at the root and at the ankle."""
-    play = rng.uniform(-LEG_PLAY_RAD, LEG_PLAY_RAD, size=(2, 2))
-    return np.column_stack([play, rng.uniform(-1.0, 1.0, size=2) * (SWING_RAD, FOOT_RAD)])
+    names = tuple(f"play of the {place} {about}" for place in ("leg", "foot") for about in PLAYS)
+    with part(rng, name.replace("_", " ")):
+        play = named(rng, names, "rad").uniform(-LEG_PLAY_RAD, LEG_PLAY_RAD, size=(2, 2))
+        turns = named(rng, ("swing", "swing of the foot")).uniform(-1.0, 1.0, size=2) * (SWING_RAD, FOOT_RAD)
+    return np.column_stack([play, turns])
 
 
 def _leg_motions(

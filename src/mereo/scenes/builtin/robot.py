@@ -31,14 +31,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin import _robot_parts as parts
 from mereo.scenes.builtin._solids import Vector, segment
 from mereo.scenes.scene import Scene, Workspace
 
 
-class Joint(NamedTuple):
+class ArmJoint(NamedTuple):
     """A revolute joint of the rest pose: a point of its axis, the axis, and limits in degrees."""
 
     name: str
@@ -49,12 +51,12 @@ class Joint(NamedTuple):
 
 
 JOINTS = (
-    Joint("turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
-    Joint("lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
-    Joint("fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
-    Joint("roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
-    Joint("pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
-    Joint("spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+    ArmJoint("turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
+    ArmJoint("lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
+    ArmJoint("fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
+    ArmJoint("roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+    ArmJoint("pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
+    ArmJoint("spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
 )
 OPENING = (0.15, 2.0)
 """Least and largest distance of a finger from the middle."""
@@ -89,7 +91,7 @@ COLUMN = (
 )
 UPPER_ARM = (Bulk(2, (3.5, 5.4, 19.0), (3.5, 5.4, 37.0), 4.4, 9),)
 
-FOOT = np.array([[-10.6, -10.0, -50.0], [10.0, 10.0, 10.4]])
+FOOT = read_only(np.array([[-10.6, -10.0, -50.0], [10.0, 10.0, 10.4]]))
 """A box around the base and the turntable."""
 
 
@@ -113,7 +115,8 @@ def rest_mesh() -> SegmentedMesh:
 def sample_angles(rng: np.random.Generator) -> Float[np.ndarray, "6"]:
     """Joint angles in radians, uniform within the limits."""
     limits = np.array([(joint.lower_deg, joint.upper_deg) for joint in JOINTS])
-    return np.deg2rad(rng.uniform(limits[:, 0], limits[:, 1]))
+    names = tuple(joint.name for joint in JOINTS)
+    return np.deg2rad(named(rng, names, "°").uniform(limits[:, 0], limits[:, 1]))
 
 
 def chain(angles_rad: Float[np.ndarray, "6"]) -> tuple[Rigid, ...]:
@@ -153,7 +156,8 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     while not is_clear(turns):
         turns = chain(sample_angles(rng))
     links = [Compose(turns[:count][::-1]) for count in range(1, len(turns) + 1)]
-    slide = np.array([0.0, rng.uniform(*OPENING) - parts.JAW_OPENING, 0.0])
+    opening = named(rng, "opening").uniform(*OPENING)
+    slide = np.array([0.0, opening - parts.JAW_OPENING, 0.0])
     fingers = [Compose((Rigid(np.zeros(3), side * slide, np.zeros(3)), *turns[::-1])) for side in (1, -1)]
     return (Identity(), *links, *fingers)
 

@@ -23,9 +23,11 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation, Identity
 from mereo.deformation.warps import CurveSweep
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.scene import Scene, Workspace
 
 SEGMENTS = 8
@@ -103,7 +105,7 @@ def rest_mesh() -> SegmentedMesh:
     return SegmentedMesh((_base(), *(_piece(number) for number in range(SEGMENTS))))
 
 
-NODES = np.linspace(0.0, LENGTH, 97)
+NODES = read_only(np.linspace(0.0, LENGTH, 97))
 
 COILS = 1 / 3
 """The share of ropes that coil."""
@@ -115,9 +117,15 @@ COIL_BEGINS = 10.0
 """Over this length straight becomes coiled: the turn out of the plane, at most 0.03 per unit, bends little more."""
 
 
+SWINGS = tuple(f"phase {k + 1} of the {angle}" for angle in ("heading", "elevation") for k in range(HARMONICS))
+"""Names of the harmonics of a rope that swings."""
+
+
 def sample_centerline(rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
     """Places at ``NODES`` along a random rope that starts along x."""
-    heading, elevation = coil(rng) if rng.random() < COILS else swing(rng)
+    coils = named(rng, "coils below 1/3").random() < COILS
+    with part(rng, "coil" if coils else "swing"):
+        heading, elevation = coil(rng) if coils else swing(rng)
     tangents = np.stack(
         [np.cos(elevation) * np.cos(heading), np.cos(elevation) * np.sin(heading), np.sin(elevation)], axis=1
     )
@@ -133,11 +141,11 @@ Angles = tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]
 def swing(rng: np.random.Generator) -> Angles:
     """Random harmonics, scaled to a random share of the largest bend."""
     k = np.arange(1, HARMONICS + 1)
-    phases = rng.uniform(0, 2 * np.pi, size=(2, HARMONICS, 1))
-    amplitudes = rng.normal(size=(2, HARMONICS, 1)) / np.sqrt(k)[:, None]
+    phases = named(rng, SWINGS, "rad").uniform(0, 2 * np.pi, size=(2, HARMONICS, 1))
+    amplitudes = named(rng, "amplitudes").normal(size=(2, HARMONICS, 1)) / np.sqrt(k)[:, None]
     rates = (amplitudes * np.cos(np.pi * k[:, None] * NODES / LENGTH + phases)).sum(axis=1)
     rates[1] *= 0.5  # the camera sees sweeps sideways better
-    rates *= rng.uniform(0.15, 1.0) * MAX_BEND / np.linalg.norm(rates, axis=0).max()
+    rates *= named(rng, "bend").uniform(0.15, 1.0) * MAX_BEND / np.linalg.norm(rates, axis=0).max()
     rates *= np.clip(NODES / 6.0, 0.0, 1.0)  # leaves the base straight
     heading, elevation = (np.cumsum(rates, axis=1) - rates / 2) * NODES[1]
     return heading, 1.2 * np.tanh(elevation / 1.2)
@@ -145,11 +153,12 @@ def swing(rng: np.random.Generator) -> Angles:
 
 def coil(rng: np.random.Generator) -> Angles:
     """A helix from a random place on; its axis is z and its pitch keeps the turns apart."""
-    start, rate, pitch = rng.uniform(0.05, 0.4) * LENGTH, rng.uniform(0.13, 0.2), rng.uniform(*COIL_PITCH)
+    start = named(rng, "start").uniform(0.05, 0.4) * LENGTH
+    rate, pitch = named(rng, "turn per unit", "rad").uniform(0.13, 0.2), named(rng, "pitch").uniform(*COIL_PITCH)
     begun = np.clip((NODES - start) / COIL_BEGINS, 0.0, 1.0)
-    heading = rng.choice([-1.0, 1.0]) * np.cumsum(rate * begun) * NODES[1]
+    heading = named(rng, "sense of turning").choice([-1.0, 1.0]) * np.cumsum(rate * begun) * NODES[1]
     # one turn takes an arc of 2 pi / rate, of which the sine of the elevation is pitch
-    elevation = rng.choice([-1.0, 1.0]) * np.arcsin(pitch * rate / (2 * np.pi)) * begun
+    elevation = named(rng, "side").choice([-1.0, 1.0]) * np.arcsin(pitch * rate / (2 * np.pi)) * begun
     return heading, elevation
 
 

@@ -19,15 +19,18 @@ What makes it hard: the solids hide each other from nearly every side, all but t
 (notches, a blunt point or a bump tell how far they are turned), and turning and twisting look alike from most sides.
 """
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 from jaxtyping import Float
 from manifold3d import Manifold
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Rigid
 from mereo.deformation.warps import Bend, SmoothField, Squash, Taper, Twist
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin import _shapes_parts as solid
 from mereo.scenes.builtin._solids import segment
 from mereo.scenes.scene import Scene, Workspace
@@ -36,7 +39,7 @@ LONGEST_EDGE = 1.15
 GAP = 0.1
 """Air between a solid and the one that it stands on."""
 
-UP = np.array([0.0, 0.0, 1.0])
+UP = read_only(np.array([0.0, 0.0, 1.0]))
 CELLS = {"box": (45.0, 20.0), "star": (135.0, 0.0), "wedge": (225.0, 80.0), "arch": (315.0, -35.0)}
 """Where each of the four around the post stands and how far it is turned at rest, in degrees."""
 
@@ -83,24 +86,25 @@ def _placed(cell: str, part: Manifold) -> Manifold:
     return part.rotate((0.0, 0.0, CELLS[cell][1])).translate((float(x), float(y), float(z)))
 
 
-def _flat(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+def _flat(rng: np.random.Generator, name: str) -> Float[np.ndarray, "3"]:
     """A random horizontal direction."""
-    angle = rng.uniform(0.0, 2 * np.pi)
+    angle = named(rng, name, "rad").uniform(0.0, 2 * np.pi)
     return np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def _within(rng: np.random.Generator, radius: float) -> Float[np.ndarray, "3"]:
     """A horizontal shift, uniform in its length."""
-    return rng.uniform(0.0, radius) * _flat(rng)
+    return named(rng, "shift").uniform(0.0, radius) * _flat(rng, "direction of the shift")
 
 
-def _symmetric(rng: np.random.Generator, limit: float) -> float:
-    return float(rng.uniform(-limit, limit))
+def _angle(rng: np.random.Generator, name: str, limit_rad: float) -> float:
+    """An angle, uniform up to its limit to either side."""
+    return float(named(rng, name, "rad").uniform(-limit_rad, limit_rad))
 
 
-def _factor(rng: np.random.Generator, low: float, high: float) -> float:
-    """Uniform in its logarithm."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+def _factor(rng: np.random.Generator, name: str, low: float, high: float) -> float:
+    """A factor, uniform in its logarithm."""
+    return float(np.exp(named(rng, name, "log").uniform(np.log(low), np.log(high))))
 
 
 def _curl(
@@ -117,75 +121,107 @@ def _curl(
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """One map for each segment: its own shape, its motion in its cell, what carries it, and the waves of all."""
-    waves = SmoothField.sample(rng, rng.uniform(0.0, 0.15), (30.0, 60.0))
-    bend_length = solid.POST_HEIGHT - BEND_START
-    lean = Bend(BEND_START * UP, UP, _flat(rng), bend_length, rng.uniform(0.0, 0.7), radius=8.0)
-    stack = _move_in_cell(rng, "box")
-    chains: tuple[list[Deformation], ...] = (
-        [Twist(np.zeros(3), UP, solid.POST_HEIGHT, _symmetric(rng, 1.2)), lean, waves],
-        [*_ring(rng), lean, waves],
-        [*_cone(rng), lean, waves],
-        [*_box(rng), stack, waves],
-        [*_ball(rng), stack, waves],
-        [*_star(rng), _move_in_cell(rng, "star"), waves],
-        [*_wedge(rng), _move_in_cell(rng, "wedge"), waves],
-        [*_arch(rng), _move_in_cell(rng, "arch"), waves],
-    )
-    return tuple(Compose(tuple(chain)) for chain in chains)
+    with part(rng, "waves"):
+        waves = SmoothField.sample(rng, named(rng, "strength").uniform(0.0, 0.15), (30.0, 60.0))
+    with part(rng, "post"):
+        lean = _lean(rng, BEND_START * UP, solid.POST_HEIGHT - BEND_START, 0.7, 8.0)
+    with part(rng, "box and ball"):
+        stack = _move_in_cell(rng, "box")
+    carried: dict[str, list[Deformation]] = {"post": [lean], "ring": [lean], "cone": [lean]}
+    carried |= {"box": [stack], "ball": [stack]}
+    chains = []
+    for name, shape in SHAPES.items():
+        with part(rng, name):
+            own = shape(rng)
+            carrier = carried[name] if name in carried else [_move_in_cell(rng, name)]
+        chains.append(Compose((*own, *carrier, waves)))
+    return tuple(chains)
 
 
 def _move_in_cell(rng: np.random.Generator, cell: str) -> Rigid:
-    return Rigid(_symmetric(rng, 0.7) * UP, _within(rng, 1.0), cell_center(cell))
+    return Rigid(_angle(rng, "turn", 0.7) * UP, _within(rng, 1.0), cell_center(cell))
+
+
+def _lean(
+    rng: np.random.Generator, foot: Float[np.ndarray, "3"], length: float, most_rad: float, radius: float
+) -> Bend:
+    """A bend of what stands upright, to any side."""
+    toward = _flat(rng, "direction of leaning")
+    return Bend(foot, UP, toward, length, named(rng, "lean", "rad").uniform(0.0, most_rad), radius)
+
+
+def _post(rng: np.random.Generator) -> list[Deformation]:
+    return [Twist(np.zeros(3), UP, solid.POST_HEIGHT, _angle(rng, "twist", 1.2))]
 
 
 def _ring(rng: np.random.Generator) -> list[Deformation]:
     center, reach = RING_HEIGHT * UP, solid.RING_RADIUS + solid.RING_TUBE
-    across = _flat(rng)
-    oval = Squash(center, across, _factor(rng, 1 / 1.06, 1.06))
-    curl = _curl(center, across, UP, reach, _symmetric(rng, 0.6), solid.RING_TUBE + 0.5)
-    turn = _symmetric(rng, 0.7) * UP
-    tilt = Rigid(rng.uniform(0.0, 0.08) * _flat(rng), _within(rng, 0.1) + _symmetric(rng, RING_SLIDE) * UP, center)
-    return [Rigid(turn, np.zeros(3), center), oval, *curl, tilt]
+    across = _flat(rng, "direction of oval and curl")
+    oval = Squash(center, across, _factor(rng, "oval", 1 / 1.06, 1.06))
+    curl = _curl(center, across, UP, reach, _angle(rng, "curl", 0.6), solid.RING_TUBE + 0.5)
+    turn = _angle(rng, "turn", 0.7) * UP
+    tilt = named(rng, "tilt", "rad").uniform(0.0, 0.08) * _flat(rng, "direction of the tilt")
+    slide = _within(rng, 0.1) + float(named(rng, "height").uniform(-RING_SLIDE, RING_SLIDE)) * UP
+    return [Rigid(turn, np.zeros(3), center), oval, *curl, Rigid(tilt, slide, center)]
 
 
 def _cone(rng: np.random.Generator) -> list[Deformation]:
     foot = CONE_FLOOR * UP
-    lean = Bend(foot + UP, UP, _flat(rng), solid.CONE_HEIGHT - 1.0, rng.uniform(0.0, 0.9), solid.CONE_RADIUS)
-    return [lean, Rigid(_symmetric(rng, 0.7) * UP, _within(rng, 0.6), foot)]
+    lean = _lean(rng, foot + UP, solid.CONE_HEIGHT - 1.0, 0.9, solid.CONE_RADIUS)
+    return [lean, Rigid(_angle(rng, "turn", 0.7) * UP, _within(rng, 0.6), foot)]
 
 
 def _box(rng: np.random.Generator) -> list[Deformation]:
     foot, height = cell_center("box"), solid.BOX_SIZE[2]
-    return [Taper(foot, UP, height, _factor(rng, 0.8, 1.22)), Twist(foot, UP, height, _symmetric(rng, 0.7))]
+    return [
+        Taper(foot, UP, height, _factor(rng, "taper", 0.8, 1.22)),
+        Twist(foot, UP, height, _angle(rng, "twist", 0.7)),
+    ]
 
 
 def _ball(rng: np.random.Generator) -> list[Deformation]:
     contact = cell_center("box") + BALL_FLOOR * UP
-    roll = rng.normal(size=3)
-    roll *= rng.uniform(0.0, 0.5) / np.linalg.norm(roll)
+    roll = named(rng, "roll about").normal(size=3)
+    roll *= named(rng, "roll", "rad").uniform(0.0, 0.5) / np.linalg.norm(roll)
     return [
         Rigid(roll, np.zeros(3), contact + solid.BALL_RADIUS * UP),
-        Squash(contact, UP, _factor(rng, 0.84, 1.18)),  # about the contact: it stays on the box
+        Squash(contact, UP, _factor(rng, "squash", 0.84, 1.18)),  # about the contact: it stays on the box
         Rigid(np.zeros(3), _within(rng, 0.6), contact),
     ]
 
 
 def _star(rng: np.random.Generator) -> list[Deformation]:
     foot, height = cell_center("star"), solid.STAR_HEIGHT
-    return [Taper(foot, UP, height, _factor(rng, 0.8, 1.2)), Twist(foot, UP, height, _symmetric(rng, 1.2))]
+    return [
+        Taper(foot, UP, height, _factor(rng, "taper", 0.8, 1.2)),
+        Twist(foot, UP, height, _angle(rng, "twist", 1.2)),
+    ]
 
 
 def _wedge(rng: np.random.Generator) -> list[Deformation]:
     along, across = cell_axes("wedge")
     half, width = solid.WEDGE_SIZE[0] / 2, solid.WEDGE_SIZE[1] / 2
-    return _curl(cell_center("wedge"), along, across, half, _symmetric(rng, 0.9), width)
+    return _curl(cell_center("wedge"), along, across, half, _angle(rng, "curve", 0.9), width)
 
 
 def _arch(rng: np.random.Generator) -> list[Deformation]:
     foot, across = cell_center("arch"), cell_axes("arch")[1]
     height, reach = solid.ARCH_LEG + solid.ARCH_RADIUS, solid.ARCH_DEPTH / 2 + 1.0
-    lean = Bend(foot, UP, across, height, _symmetric(rng, 0.6), reach)
-    return [lean, Twist(foot, UP, height, _symmetric(rng, 0.7))]
+    lean = Bend(foot, UP, across, height, _angle(rng, "lean", 0.6), reach)
+    return [lean, Twist(foot, UP, height, _angle(rng, "twist", 0.7))]
+
+
+SHAPES: dict[str, Callable[[np.random.Generator], list[Deformation]]] = {
+    "post": _post,
+    "ring": _ring,
+    "cone": _cone,
+    "box": _box,
+    "ball": _ball,
+    "star": _star,
+    "wedge": _wedge,
+    "arch": _arch,
+}
+"""What deforms each solid by itself, in the order of the segments."""
 
 
 def scene() -> Scene:

@@ -29,12 +29,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Rigid, smooth_step
 from mereo.deformation.warps import Bend, CurveSweep, SmoothField, Twist
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin._sheet_parts import LARGEST_OFFSET, middle_points, rest_mesh
 from mereo.scenes.scene import Scene, Workspace
 
-NODES = np.linspace(-42.0, 42.0, 169)
+NODES = read_only(np.linspace(-42.0, 42.0, 169))
 """Stations along the sweep's curve; the sheet reaches 34 units from its middle."""
 
 GENTLE = 0.05
@@ -72,12 +74,15 @@ def _fold(start: float, length: float) -> Float[np.ndarray, " m"]:
 
 def sample_profile(rng: np.random.Generator, kind: str, low: float, high: float) -> Profile:
     """Waves and, by ``kind``, folds or a roll of a sheet that reaches from station ``low`` to ``high``."""
-    wavelengths, phases = rng.uniform(22.0, 60.0, size=(3, 1)), rng.uniform(0, 2 * np.pi, size=(3, 1))
-    waves = rng.uniform(-1, 1, size=(3, 1)) * np.sin(2 * np.pi * NODES / wavelengths + phases)
+    wavelengths = named(rng, "wavelength").uniform(22.0, 60.0, size=(3, 1))
+    phases = named(rng, "wave phase", "rad").uniform(0, 2 * np.pi, size=(3, 1))
+    sizes = named(rng, "wave").uniform(-1, 1, size=(3, 1))
+    waves = sizes * np.sin(2 * np.pi * NODES / wavelengths + phases)
     curvature = GENTLE / 3 * waves.sum(axis=0)
     bent: list[tuple[float, float]] = []  # from station to station
     if kind == "roll":
-        angle, radius = np.deg2rad(rng.uniform(180.0, 450.0)), rng.uniform(2.7, 3.6)
+        angle = np.deg2rad(named(rng, "roll", "°").uniform(180.0, 450.0))
+        radius = named(rng, "radius of the roll").uniform(2.7, 3.6)
         # a spiral whose radius grows by the pitch each turn, from its end inwards: r dr = -pitch / (2 pi) ds
         growth = ROLL_PITCH / (2 * np.pi)
         start = high - (radius * angle + growth * angle**2 / 2)
@@ -85,10 +90,12 @@ def sample_profile(rng: np.random.Generator, kind: str, low: float, high: float)
         curvature += smooth_step((NODES - start) / 5.0) / np.sqrt(radius**2 + 2 * growth * inner)
         bent = [(start, high)]
     elif kind != "waves":
-        places = np.sort(rng.uniform(low + 6.0, high - 6.0, size=1 if kind == "fold" else 2))
-        sign = 1.0 if rng.uniform() < 0.8 else -1.0
+        folds = ("place of the fold",) if kind == "fold" else ("place of a fold", "place of the other fold")
+        places = np.sort(named(rng, folds).uniform(low + 6.0, high - 6.0, size=len(folds)))
+        sign = 1.0 if named(rng, "folds upwards below 0.8").uniform() < 0.8 else -1.0
         for place in places:
-            angle, peak = np.deg2rad(rng.triangular(60.0, 175.0, 190.0)), rng.uniform(*FOLD_CURVATURE)
+            angle = np.deg2rad(named(rng, "fold", "°").triangular(60.0, 175.0, 190.0))
+            peak = named(rng, "curvature of the fold").uniform(*FOLD_CURVATURE)
             length = angle / (0.7 * peak)
             curvature += sign * peak * _fold(place - length / 2, length)
             bent.append((place - length / 2, place + length / 2))
@@ -118,12 +125,13 @@ def curve(profile: Profile) -> Float[np.ndarray, "m 3"]:
 
 def sample_corner(rng: np.random.Generator, corner: int) -> Bend:
     """One corner of the sheet (0 to 3) lifted, or folded onto the sheet."""
-    heading = np.arctan2(19.0, 26.0) * (-1) ** corner + np.pi * (corner // 2) + rng.uniform(-0.45, 0.45)
+    turn = named(rng, "direction", "rad").uniform(-0.45, 0.45)
+    heading = np.arctan2(19.0, 26.0) * (-1) ** corner + np.pi * (corner // 2) + turn
     axis = np.array([np.cos(heading), np.sin(heading), 0.0])
-    start = float((_middle() @ axis).max()) - rng.uniform(9.0, 17.0)
-    angle = np.deg2rad(rng.triangular(35.0, 165.0, 180.0))
-    radius = rng.uniform(2.7, 4.5 if angle > 2.0 else 9.0)
-    side = 1.0 if rng.uniform() < 5 / 6 else -1.0
+    start = float((_middle() @ axis).max()) - named(rng, "depth").uniform(9.0, 17.0)
+    angle = np.deg2rad(named(rng, "bend", "°").triangular(35.0, 165.0, 180.0))
+    radius = named(rng, "radius").uniform(2.7, 4.5 if angle > 2.0 else 9.0)
+    side = 1.0 if named(rng, "upwards below 5/6").uniform() < 5 / 6 else -1.0
     return Bend(start * axis, axis, np.array([0.0, 0.0, side]), radius * angle, float(angle), LARGEST_OFFSET)
 
 
@@ -133,7 +141,7 @@ def _turned(heading: float) -> Rigid:
 
 @cache
 def _middle() -> Float[np.ndarray, "k 3"]:
-    return middle_points()
+    return read_only(middle_points())
 
 
 def _do_not_meet(corners: list[Bend]) -> bool:
@@ -147,21 +155,34 @@ def _do_not_meet(corners: list[Bend]) -> bool:
     return True
 
 
+def _sample_corners(rng: np.random.Generator) -> list[Bend]:
+    """None, one or two corners, bent one after the other."""
+    order = named(rng, tuple(f"order of corner {corner}" for corner in range(4))).permutation(4)
+    corners = []
+    for corner in order[: named(rng, "corners").choice(3, p=[0.4, 0.4, 0.2])]:
+        with part(rng, f"corner {corner}"):
+            corners.append(sample_corner(rng, int(corner)))
+    return corners
+
+
 def sample_deformation(rng: np.random.Generator, kind: str) -> Deformation | None:
     """One state's map, its profile of one of ``KINDS``, or None where it is not to be used."""
-    corners = [sample_corner(rng, int(k)) for k in rng.permutation(4)[: rng.choice(3, p=[0.4, 0.4, 0.2])]]
-    heading = rng.uniform(0, 2 * np.pi)
+    corners = _sample_corners(rng)
+    heading = named(rng, "heading of the curve", "rad").uniform(0, 2 * np.pi)
     before = Compose((*corners, _turned(-heading)))
     flat, lifted = _turned(-heading)(_middle()), before(_middle())
-    profile = sample_profile(rng, kind, float(flat[:, 0].min()), float(flat[:, 0].max()))
+    with part(rng, "curve"):
+        profile = sample_profile(rng, kind, float(flat[:, 0].min()), float(flat[:, 0].max()))
     curvature = np.abs(np.interp(lifted[:, 0], NODES, profile.curvature))
     pressed = curvature * (np.abs(lifted[:, 2]) + LARGEST_OFFSET)
     if pressed.max() > MOST_PRESSED or not _do_not_meet(corners):
         return None
     sweep = CurveSweep.through(NODES, curve(profile), np.array([0.0, 1.0, 0.0]), LARGEST_OFFSET)
-    twist = Twist(np.array([-35.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 70.0, rng.uniform(-0.5, 0.5))
-    waves = SmoothField.sample(rng, rng.uniform(0.0, 0.18), (30.0, 60.0))
-    tilt = Rigid(rng.uniform(-0.18, 0.18, size=3), np.zeros(3), np.zeros(3))
+    twist_rad = named(rng, "twist", "rad").uniform(-0.5, 0.5)
+    twist = Twist(np.array([-35.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 70.0, twist_rad)
+    with part(rng, "waves"):
+        waves = SmoothField.sample(rng, named(rng, "strength").uniform(0.0, 0.18), (30.0, 60.0))
+    tilt = Rigid(named(rng, "tilt", "rad").uniform(-0.18, 0.18, size=3), np.zeros(3), np.zeros(3))
     whole = Compose((before, sweep, _turned(heading), twist, waves, tilt))
     return whole if is_clear(whole(_middle())) else None
 
@@ -176,7 +197,7 @@ def is_clear(moved: Float[np.ndarray, "k 3"]) -> bool:
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """One map moves all segments."""
     # drawn once: were it drawn with every attempt, folds and rolls, which are refused more often, would be rare
-    kind = str(rng.choice(KINDS, p=KIND_SHARES))
+    kind = str(named(rng, "kind").choice(KINDS, p=KIND_SHARES))
     for _ in range(ATTEMPTS):
         deformation = sample_deformation(rng, kind)
         if deformation is not None:

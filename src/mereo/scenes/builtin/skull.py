@@ -26,6 +26,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.geometry.manifold import solid_of
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -74,8 +75,8 @@ leave the skull."""
 
 
 @dataclass(frozen=True, eq=False)
-class Joint:
-    """The condyles at rest: the middles of the heads on the jaw's right (+y) and left (-y)."""
+class Condyles:
+    """Condyles of the jaw at rest: the middles of its joints' heads on its right (+y) and left (-y)."""
 
     right: Float[np.ndarray, "3"]
     left: Float[np.ndarray, "3"]
@@ -91,22 +92,22 @@ DISENGAGED_RAD = float(np.deg2rad(6.0))
 """From here on the teeth are far enough apart for the jaw to slide fully."""
 
 
-def jaw_motion(joint: Joint, open_rad: float, protrusion: float, lateral_rad: float) -> Compose:
+def jaw_motion(condyles: Condyles, open_rad: float, protrusion: float, lateral_rad: float) -> Compose:
     """Opening about the hinge with its glide and a slide forward, then a turn about an upright axis in one condyle.
 
     Args:
-        joint: the condyles at rest.
+        condyles: their places at rest.
         open_rad: 0 (closed) to ``OPEN_RAD``.
         protrusion: forward, in units.
         lateral_rad: positive turns the chin to the skull's left, about the left condyle.
     """
-    axis = joint.left - joint.right
+    axis = condyles.left - condyles.right
     hinge = open_rad * axis / np.linalg.norm(axis)
     slide = open_rad / OPEN_RAD * np.array(GLIDE) + np.array([0.0, 0.0, protrusion])
-    pivot = (joint.left if lateral_rad > 0 else joint.right) + slide
+    pivot = (condyles.left if lateral_rad > 0 else condyles.right) + slide
     return Compose(
         (
-            Rigid(hinge, slide, (joint.left + joint.right) / 2),
+            Rigid(hinge, slide, (condyles.left + condyles.right) / 2),
             Rigid(np.array([lateral_rad, 0.0, 0.0]), np.zeros(3), pivot),
         )
     )
@@ -118,7 +119,8 @@ def jaw_state(opening: float, forward: float, side: float) -> tuple[float, float
     Closed teeth hold the jaw, and so do its ligaments when the mouth is wide open: Posselt's envelope, roughly.
 
     Args:
-        opening, forward: 0 to 1.
+        opening: 0 to 1.
+        forward: 0 to 1.
         side: -1 to 1.
     """
     open_rad = opening * OPEN_RAD
@@ -128,8 +130,8 @@ def jaw_state(opening: float, forward: float, side: float) -> tuple[float, float
 
 def sample_jaw(rng: np.random.Generator) -> tuple[float, float, float]:
     """A random ``jaw_state``; one mouth in seven is closed."""
-    opening = 0.0 if rng.uniform() < 1 / 7 else rng.uniform()
-    return jaw_state(opening, rng.uniform(), rng.uniform(-1.0, 1.0))
+    opening = 0.0 if named(rng, "closed below 1/7").uniform() < 1 / 7 else named(rng, "opening").uniform()
+    return jaw_state(opening, named(rng, "forward").uniform(), named(rng, "to its left").uniform(-1.0, 1.0))
 
 
 # --- the model --------------------------------------------------------------------------------------------------------
@@ -183,7 +185,7 @@ def _moved(solid: manifold3d.Manifold, motion: Fit) -> manifold3d.Manifold:
 
 
 @cache
-def joint() -> Joint:
+def condyles() -> Condyles:
     """The condyles, found on the mandible: of each side what is near its highest point behind the notch."""
     vertices = _source()["jaw_bone_j"].vertices
     heads = []
@@ -191,12 +193,12 @@ def joint() -> Joint:
         behind = vertices[(side * vertices[:, 1] > 0) & (vertices[:, 2] < 2.5)]
         head = behind[behind[:, 0] > behind[:, 0].max() - 1.4]
         heads.append(CLOSE((head.min(axis=0) + head.max(axis=0))[None] / 2)[0] - np.array(CENTER))
-    return Joint(*heads)
+    return Condyles(*heads)
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """The cranium stays; one rigid motion moves mandible and lower teeth."""
-    still, jaw = Identity(), jaw_motion(joint(), *sample_jaw(rng))
+    still, jaw = Identity(), jaw_motion(condyles(), *sample_jaw(rng))
     return (still, still, jaw, jaw)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.scenes.builtin._liver_parts import MM, SOURCE, UNIT_M, WORKSPACE, organs, sample_field, to_scene
@@ -80,9 +81,10 @@ def rest_mesh() -> SegmentedMesh:
 
 def sample_placement(rng: np.random.Generator) -> Localized:
     """Another place and size of the tumour, uniform in a ball and in diameter; the liver's surface stays."""
-    direction = rng.normal(size=3)
-    shift = direction / np.linalg.norm(direction) * SHIFT_MM * MM * rng.uniform() ** (1 / 3)
-    similarity = Similarity(_center(), rng.uniform(1 - GROWTH, 1 + GROWTH), shift)
+    with part(rng, "tumor"):
+        direction = named(rng, "shift toward").normal(size=3)
+        shift = direction / np.linalg.norm(direction) * SHIFT_MM * MM * named(rng, "shift").uniform() ** (1 / 3)
+        similarity = Similarity(_center(), named(rng, "size").uniform(1 - GROWTH, 1 + GROWTH), shift)
     return Localized(similarity, _center(), TISSUE_MM[0] * MM, TISSUE_MM[1] * MM)
 
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mereo.deformation import samplers as motion
+from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.mesh_check import examine
 from mereo.geometry.normalizer import Normalizer
 from mereo.io.yaml_document import Document, similar
-from mereo.scenes.files import schema
-from mereo.scenes.files.schema import SceneFile
+from mereo.scenes.files.deformation_blocks import AnyDeformation, LatticeBlock, Misfit, Target
+from mereo.scenes.files.schema import CameraBlock, SceneFile
 from mereo.scenes.files.segments import read_segments
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.registry import SCENES
@@ -77,7 +77,7 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
         scene = _recorded(document, file, rest, placement, workspace)
         definition += _digest(document.path.parent / file.states)
     else:
-        motions = _Builder(document, placement, rest).random_motion(file.deformations)
+        motions = _random_motion(document, placement, rest, file.deformations)
         scene = Scene(file.name, rest, motions, workspace, file.source)
     return replace(scene, unit_m=unit_m, definition=definition)
 
@@ -113,7 +113,7 @@ def placed(mesh: SegmentedMesh, size: float) -> Normalizer:
     return Normalizer((low + high) / 2, size / shortest)
 
 
-def _workspace(document: Document, camera: schema.Camera, bounds: Float[np.ndarray, "2 3"]) -> Workspace:
+def _workspace(document: Document, camera: CameraBlock, bounds: Float[np.ndarray, "2 3"]) -> Workspace:
     radius = float(np.linalg.norm(bounds[1] - bounds[0])) / 2
     if not camera.distance[0] > radius:
         raise document.error(
@@ -121,91 +121,29 @@ def _workspace(document: Document, camera: schema.Camera, bounds: Float[np.ndarr
             f"`distance` starts at {camera.distance[0]:g}; the camera must stay outside the object, which reaches "
             f"{radius:.3g} scene units from its centre: start farther away, or lower `size`",
         )
-    return Workspace(
-        aperture_rad=float(np.deg2rad(camera.aperture)),
-        distance=camera.distance,
-        axis=camera.axis,
-        any_roll=camera.roll,
-        fov_rad=float(np.deg2rad(camera.field_of_view)),
-    )
+    return camera.workspace()
 
 
-class _Builder:
-    """Turns blocks of the file into draws: places and lengths into scene units, degrees into radians."""
-
-    def __init__(self, document: Document, placement: Normalizer, rest: SegmentedMesh) -> None:
-        self.document, self.placement, self.rest = document, placement, rest
-
-    def random_motion(self, blocks: Sequence[schema.Deformation] | None) -> motion.RandomMotion:
-        """All steps; a lattice sized to the object where the file has none."""
-        if blocks is None:
-            blocks = [schema.Lattice(type="lattice")]
-        steps = []
-        for index, block in enumerate(blocks):
-            members = self._members(index, block)
-            steps.append((self._draw(index, block, members), members))
-        return motion.RandomMotion(self.rest, tuple(steps))
-
-    def _members(self, index: int, block: schema.Motion) -> tuple[int, ...]:
-        names = list(self.rest.names)
-        for name in block.segments or ():
-            if name not in names:
-                place = ("deformations", index, "segments")
-                raise self.document.error(place, f"no segment is called {name!r}: {similar(name, names)}")
-        return tuple(i for i, name in enumerate(names) if block.segments is None or name in block.segments)
-
-    def _draw(self, index: int, block: schema.Deformation, members: tuple[int, ...]) -> motion.Draw:
-        length = self.placement.scale
-        if isinstance(block, schema.Lattice):
-            bounds = SegmentedMesh(tuple(self.rest.segments[i] for i in members)).bounds
-            x, y, z = block.cells or motion.default_cells(bounds)
-            return motion.DrawLattice(bounds, (x, y, z), block.strength)
-        if isinstance(block, schema.Waves):
-            low, high = block.wavelength
-            return motion.DrawWaves((low * length, high * length), block.strength, block.modes)
-        if isinstance(block, schema.Squash):
-            center = self.rest.bounds.mean(axis=0) if block.center is None else self._point(block.center)
-            return motion.DrawSquash(center, None if block.axis is None else np.array(block.axis), block.factor)
-        if isinstance(block, schema.Push):
-            near, far = block.distance
-            return motion.DrawPush((near * length, far * length), block.tip * length, block.reach * length)
-        if isinstance(block, schema.Joint):
-            slide = (block.slide[0] * length, block.slide[1] * length)
-            shift = np.array(block.shift) * length
-            return motion.DrawJoint(self._point(block.pivot), np.array(block.axis), _radians(block.angle), slide, shift)
-        return self._along_axis(index, block, members)
-
-    def _along_axis(
-        self, index: int, block: schema.Bend | schema.Twist | schema.Taper, members: tuple[int, ...]
-    ) -> motion.Draw:
-        origin, axis, length = self._point(block.origin), np.array(block.axis), block.length * self.placement.scale
-        if isinstance(block, schema.Twist):
-            return motion.DrawTwist(origin, axis, length, _radians(block.angle))
-        if isinstance(block, schema.Taper):
-            return motion.DrawTaper(origin, axis, length, block.factor)
-        toward = None if block.toward is None else np.array(block.toward)
-        if toward is not None and np.linalg.norm(np.cross(toward, axis)) < 1e-9 * np.linalg.norm(toward):
-            place = ("deformations", index, "toward")
-            raise self.document.error(
-                place, f"`toward` is {list(block.toward or ())}, along the axis; it must point away from it"
-            )
-        radius = max(motion.distance_from_line(self.rest.segments[i].vertices, origin, axis) for i in members)
-        most = np.rad2deg(motion.FOLD_SHARE * length / radius)
-        worst = max(abs(block.angle[0]), abs(block.angle[1]))
-        if worst > most:
-            raise self.document.error(
-                ("deformations", index, "angle"),
-                f"`angle` reaches {worst:g} degrees; an object that reaches {radius / self.placement.scale:.4g} from "
-                f"the axis folds over beyond {most:.3g} degrees on a length of {block.length:g}: bend less, or over a "
-                "greater length",
-            )
-        return motion.DrawBend(origin, axis, length, _radians(block.angle), toward)
-
-    def _point(self, place: schema.Point) -> Float[np.ndarray, "3"]:
-        """A place of the file in the scene's frame."""
-        moved: Float[np.ndarray, "3"] = self.placement.apply(np.array(place))
-        return moved
+def _random_motion(
+    document: Document, placement: Normalizer, rest: SegmentedMesh, blocks: Sequence[AnyDeformation] | None
+) -> RandomMotion:
+    """All deformations of the file in their order; a lattice sized to the object where it has none."""
+    steps = []
+    for index, block in enumerate([LatticeBlock(type="lattice")] if blocks is None else blocks):
+        members = _members(document, rest, index, block)
+        moved = SegmentedMesh(tuple(rest.segments[i] for i in members))
+        try:
+            steps.append((block.sampler(Target(moved, rest.bounds, placement)), members))
+        except Misfit as misfit:
+            raise document.error(("deformations", index, misfit.key), str(misfit)) from None
+    return RandomMotion(rest, tuple(steps))
 
 
-def _radians(degrees: tuple[float, float]) -> tuple[float, float]:
-    return float(np.deg2rad(degrees[0])), float(np.deg2rad(degrees[1]))
+def _members(document: Document, rest: SegmentedMesh, index: int, block: AnyDeformation) -> tuple[int, ...]:
+    """Indices of the segments that a block moves."""
+    names = list(rest.names)
+    for name in block.segments or ():
+        if name not in names:
+            place = ("deformations", index, "segments")
+            raise document.error(place, f"no segment is called {name!r}: {similar(name, names)}")
+    return tuple(i for i, name in enumerate(names) if block.segments is None or name in block.segments)

@@ -4,11 +4,15 @@ Lengths and places are in the file's own unit and frame, those of its meshes; th
 scene units, the unit of datasets and weights. Angles are in degrees. ``docs/own-object.md`` explains every key.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
+import numpy as np
+from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from mereo.geometry.conventions import UNITS_M
+from mereo.scenes.files.deformation_blocks import Deformations
+from mereo.scenes.files.fields import Block, Byte, Direction, Name, Positive, PositiveRange
+from mereo.scenes.scene import Workspace
 
 
 def _unit_m(value: object) -> object:
@@ -18,33 +22,6 @@ def _unit_m(value: object) -> object:
     if isinstance(value, str):
         raise ValueError(f"it must be one of {', '.join(UNITS_M)}, or a number of metres per unit")
     return value
-
-
-def _ascending(value: tuple[float, float]) -> tuple[float, float]:
-    if value[0] > value[1]:
-        raise ValueError("it must be [least, most]")
-    return value
-
-
-def _pointing(value: tuple[float, float, float]) -> tuple[float, float, float]:
-    if not any(value):
-        raise ValueError("it is a direction and must have a length")
-    return value
-
-
-Byte = Annotated[int, Field(ge=0, le=255)]
-Positive = Annotated[FiniteFloat, Field(gt=0)]
-Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\\\x00-\x1f]+$")]
-Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Direction = Annotated[Point, AfterValidator(_pointing)]
-Range = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_ascending)]
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ascending)]
-
-
-class Block(BaseModel):
-    """A block of keys: none but its fields, and none of them changes."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class PartLook(Block):
@@ -73,8 +50,8 @@ class ModelPart(PartLook):
     parts: Annotated[list[str], Field(min_length=1)] | None = None
 
 
-class Camera(Block):
-    """The camera's workspace, ``scene.Workspace`` in degrees."""
+class CameraBlock(Block):
+    """The camera's workspace, ``scenes.scene.Workspace`` in degrees."""
 
     aperture: Annotated[FiniteFloat, Field(gt=0, le=360)] = 140.0
     distance: PositiveRange = (100.0, 200.0)
@@ -82,114 +59,15 @@ class Camera(Block):
     roll: bool = False
     field_of_view: Annotated[FiniteFloat, Field(gt=0, lt=170)] = 35.0
 
-
-class Motion(Block):
-    """What all deformations have: the segments that they move, all of them where absent."""
-
-    segments: Annotated[list[Name], Field(min_length=1)] | None = None
-
-
-class Lattice(Motion):
-    """Free-form deformation: random control points over the box of the segments.
-
-    Attributes:
-        cells: along x, y and z; where absent, roughly cubes, two of them along the shortest side.
-        strength: largest move of a control point, as a share of what keeps the map injective.
-    """
-
-    type: Literal["lattice"]
-    cells: tuple[Annotated[int, Field(ge=1, le=20)], ...] | None = Field(default=None, min_length=3, max_length=3)
-    strength: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5
-
-
-class Waves(Motion):
-    """A smooth random field: waves in random directions; ``strength`` bounds by how much lengths change."""
-
-    type: Literal["waves"]
-    wavelength: PositiveRange
-    strength: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.3
-    modes: Annotated[int, Field(ge=1, le=64)] = 4
-
-
-class Bend(Motion):
-    """Into a circular arc, from ``origin`` over ``length`` along ``axis``; to any side where ``toward`` is absent."""
-
-    type: Literal["bend"]
-    origin: Point
-    axis: Direction
-    length: Positive
-    angle: Range
-    toward: Direction | None = None
-
-
-class Twist(Motion):
-    """About ``axis``, growing from nothing at ``origin`` to ``angle`` at ``length`` beyond it."""
-
-    type: Literal["twist"]
-    origin: Point
-    axis: Direction
-    length: Positive
-    angle: Range
-
-
-class Taper(Motion):
-    """Cross-sections scaled by a factor that goes from 1 at ``origin`` to ``factor`` at ``length`` beyond it."""
-
-    type: Literal["taper"]
-    origin: Point
-    axis: Direction
-    length: Positive
-    factor: PositiveRange
-
-
-class Squash(Motion):
-    """Scaled by ``factor`` along an axis, a random one where absent, with the volume kept."""
-
-    type: Literal["squash"]
-    factor: PositiveRange
-    axis: Direction | None = None
-    center: Point | None = None
-
-
-class Joint(Motion):
-    """Rigid motion: a turn by ``angle`` about ``axis`` through ``pivot``, a ``slide`` along it, a ``shift`` anywhere.
-
-    Attributes:
-        shift: largest displacement to either side along x, y and z.
-    """
-
-    type: Literal["joint"]
-    pivot: Point
-    axis: Direction
-    angle: Range = (0.0, 0.0)
-    slide: Range = (0.0, 0.0)
-    shift: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = Field(default=(0.0, 0.0, 0.0), min_length=3, max_length=3)
-
-
-class Push(Motion):
-    """An instrument at a random place of the surface.
-
-    Attributes:
-        distance: of its tip, outwards along the surface's normal or, where negative, inwards.
-        tip: everything within this distance of the tip moves with it.
-        reach: nothing moves beyond this one.
-    """
-
-    type: Literal["push"]
-    distance: Range
-    tip: Annotated[FiniteFloat, Field(ge=0)]
-    reach: Positive
-
-    @model_validator(mode="after")
-    def _is_invertible(self) -> "Push":
-        # the blend's slope is at most 15/8 over its width (``deformation.smooth_step``)
-        steepest = 15 / 8 * max(abs(self.distance[0]), abs(self.distance[1]))
-        if not steepest < 0.95 * (self.reach - self.tip):
-            raise ValueError(f"space would fold over; reach must be above {self.tip + steepest / 0.95:.4g}")
-        return self
-
-
-Deformation = Lattice | Waves | Bend | Twist | Taper | Squash | Joint | Push
+    def workspace(self) -> Workspace:
+        """The workspace that this block describes, angles in radians."""
+        return Workspace(
+            aperture_rad=float(np.deg2rad(self.aperture)),
+            distance=self.distance,
+            axis=self.axis,
+            any_roll=self.roll,
+            fov_rad=float(np.deg2rad(self.field_of_view)),
+        )
 
 
 class SceneFile(Block):
@@ -219,10 +97,8 @@ class SceneFile(Block):
     names: Annotated[dict[Annotated[int, Field(ge=1)], Name], Field(min_length=1)] | None = None
     cells: Annotated[int, Field(ge=16, le=400)] = 64
     size: Positive = 20.0
-    camera: Camera = Camera()
-    deformations: Annotated[list[Annotated[Deformation, Field(discriminator="type")]], Field(min_length=1)] | None = (
-        None
-    )
+    camera: CameraBlock = CameraBlock()
+    deformations: Deformations | None = None
     states: str | None = None
     held_out: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.1
 

@@ -16,7 +16,6 @@ from mereo.geometry.mesh_check import likely_unit
 from mereo.io.atomic_files import atomic_file
 from mereo.io.label_volumes import is_volume, read_label_volume, segment_surfaces
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.scenes.files.rewrite import quoted
 from mereo.scenes.registry import SCENES
 
 SIZE = 20.0
@@ -57,7 +56,7 @@ def write_scene_file(files: Sequence[Path], output: Path | None = None, units: s
     Args:
         files: one mesh for each segment, one file of named parts, or one label volume.
         output: by default ``NAME.yaml`` in the working directory, after the first file.
-        units: a key of ``scene_schema.UNITS_M``; None guesses.
+        units: a key of ``geometry.conventions.UNITS_M``; None guesses.
 
     Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files.
     """
@@ -180,6 +179,13 @@ def _text(name: str, source: _Source, units: str | None) -> str:
 
 def _color(number: int) -> str:
     return str(list(PALETTE[number % len(PALETTE)]))
+
+
+def quoted(text: str) -> str:
+    """A text as a YAML value on one line: quoted unless it is a plain word."""
+    plain = re.fullmatch(r"[A-Za-z_./][\w./ -]*", text) and not text.endswith(" ")
+    reserved = text.lower() in ("yes", "no", "on", "off", "true", "false", "null", "y", "n")
+    return text if plain and not reserved else "'" + text.replace("'", "''") + "'"
 
 
 def _numbers(values: Float[np.ndarray, "3"]) -> str:

@@ -1,0 +1,73 @@
+"""Names of the numbers that a scene draws, for people who move them by sliders.
+
+    with part(rng, "left ear"):
+        angle_rad = named(rng, "bend", "rad").uniform(0.0, 0.7)
+
+Only a ``NamedGenerator`` keeps them, such as the laboratory's (``mereo.scenes.draw_recorder``). Any other generator
+draws as if it had not been told, and names change no number with either.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class DrawName:
+    """What one call of a generator draws.
+
+    Attributes:
+        parts: the parts of the object that it belongs to, the outermost first; () is the whole object.
+        name: of all its numbers, or of each of them in C order; "" where the scene did not say.
+        unit: of the numbers as they are drawn; "rad" is shown in degrees, "log" is a factor's logarithm.
+    """
+
+    parts: tuple[str, ...] = ()
+    name: str | tuple[str, ...] = ""
+    unit: str = ""
+
+
+class NamedGenerator(np.random.Generator):
+    """A generator that is told what its next draw is called.
+
+    Attributes:
+        parts: those whose numbers are being drawn, the outermost first.
+        next_name: name and unit of the next draw.
+    """
+
+    parts: tuple[str, ...] = ()
+    next_name: tuple[str | tuple[str, ...], str] = ("", "")
+
+    def take_name(self) -> DrawName:
+        """The name of the draw that is being made; the one after it has none until it is told."""
+        (name, unit), self.next_name = self.next_name, ("", "")
+        return DrawName(self.parts, name, unit)
+
+
+def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "") -> np.random.Generator:
+    """The generator ``rng``, told what the numbers of its next draw are called.
+
+    Args:
+        rng: any generator.
+        name: of all numbers of the draw, or of each of them in C order.
+        unit: of the numbers as they are drawn: "rad", "°", "mm", "log" for a factor's logarithm, "" for shares.
+    """
+    if isinstance(rng, NamedGenerator):
+        rng.next_name = (name, unit)
+    return rng
+
+
+@contextmanager
+def part(rng: np.random.Generator, name: str) -> Iterator[None]:
+    """Within this block all draws of ``rng`` belong to a part of the object, or to a part of the part around it."""
+    if not isinstance(rng, NamedGenerator):
+        yield
+        return
+    before = rng.parts
+    rng.parts = (*before, name)
+    try:
+        yield
+    finally:
+        rng.parts = before

@@ -1,0 +1,236 @@
+"""Deformations that a scene file may list: one block each, which says its keys and makes the sampler of its maps.
+
+Places and lengths of a block are in the file's frame and unit, angles in degrees; those of its sampler are in scene
+units and radians.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, FiniteFloat, model_validator
+
+from mereo.deformation import samplers
+from mereo.deformation.samplers import DeformationSampler
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.normalizer import Normalizer
+from mereo.scenes.files.fields import Block, Direction, Name, Point, Positive, PositiveRange, Range
+
+
+class Misfit(ValueError):
+    """A value that does not fit the object which it is to move.
+
+    Attributes:
+        key: of the block, whose value it is.
+    """
+
+    def __init__(self, key: str, message: str) -> None:
+        """``message`` says value, rule and cure."""
+        super().__init__(message)
+        self.key = key
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What one deformation moves, and the way from the file's frame to the scene's.
+
+    Attributes:
+        moved: the segments that it moves, at rest in scene units.
+        whole: the joint box of all segments, in scene units.
+        placement: from the file's frame and unit to the scene's.
+    """
+
+    moved: SegmentedMesh
+    whole: Float[np.ndarray, "2 3"]
+    placement: Normalizer
+
+    @property
+    def unit(self) -> float:
+        """Scene units per unit of the file, by which its lengths are multiplied."""
+        return self.placement.scale
+
+    def point(self, place: Point) -> Float[np.ndarray, "3"]:
+        """A place of the file in the scene's frame."""
+        moved: Float[np.ndarray, "3"] = self.placement.apply(np.array(place))
+        return moved
+
+
+class DeformationBlock(Block, ABC):
+    """A deformation of a scene file; all have ``segments``, those that it moves, all of them where absent."""
+
+    segments: Annotated[list[Name], Field(min_length=1)] | None = None
+
+    @abstractmethod
+    def sampler(self, target: Target) -> DeformationSampler:
+        """The sampler of this block's maps for an object. Raises ``Misfit`` where a value does not fit it."""
+
+
+class LatticeBlock(DeformationBlock):
+    """Free-form deformation: random control points over the box of the segments.
+
+    Attributes:
+        cells: along x, y and z; where absent, roughly cubes, two of them along the shortest side.
+        strength: largest move of a control point, as a share of what keeps the map injective.
+    """
+
+    type: Literal["lattice"]
+    cells: tuple[Annotated[int, Field(ge=1, le=20)], ...] | None = Field(default=None, min_length=3, max_length=3)
+    strength: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5
+
+    def sampler(self, target: Target) -> DeformationSampler:
+        """Lattices over the box of what is moved."""
+        bounds = target.moved.bounds
+        x, y, z = self.cells or samplers.default_cells(bounds)
+        return samplers.LatticeSampler(bounds, (x, y, z), self.strength)
+
+
+class WavesBlock(DeformationBlock):
+    """A smooth random field: waves in random directions; ``strength`` bounds by how much lengths change."""
+
+    type: Literal["waves"]
+    wavelength: PositiveRange
+    strength: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.3
+    modes: Annotated[int, Field(ge=1, le=64)] = 4
+
+    def sampler(self, target: Target) -> DeformationSampler:
+        """Fields of waves, their lengths in scene units."""
+        return samplers.WavesSampler(_lengths(self.wavelength, target), self.strength, self.modes)
+
+
+class BendBlock(DeformationBlock):
+    """Into a circular arc, from ``origin`` over ``length`` along ``axis``; to any side where ``toward`` is absent."""
+
+    type: Literal["bend"]
+    origin: Point
+    axis: Direction
+    length: Positive
+    angle: Range
+    toward: Direction | None = None
+
+    def sampler(self, target: Target) -> DeformationSampler:
+        """Bends; ``Misfit`` where ``toward`` is along the axis, or where the largest one would fold space over."""
+        origin, axis, length = target.point(self.origin), np.array(self.axis), self.length * target.unit
+        toward = None if self.toward is None else np.array(self.toward)
+        if toward is not None and np.linalg.norm(np.cross(toward, axis)) < 1e-9 * np.linalg.norm(toward):
+            raise Misfit("toward", f"`toward` is {list(self.toward or ())}, along the axis; it must point away from it")
+        radius = max(samplers.distance_from_line(part.vertices, origin, axis) for part in target.moved.segments)
+        most = np.rad2deg(samplers.FOLD_SHARE * length / radius)
+        worst = max(abs(self.angle[0]), abs(self.angle[1]))
+        if worst > most:
+            raise Misfit(
+                "angle",
+                f"`angle` reaches {worst:g} degrees; an object that reaches {radius / target.unit:.4g} from "
+                f"the axis folds over beyond {most:.3g} degrees on a length of {self.length:g}: bend less, or over a "
+                "greater length",
+            )
+        return samplers.BendSampler(origin, axis, length, _radians(self.angle), toward)
+
+
+class TwistBlock(DeformationBlock):
+    """About ``axis``, growing from nothing at ``origin`` to ``angle`` at ``length`` beyond it."""
+
+    type: Literal["twist"]
+    origin: Point
+    axis: Direction
+    length: Positive
+    angle: Range
+
+    def sampler(self, target: Target) -> DeformationSampler:
+        """Twists about the axis, in scene units and radians."""
+        length = self.length * target.unit
+        return samplers.TwistSampler(target.point(self.origin), np.array(self.axis), length, _radians(self.angle))
+
+
+class TaperBlock(DeformationBlock):
+    """Cross-sections scaled by a factor that goes from 1 at ``origin`` to ``factor`` at ``length`` beyond it."""
+
+    type: Literal["taper"]
+    origin: Point
+    axis: Direction
+    length: Positive
+    factor: PositiveRange
+
+    def sampler(self, target: Target) -> DeformationSampler:
+        """Tapers along the axis, in scene units."""
+        length = self.length * target.unit
+        return samplers.TaperSampler(target.point(self.origin), np.array(self.axis), length, self.factor)
+
+
+class SquashBlock(DeformationBlock):
+    """Scaled by ``factor`` along an axis, a random one where absent, with the volume kept."""
+
+    type: Literal["squash"]
+    factor: PositiveRange
+    axis: Direction | None = None
+    center: Point | None = None
+
+    def sampler(self, target: Target) -> DeformationSampler:
+        """Squashes about ``center``, the middle of the whole object where absent."""
+        center = target.whole.mean(axis=0) if self.center is None else target.point(self.center)
+        return samplers.SquashSampler(center, None if self.axis is None else np.array(self.axis), self.factor)
+
+
+class JointBlock(DeformationBlock):
+    """Rigid motion: a turn by ``angle`` about ``axis`` through ``pivot``, a ``slide`` along it, a ``shift`` anywhere.
+
+    Attributes:
+        shift: largest displacement to either side along x, y and z.
+    """
+
+    type: Literal["joint"]
+    pivot: Point
+    axis: Direction
+    angle: Range = (0.0, 0.0)
+    slide: Range = (0.0, 0.0)
+    shift: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = Field(default=(0.0, 0.0, 0.0), min_length=3, max_length=3)
+
+    def sampler(self, target: Target) -> DeformationSampler:
+        """Rigid motions about the pivot, in scene units and radians."""
+        slide, shift = _lengths(self.slide, target), np.array(self.shift) * target.unit
+        axis = np.array(self.axis)
+        return samplers.JointSampler(target.point(self.pivot), axis, _radians(self.angle), slide, shift)
+
+
+class PushBlock(DeformationBlock):
+    """An instrument at a random place of the surface.
+
+    Attributes:
+        distance: of its tip, outwards along the surface's normal or, where negative, inwards.
+        tip: everything within this distance of the tip moves with it.
+        reach: nothing moves beyond this one.
+    """
+
+    type: Literal["push"]
+    distance: Range
+    tip: Annotated[FiniteFloat, Field(ge=0)]
+    reach: Positive
+
+    @model_validator(mode="after")
+    def _is_invertible(self) -> "PushBlock":
+        # the blend's slope is at most 15/8 over its width (``maps.smooth_step``)
+        steepest = 15 / 8 * max(abs(self.distance[0]), abs(self.distance[1]))
+        if not steepest < 0.95 * (self.reach - self.tip):
+            raise ValueError(f"space would fold over; reach must be above {self.tip + steepest / 0.95:.4g}")
+        return self
+
+    def sampler(self, target: Target) -> DeformationSampler:
+        """Pushes of what is moved, in scene units."""
+        unit = target.unit
+        return samplers.PushSampler(_lengths(self.distance, target), self.tip * unit, self.reach * unit)
+
+
+AnyDeformation = LatticeBlock | WavesBlock | BendBlock | TwistBlock | TaperBlock | SquashBlock | JointBlock | PushBlock
+
+Deformations = Annotated[list[Annotated[AnyDeformation, Field(discriminator="type")]], Field(min_length=1)]
+"""A list of deformations, told apart by their ``type``."""
+
+
+def _lengths(values: tuple[float, float], target: Target) -> tuple[float, float]:
+    """A range of lengths in scene units."""
+    return values[0] * target.unit, values[1] * target.unit
+
+
+def _radians(degrees: tuple[float, float]) -> tuple[float, float]:
+    return float(np.deg2rad(degrees[0])), float(np.deg2rad(degrees[1]))
