@@ -31,8 +31,9 @@ SHARES = (1.0, 0.5, 0.2)
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """The best of several starts; None where the scene has too many draws or plays none of them back."""
     config = problem.config
+    if problem.states.z.shape[1] > MOST_DRAWS:
+        return None
     starts = [fit for fit in (started(problem, *start) for start in choose_starts(problem, modes)) if fit is not None]
-    starts = [fit for fit in starts if int(fit.drawn.smooth.sum()) <= MOST_DRAWS]
     guess = guessed(problem, modes)
     starts = [approach(problem, fit, modes) for fit in [*starts, *([] if guess is None else [guess])]]
     for rounds, keep in ((config.first_rounds, config.starts), (config.last_rounds, config.kept)):
