@@ -139,7 +139,7 @@ class Solids:
         return result
 
     def label(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-        """Labels of points: 0 in empty space, else index + 1; of overlapping segments the first (so a nested one) wins."""
+        """Labels of points: 0 in empty space, else index + 1; of overlapping segments the first (so a nested one)."""
         labels = np.zeros(len(points), dtype=np.uint8)
         for index, solid in enumerate(self._solids):
             candidates = np.flatnonzero((labels == 0) & solid.in_box(points))

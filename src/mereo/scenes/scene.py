@@ -98,7 +98,7 @@ class Scene:
             )
 
     def for_seed(self, seed: int) -> "Scene":
-        """Scene that a seed draws from: its held-out states for testing (``TEST_SEED_START`` up) if any, else itself."""
+        """Scene that a seed draws from: its held-out states for testing (``TEST_SEED_START`` up), or itself."""
         return self.held_out if self.held_out is not None and seed >= TEST_SEED_START else self
 
     def sample_state(self, rng: np.random.Generator) -> State:
