@@ -20,10 +20,11 @@ from mereo.evaluation.scans import scan_in_camera
 from mereo.evaluation.scoring import grid_scores
 from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
+from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import isolate
-from mereo.reconstruction.observation import read_observation
+from mereo.reconstruction.observation import find_object
 from mereo.visualization.contact_sheets import cloud_picture, contact_sheet, save_png
 from mereo.visualization.renderer import Viewpoint
 
@@ -89,9 +90,9 @@ def main(
     if input is None:
         crowded_bunny(output)
         return
-    found = read_observation(input, reading, isolation)
+    found = find_object(read_frame(input, reading), isolation)
     print(found)
-    whole = read_observation(input, replace(reading, mask=None))
+    whole = read_frame(input, replace(reading, mask=None))
     draw(output, {"everything": whole.cloud, "the object": found.cloud})
 
 

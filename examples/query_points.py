@@ -10,11 +10,11 @@ import time
 import numpy as np
 
 import mereo
-from mereo.evaluation.sample_views import load_frame
+from mereo.evaluation.sample_views import load_view
 
 
 def main(weights: str = "bunny", queries: int = 2000) -> None:
-    cloud = load_frame("bunny").depth.to_points()  # points [n, 3]: x right, y down, z forward
+    cloud = load_view("bunny").depth.to_points()  # points [n, 3]: x right, y down, z forward
     model = mereo.load_model(weights)
     code = model.encode(cloud)
 

@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 
 import mereo
-from mereo.evaluation.sample_views import load_frame
+from mereo.evaluation.sample_views import load_view
 
 
 def main(cloud_path: str | None = None, output: str = "out/example", weights: str = "bunny") -> None:
-    cloud = mereo.read_point_cloud(cloud_path) if cloud_path else load_frame("bunny").depth.to_points()
+    cloud = mereo.read_point_cloud(cloud_path) if cloud_path else load_view("bunny").depth.to_points()
     model = mereo.load_model(weights)
     result = mereo.reconstruct(cloud, model, resolution=64)
     for segment in result.segments:

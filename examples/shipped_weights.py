@@ -20,7 +20,7 @@ def first_view(name: str, cells: int) -> EvaluatedView:
     """The first test view with its labels, true and predicted; the row says how good this one is."""
     evaluation = evaluate(load_model(name), examples=1, cells=cells, seed=TEST_SEED_START)
     scores = evaluation.scores
-    return replace(evaluation.cases[0], name=f"{name}\nIoU {scores.iou:.2f}\nmIoU {scores.miou:.2f}")
+    return replace(evaluation.views[0], name=f"{name}\nIoU {scores.iou:.2f}\nmIoU {scores.miou:.2f}")
 
 
 def main() -> None:
@@ -30,13 +30,13 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=100, help="grid cells along each axis")
     options = parser.parse_args()
 
-    cases: list[EvaluatedView] = []
+    views: list[EvaluatedView] = []
     for name in options.weights:
         try:
-            cases.append(first_view(name, options.cells))
+            views.append(first_view(name, options.cells))
         except AssetUnavailable as error:
             print(f"{name} is left out: {error}")
-    error_picture(options.output, cases)
+    error_picture(options.output, views)
     print(f"wrote {options.output}")
 
 

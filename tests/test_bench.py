@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from mereo.cli import bench_command
-from mereo.evaluation.sample_views import load_frame
+from mereo.cli import tool_commands
+from mereo.evaluation.sample_views import load_view
 from mereo.experiments.speed import fitted_model
 from mereo.experiments.speed.baseline import Rival, farthest_points
 from mereo.experiments.speed.report import table
@@ -22,9 +22,9 @@ MACHINE = Machine(1e11, 1e10)
 
 
 def test_the_rival_answers_as_the_model() -> None:
-    frame, model = load_frame("rope"), load_model("rope")
-    cloud = frame.depth.to_points()
-    points = frame.truth.grid.positions(np.random.default_rng(0).integers(0, 100, (500, 3)))
+    view, model = load_view("rope"), load_model("rope")
+    cloud = view.depth.to_points()
+    points = view.truth.grid.positions(np.random.default_rng(0).integers(0, 100, (500, 3)))
     ours = model.logits(model.encode(cloud), points)
     theirs = Rival(model, *model.normalized_cloud(cloud)).logits(points)
     np.testing.assert_allclose(theirs, ours, atol=1e-3 * np.abs(ours).max())
@@ -68,19 +68,19 @@ def test_work_is_bound_by_operations_or_bytes() -> None:
 def test_a_fitted_network_knows_its_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fitted_model, "STEPS", 60)
     monkeypatch.setattr(fitted_model, "QUERIES", 512)
-    frame = load_frame("rope")
-    model = fitted_model.fitted_model("tiny", frame)
-    grid, kept = frame.truth.grid, frame.truth.kept
+    view = load_view("rope")
+    model = fitted_model.fitted_model("tiny", view)
+    grid, kept = view.truth.grid, view.truth.kept
     cells = np.argwhere(kept & (grid.labels > 0))[::50]
-    labels = model.query(model.encode(frame.depth.to_points()), grid.positions(cells)).label
+    labels = model.query(model.encode(view.depth.to_points()), grid.positions(cells)).label
     assert (labels > 0).mean() > 0.5
-    assert model.network.config == replace(PRESETS["tiny"].network, dropout=0.0)
+    assert model.network.config == PRESETS["tiny"].network.changed(dropout=0.0)
 
 
 def test_a_frame_by_fixed_shapes_is_what_the_model_answers() -> None:
     """What CUDA times for a whole frame, step by step on this CPU."""
-    bench = Bench(load_model("rope"), load_frame("rope"), MACHINE)
-    points = random_points(bench.frame, 500)
+    bench = Bench(load_model("rope"), load_view("rope"), MACHINE)
+    points = random_points(bench.view, 500)
     expected = bench.model.logits(bench._code, points).argmax(axis=1)
     assert (bench._by_graphs(points[:100], points)() == expected).mean() > 0.99
 
@@ -102,14 +102,14 @@ def test_the_table_names_ratio_and_floor() -> None:
 
 def test_bad_options_are_refused() -> None:
     with pytest.raises(ValueError, match="0 repeats are asked for"):
-        bench_command.BenchCommand(repeats=0).run()
+        tool_commands.BenchCommand(repeats=0).run()
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match="torch sees no CUDA device"):
-            bench_command.BenchCommand(device="cuda").run()
+            tool_commands.BenchCommand(device="cuda").run()
 
 
 @pytest.mark.slow
 def test_every_stage_is_timed() -> None:
-    stages = Bench(load_model("rope"), load_frame("rope"), MACHINE, repeats=1).run()
+    stages = Bench(load_model("rope"), load_view("rope"), MACHINE, repeats=1).run()
     assert len(stages) == 6
     assert all(stage.floor > 0 and 0 < stage.median <= stage.slowest for stage in stages)

@@ -36,6 +36,12 @@ def assert_one_line_error(result: subprocess.CompletedProcess[str], *parts: str)
     assert all(part in result.stderr for part in parts), result.stderr
 
 
+def processor_time_of_children() -> float:
+    """Seconds, of the processes that have ended: unlike the clock's, the same on a busy machine."""
+    times = os.times()
+    return times.children_user + times.children_system
+
+
 def raising(error: BaseException) -> SimpleNamespace:
     """A command whose work raises ``error``."""
 
@@ -51,9 +57,9 @@ def raising(error: BaseException) -> SimpleNamespace:
 def test_help_is_instant_and_names_every_command() -> None:
     seconds = []
     for _ in range(3):
-        start = time.perf_counter()
+        start = processor_time_of_children()
         result = mereo("--help")
-        seconds.append(time.perf_counter() - start)
+        seconds.append(processor_time_of_children() - start)
     assert result.returncode == 0
     names = ("demo", "doctor", "scene", "assets", "generate", "train", "evaluate", "reconstruct", "align")
     assert all(f"• {name} " in result.stdout for name in names)
@@ -128,8 +134,8 @@ def test_train_options_override_the_preset() -> None:
     )
     command = command_line.parse(text.split())
     assert isinstance(command, commands.Train)
-    assert (command.config.epochs, command.config.loss, command.config.network.width) == (2, "ce", 64)
-    assert not command.config.network.encode_positions
+    assert (command.config.epochs, command.config.loss, command.config.network.decoder.width) == (2, "ce", 64)
+    assert not command.config.network.decoder.encode_positions
     assert command.config.learning_rate == PRESETS["paper"].learning_rate
     assert command_line.parse(["train", "data", "--output", "run"]).config == PRESETS["base"]  # type: ignore[union-attr]
 

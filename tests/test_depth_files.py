@@ -9,7 +9,8 @@ from PIL import Image
 
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.io.depth_formats import is_depth_image
-from mereo.io.readers import read_camera, read_depth_image, read_mask
+from mereo.io.intrinsics import read_camera
+from mereo.io.readers import read_depth_image, read_mask
 
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
 

@@ -9,9 +9,10 @@ from analytic import AnalyticModel, untrained
 
 from mereo.cli import demo
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
-from mereo.evaluation.sample_views import DEPTH_STEP, load_frame, make_frame, save_frame
+from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union
+from mereo.evaluation.sample_views import DEPTH_STEP, load_view, make_view, save_view
 from mereo.evaluation.scoring import (
+    PICTURE_MARGIN,
     Evaluation,
     TestCase,
     evaluate,
@@ -74,6 +75,12 @@ def test_scores_of_a_shifted_answer_have_a_closed_form() -> None:
     assert scores.iou == pytest.approx(1.75 / 2)
 
 
+@pytest.mark.parametrize("missing", [None, float("nan")])
+def test_scores_have_three_decimals_and_a_mark_where_they_are_missing(missing: float | None) -> None:
+    assert [format_score(score) for score in (0.0, 0.12349, 1.0, missing)] == ["0.000", "0.123", "1.000", "-"]
+    assert format_score(missing, "") == "" and format_score(0.5, "") == "0.500"
+
+
 def test_false_positives_in_free_space_count() -> None:
     """Everything is called left: the joint box is 2 x 1 x 1, of which left fills a third once right is short."""
     mesh = SegmentedMesh((cuboid("left", (0, 0, 5), (1, 1, 6)), cuboid("right", (1, 0, 5), (2, 1, 5.5), 1)))
@@ -132,7 +139,20 @@ def test_one_confusion_matrix_over_the_whole_set() -> None:
     assert each[0] == 1.0 and each[1] < 0.8
     assert whole.miou != pytest.approx(np.mean(each), abs=1e-3)
     assert result.example_mean[1] == pytest.approx(np.mean(each))
-    assert [len(result.cases), result.cases[0].name] == [2, "0"]
+    assert [len(result.views), result.views[0].name] == [2, "0"]
+
+
+def test_pictures_show_what_lies_beside_the_box_of_the_truth() -> None:
+    mesh = two_cuboids()
+    truth = truth_grid(mesh, 20)
+    shift = 2.0 * truth.grid.spacing[0]
+    result = score_cases(oracle(mesh, (shift, 0.0, 0.0)), lambda _: TestCase("0", cloud(), truth), 1, progress=False)
+    shown, inner = result.views[0], (slice(PICTURE_MARGIN, -PICTURE_MARGIN),) * 3
+    np.testing.assert_array_equal(shown.reference[inner], truth.grid.labels)
+    assert (shown.reference > 0).sum() == (truth.grid.labels > 0).sum()
+    np.testing.assert_allclose(shown.origin + PICTURE_MARGIN * shown.spacing, truth.grid.origin)
+    assert (shown.predicted > 0).sum() == (shown.reference > 0).sum()  # all of it, though two cells are outside
+    assert (shown.predicted[inner] > 0).sum() < (shown.reference > 0).sum()
 
 
 def test_a_model_of_distances_is_scored_on_the_whole() -> None:
@@ -219,30 +239,30 @@ def test_the_table_agrees_with_the_matrix() -> None:
     assert {len(row) for row in rows} == {5}
 
 
-# --- frames and the demo ---------------------------------------------------------------------------------------------
+# --- sample views and the demo ---------------------------------------------------------------------------------------
 
 
-def test_a_frame_survives_its_file(tmp_path: Path) -> None:
-    frame = make_frame("rope", 1_000_002, cells=24)
-    save_frame(tmp_path / "rope.npz", frame)
-    again = load_frame(tmp_path / "rope.npz")
-    np.testing.assert_allclose(again.depth.depth, frame.depth.depth, atol=1e-9)
-    view = sample_view(load_scene("rope"), GenerateConfig(), example_rng(1_000_002, 0))
-    assert np.abs(again.depth.depth - view.depth.depth).max() <= DEPTH_STEP / 2 + 1e-9
-    np.testing.assert_array_equal(again.truth.grid.labels, frame.truth.grid.labels)
-    np.testing.assert_array_equal(again.truth.kept, frame.truth.kept)
-    assert again.depth.camera == frame.depth.camera and again.truth.grid.names == frame.truth.grid.names
+def test_a_sample_view_survives_its_file(tmp_path: Path) -> None:
+    view = make_view("rope", 1_000_002, cells=24)
+    save_view(tmp_path / "rope.npz", view)
+    again = load_view(tmp_path / "rope.npz")
+    np.testing.assert_allclose(again.depth.depth, view.depth.depth, atol=1e-9)
+    exact = sample_view(load_scene("rope"), GenerateConfig(), example_rng(1_000_002, 0))
+    assert np.abs(again.depth.depth - exact.depth.depth).max() <= DEPTH_STEP / 2 + 1e-9
+    np.testing.assert_array_equal(again.truth.grid.labels, view.truth.grid.labels)
+    np.testing.assert_array_equal(again.truth.kept, view.truth.kept)
+    assert again.depth.camera == view.depth.camera and again.truth.grid.names == view.truth.grid.names
     assert (again.scene, again.seed) == ("rope", 1_000_002)
 
 
-def test_not_a_frame(tmp_path: Path) -> None:
+def test_not_a_sample_view(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04")
     for name in ("other.npz", "broken.npz"):
-        with pytest.raises(ValueError, match="is not a frame of mereo"):
-            load_frame(tmp_path / name)
-    with pytest.raises(FileNotFoundError, match="there is no frame 'teapot'"):
-        load_frame("teapot")
+        with pytest.raises(ValueError, match="is not a sample view of mereo"):
+            load_view(tmp_path / name)
+    with pytest.raises(FileNotFoundError, match="there is no sample view 'teapot'"):
+        load_view("teapot")
 
 
 def test_demo_reconstructs_scores_and_says_what_is_missing(
@@ -255,7 +275,7 @@ def test_demo_reconstructs_scores_and_says_what_is_missing(
 
     def case() -> demo.Case:
         truth: TruthGrid = truth_grid(mesh, 20)
-        return demo.Case("cuboids", "two cuboids", "any", cloud(), "camera", cloud(), truth)
+        return demo.Case("cuboids", "two cuboids", "any", cloud(), "camera", truth)
 
     monkeypatch.setattr(demo, "_inputs", lambda: iter([unavailable, case]))
     monkeypatch.setattr(demo, "load_model", lambda _: oracle(mesh))

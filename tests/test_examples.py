@@ -11,6 +11,7 @@ import pytest
 EXAMPLES = Path(__file__).parents[1] / "examples"
 EXPECTED = {
     "isolate_object.py": "isolated",
+    "loop.py": "wrote loop.webp: 9 frames",
     "query_points.py": "to the nearest surface",
     "reconstruct_cloud.py": "report.html",
     "sensors.py": "wrote",
@@ -19,11 +20,12 @@ EXPECTED = {
 }
 ASSETS = {
     "isolate_object.py": ("bunny/bunny.off", "bunny/bun000.ply"),
+    "loop.py": ("bunny/bunny.off",),
     "simulate_liver.py": ("liver/lapgym_liver_volumetric.vtk",),
 }
 """Downloads that they need."""
 
-OPTIONS = {"shipped_weights.py": ("--weights", "rope", "--cells", "24")}
+OPTIONS = {"loop.py": ("--fps", "1"), "shipped_weights.py": ("--weights", "rope", "--cells", "24")}
 """What keeps an example short."""
 
 EXTRAS = {"simulate_liver.py": "mujoco"}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from mereo.evaluation.sample_views import load_frame
+from mereo.evaluation.sample_views import load_view
 from mereo.experiments.speed.stages import random_points
 from mereo.models import rigid_alignment
 from mereo.models.cuda_graphs import StaticFrames
@@ -20,9 +20,9 @@ from mereo.models.weights import load_model
 
 KERNELS = """
 import numpy as np, torch
-from mereo.gpu.kernels import farthest_points, nearest
-from mereo.neighbors import nearest as expected
-from mereo.ordering import farthest_point_order
+from mereo.models.ops.triton_kernels import farthest_points, nearest
+from mereo.models.ops.neighbors import nearest as expected
+from mereo.geometry.farthest_point_sampling import farthest_point_order
 
 torch.manual_seed(0)
 points, valid = torch.randn(2, 300, 3), torch.rand(2, 300) > 0.3
@@ -62,13 +62,13 @@ def test_kernels_do_what_the_cpu_does() -> None:
 
 @pytest.mark.parametrize("name", ["bunny", "rope"])
 def test_fixed_frames_answer_as_the_model(name: str) -> None:
-    model, frame = load_model(name), load_frame(name)
-    frames = StaticFrames(model, frame.depth.camera, sizes=(100, 400))
-    code = model.encode(frame.depth.to_points())
-    points = random_points(frame, 950)
+    model, view = load_model(name), load_view(name)
+    frames = StaticFrames(model, view.depth.camera, sizes=(100, 400))
+    code = model.encode(view.depth.to_points())
+    points = random_points(view, 950)
     expected = model.query(code, points)
     for count in (950, 60):
-        frames.see(frame.depth.depth)
+        frames.see(view.depth.depth)
         labels, distances = frames.ask(points[:count])
         assert labels.dtype == np.uint8 and labels.shape == distances.shape == (count,)
         assert (labels != expected.label[:count]).mean() < 0.005  # rounding: coordinates here are in single precision
@@ -78,37 +78,37 @@ def test_fixed_frames_answer_as_the_model(name: str) -> None:
 
 def test_each_image_is_answered_by_itself() -> None:
     """Nothing of one image may stay in the buffers of the next, whose object is smaller and elsewhere."""
-    model, frame = load_model("rope"), load_frame("rope")
-    frames = StaticFrames(model, frame.depth.camera, sizes=(64,))
-    points = random_points(frame, 64)
-    frames.see(frame.depth.depth)
+    model, view = load_model("rope"), load_view("rope")
+    frames = StaticFrames(model, view.depth.camera, sizes=(64,))
+    points = random_points(view, 64)
+    frames.see(view.depth.depth)
     whole = frames.ask(points)
-    part = frame.depth.depth.copy()
+    part = view.depth.depth.copy()
     part[: np.flatnonzero(part.any(axis=1))[len(part) // 8]] = 0
     frames.see(part)
     other = frames.ask(points)
-    fresh = StaticFrames(model, frame.depth.camera, sizes=(64,))
+    fresh = StaticFrames(model, view.depth.camera, sizes=(64,))
     fresh.see(part)
     np.testing.assert_array_equal(other[1], fresh.ask(points)[1])
     assert not np.array_equal(whole[1], other[1])
-    frames.see(frame.depth.depth)
+    frames.see(view.depth.depth)
     np.testing.assert_array_equal(frames.ask(points)[1], whole[1])
 
 
 def test_few_pixels_are_repeated_and_too_few_refused() -> None:
-    model, frame = load_model("bunny"), load_frame("bunny")
-    frames = StaticFrames(model, frame.depth.camera, sizes=(64,))
-    rows, columns = np.nonzero(frame.depth.depth)
+    model, view = load_model("bunny"), load_view("bunny")
+    frames = StaticFrames(model, view.depth.camera, sizes=(64,))
+    rows, columns = np.nonzero(view.depth.depth)
     for count in (200, 10, 0):
-        few = np.zeros_like(frame.depth.depth)
+        few = np.zeros_like(view.depth.depth)
         chosen = slice(None, None, max(1, len(rows) // max(count, 1))) if count else slice(0, 0)
-        few[rows[chosen][:count], columns[chosen][:count]] = frame.depth.depth[
+        few[rows[chosen][:count], columns[chosen][:count]] = view.depth.depth[
             rows[chosen][:count], columns[chosen][:count]
         ]
-        points = random_points(frame, 50)
+        points = random_points(view, 50)
         frames.see(few)
         if count == 200:
-            code = model.encode(replace(frame.depth, depth=few).to_points())
+            code = model.encode(replace(view.depth, depth=few).to_points())
             np.testing.assert_allclose(
                 frames.ask(points)[1], model.query(code, points).distance, atol=2e-3 / code.normalizer.scale
             )
@@ -118,8 +118,8 @@ def test_few_pixels_are_repeated_and_too_few_refused() -> None:
 
 
 def test_what_cannot_be_fixed_is_refused() -> None:
-    model, frame = load_model("rope"), load_frame("rope")
-    camera = frame.depth.camera
+    model, view = load_model("rope"), load_view("rope")
+    camera = view.depth.camera
     with pytest.raises(ValueError, match="640 x 480 pixels; at most 16384 .*crop it around the object"):
         StaticFrames(model, replace(camera, width=640, height=480))
     for sizes in ((), (0, 64)):
@@ -130,7 +130,7 @@ def test_what_cannot_be_fixed_is_refused() -> None:
         frames.ask(np.zeros((1, 3)))
     with pytest.raises(ValueError, match=r"the image is \(4, 4\); the camera's are"):
         frames.see(np.ones((4, 4)))
-    odd = replace(model.network.config, encoder="autodecoder")
+    odd = model.network.config.changed(encoder="autodecoder")
     fake = replace(model)
     fake.network.config = odd
     with pytest.raises(ValueError, match="an autodecoder searches for its code"):
@@ -153,13 +153,13 @@ def test_rotation_is_the_same_from_either_decomposition(monkeypatch: pytest.Monk
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("name", ["bunny", "rope"])
 def test_graphs_on_cuda_answer_as_the_cpu(name: str) -> None:
-    exact, frame = load_model(name), load_frame(name)
+    exact, view = load_model(name), load_view(name)
     fast: Model = replace(load_model(name, "cuda"), precision="float32")
-    frames = StaticFrames(fast, frame.depth.camera, sizes=(1000,))
-    points = random_points(frame, 900)
-    expected = exact.query(exact.encode(frame.depth.to_points()), points)
+    frames = StaticFrames(fast, view.depth.camera, sizes=(1000,))
+    points = random_points(view, 900)
+    expected = exact.query(exact.encode(view.depth.to_points()), points)
     for _ in range(3):
-        frames.see(frame.depth.depth)
+        frames.see(view.depth.depth)
         labels, distances = frames.ask(points)
         assert (labels != expected.label).mean() < 0.01
         assert np.abs(distances - expected.distance).mean() < 0.01 * np.ptp(points, axis=0).max()

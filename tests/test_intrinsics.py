@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_files import write_camera
 
 from mereo.geometry.camera import Camera
-from mereo.io.intrinsics import CameraWarning
-from mereo.io.readers import read_camera, read_intrinsics
+from mereo.io.intrinsics import CameraWarning, read_camera, read_intrinsics
 
 K = [[525.0, 0.0, 319.5], [0.0, 520.0, 239.5], [0.0, 0.0, 1.0]]
 FLAT = [v for row in K for v in row]
@@ -31,6 +31,12 @@ CAMERAS = {
     "nerfstudio.json": json.dumps({"fl_x": 525, "fl_y": 520, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480}),
     "calibrator.yml": CALIBRATOR,
 }
+
+
+def test_what_a_file_says_comes_back_exactly(tmp_path: Path) -> None:
+    camera = Camera(96, 64, 101.123456789, 99.1, 48.25, 31.5)
+    write_camera(tmp_path / "c.json", camera)
+    assert read_camera(tmp_path / "c.json") == camera
 
 
 @pytest.mark.parametrize("name", CAMERAS)

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_files import write_camera
 from PIL import Image
 
 from mereo.cli.stream import stream_reconstructions
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid
-from mereo.io.atomic_files import write_camera
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.stream_sources import frames_of

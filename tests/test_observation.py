@@ -6,17 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from camera_files import write_camera
 from PIL import Image
 
 from mereo import __main__ as command_line
 from mereo.cli import commands
 from mereo.geometry.camera import Camera
-from mereo.io.atomic_files import write_camera
 from mereo.io.config import InputConfig
 from mereo.io.readers import read_point_cloud
+from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import read_observation, size_warning
+from mereo.reconstruction.observation import find_object, size_warning
 
 CAMERA = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
 
@@ -33,9 +34,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_depth_image_becomes_the_points_it_shows(folder: Path) -> None:
-    seen = read_observation(folder / "d.png", InputConfig(intrinsics=folder / "k.json", depth_scale=5000.0))
+    seen = find_object(read_frame(folder / "d.png", InputConfig(intrinsics=folder / "k.json", depth_scale=5000.0)))
     points = seen.cloud.points
-    assert len(points) == 50 and seen.unit_m == 1.0 and seen.depth_m == (0.5, 0.5, 0.5)
+    assert len(points) == 50 and seen.frame.unit_m == 1.0 and seen.depth_m == (0.5, 0.5, 0.5)
     np.testing.assert_allclose(points[:, 2], 0.5)
     np.testing.assert_allclose(CAMERA.project(points)[0], [5.5, 2.5])
     assert seen.size_m == pytest.approx((0.15, 4 / 60, 0.0))
@@ -54,7 +55,7 @@ def test_the_depth_scale_of_the_intrinsics_is_for_integers_and_gives_way(folder:
         ("d.npy", None, 0.5),
         ("d.npy", 0.5, 1),
     ):
-        seen = read_observation(folder / name, InputConfig(intrinsics=folder / "bop.json", depth_scale=scale))
+        seen = find_object(read_frame(folder / name, InputConfig(intrinsics=folder / "bop.json", depth_scale=scale)))
         assert seen.depth_m[1] == pytest.approx(expected), (name, scale)
 
 
@@ -63,10 +64,11 @@ def test_the_mask_and_the_crop_work_together(folder: Path) -> None:
     mask[:, :10] = 1
     Image.fromarray(mask).save(folder / "m.png")
     reading = InputConfig(intrinsics=folder / "k.json", mask=folder / "m.png", depth_scale=500.0)
-    seen = read_observation(folder / "d.png", reading)
-    assert len(seen.cloud) == 25
+    seen = find_object(read_frame(folder / "d.png", reading))
+    assert len(seen.cloud) == 25 and seen.frame.depth is not None
+    np.testing.assert_array_equal(seen.frame.depth.valid, (mask != 0) & (np.load(folder / "d.npy") > 0))
     with pytest.raises(ValueError, match="the step 'depth range' leaves 0 of 25 points, which reach"):
-        read_observation(folder / "d.png", reading, IsolationConfig(depth_range=(1.0, 2.0)))
+        find_object(read_frame(folder / "d.png", reading), IsolationConfig(depth_range=(1.0, 2.0)))
 
 
 @pytest.mark.parametrize(
@@ -91,14 +93,14 @@ def test_the_mask_and_the_crop_work_together(folder: Path) -> None:
 )
 def test_contradictory_inputs(name: str, options: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        read_observation(Path(name), InputConfig(**options))
+        read_frame(Path(name), InputConfig(**options))
 
 
 def test_a_scan_has_no_depth(tmp_path: Path) -> None:
     np.save(tmp_path / "c.npy", np.random.default_rng(0).normal(size=(100, 3)))
     with pytest.raises(ValueError, match="scanner's frame, in which depth is not known.*crop with --box"):
-        read_observation(tmp_path / "c.npy", InputConfig(frame="scanner"), IsolationConfig(depth_range=(0.1, 1)))
-    seen = read_observation(tmp_path / "c.npy", InputConfig(frame="scanner"))
+        find_object(read_frame(tmp_path / "c.npy", InputConfig(frame="scanner")), IsolationConfig(depth_range=(0.1, 1)))
+    seen = find_object(read_frame(tmp_path / "c.npy", InputConfig(frame="scanner")))
     assert "depth" not in str(seen) and seen.facts()["depth_m"] is None
 
 
@@ -107,7 +109,7 @@ def test_the_unit_of_a_cloud(tmp_path: Path) -> None:
     points = np.random.default_rng(0).uniform((-100, -100, 500), (100, 100, 600), (400, 3))
     np.save(tmp_path / "c.npy", points)
     near = IsolationConfig(box=(-0.1, -0.1, 0.5, 0.1, 0.1, 0.55))
-    seen = read_observation(tmp_path / "c.npy", InputConfig(unit_m=0.001), near)
+    seen = find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=0.001)), near)
     assert 150 < len(seen.cloud) < 250 and seen.cloud.points[:, 2].max() > 500
     assert seen.depth_m[0] == pytest.approx(0.5, abs=0.01)
     with pytest.raises(ValueError, match="the unit is 0 m; it must be positive: give 0.001 for millimetres"):
@@ -116,7 +118,7 @@ def test_the_unit_of_a_cloud(tmp_path: Path) -> None:
 
 def test_size_against_training(tmp_path: Path) -> None:
     np.save(tmp_path / "c.npy", np.random.default_rng(0).uniform((0, 0, 1), (0.1, 0.05, 1.1), (400, 3)))
-    seen = read_observation(tmp_path / "c.npy")
+    seen = find_object(read_frame(tmp_path / "c.npy"))
     for visible_m, fits in (([0.08, 0.2], True), ([0.15, 0.3], True), ([0.25, 0.5], False), ([0.01, 0.04], False)):
         text = size_warning(seen, {"visible_m": visible_m})
         assert (text is None) == fits, visible_m
@@ -128,8 +130,8 @@ def test_shipped_bunny_weights_know_the_bunny_size(tmp_path: Path) -> None:
     """The Stanford Bunny is 15 cm long; the same cloud read as millimetres cannot be it."""
     np.save(tmp_path / "c.npy", np.random.default_rng(0).uniform((0, 0, 1), (0.15, 0.15, 1.1), (400, 3)))
     provenance = load_model("bunny").provenance
-    assert size_warning(read_observation(tmp_path / "c.npy"), provenance) is None
-    text = size_warning(read_observation(tmp_path / "c.npy", InputConfig(unit_m=0.001)), provenance)
+    assert size_warning(find_object(read_frame(tmp_path / "c.npy")), provenance) is None
+    text = size_warning(find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=0.001))), provenance)
     assert text is not None and "m long, but 0.12 to 0.254 m in training" in text
 
 
@@ -147,9 +149,9 @@ def test_zdf_is_an_organized_cloud_in_millimetres(tmp_path: Path) -> None:
         group.createVariable("pointcloud", "f4", ("rows", "cols", "xyz"))[:] = points
     with pytest.raises(ValueError, match="1 of 48 points without a measurement.*--drop-invalid"):
         read_point_cloud(tmp_path / "z.zdf")
-    seen = read_observation(tmp_path / "z.zdf", InputConfig(drop_invalid=True))
+    seen = find_object(read_frame(tmp_path / "z.zdf", InputConfig(drop_invalid=True)))
     np.testing.assert_array_equal(seen.cloud.points, np.delete(points.reshape(-1, 3), 10, axis=0))
-    assert seen.unit_m == 0.001 and 0.5 < seen.depth_m[1] < 0.9
+    assert seen.frame.unit_m == 0.001 and 0.5 < seen.depth_m[1] < 0.9
     with netcdf.Dataset(tmp_path / "other.zdf", "w") as file:
         file.createGroup("nothing")
     with pytest.raises(ValueError, match="other.zdf cannot be read as a point cloud"):
@@ -161,7 +163,7 @@ def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         (tmp_path / name).write_bytes(b"anything")
         monkeypatch.setattr(f"mereo.io.{module}.find_spec", lambda _: None)
         with pytest.raises(ImportError, match=rf"{name} needs {library}.*: pip install 'mereo\[sensors\]'"):
-            read_observation(tmp_path / name)
+            read_frame(tmp_path / name)
 
 
 # --- the command line ------------------------------------------------------------------------------------------------

@@ -12,14 +12,21 @@ from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid
 from mereo.synthesis.examples import View
-from mereo.visualization.error_maps import OVER, UNDER, WRONG, error_grids, voxel_triangles
-from mereo.visualization.previews import (
-    contact_sheet,
-    depth_to_rgb,
+from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb
+from mereo.visualization.error_maps import (
+    FULL_CELLS,
+    OVER,
+    PALE,
+    TOLERANCE_CELLS,
+    UNDER,
+    WRONG,
     error_picture,
-    render_cloud_and_segments,
-    scene_preview,
+    offset_colors,
+    offset_triangles,
+    segmentation_error,
+    voxel_triangles,
 )
+from mereo.visualization.previews import preview_states, render_cloud_and_segments
 from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
 
 FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -50,6 +57,13 @@ def test_an_orthographic_ball_has_its_closed_form_depth_and_area() -> None:
     inner = x**2 + y**2 < 0.9
     # depth in the view frame, whose origin is the middle of the box
     np.testing.assert_allclose(canvas.depth[seen][inner], -np.sqrt(1 - x**2 - y**2)[inner], atol=6e-3)
+
+
+def test_a_view_along_its_own_up_is_still_a_rotation() -> None:
+    view = Viewpoint.along(np.array([[-1.0, -1, 4], [1, 1, 6]]), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0))
+    rotation = view.T_view_world[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rotation[2], [0, 0, 1])
 
 
 def test_a_pinhole_picture_is_the_camera_depth_image_in_colour() -> None:
@@ -138,44 +152,75 @@ def test_voxel_faces_are_a_closed_outward_surface_of_the_right_volume() -> None:
     np.testing.assert_allclose(high, [3, 2, 1] + (filled.max(axis=0) + 0.5) * spacing)
 
 
-def test_error_grids_count_what_the_confusion_matrix_counts() -> None:
+def labelled(
+    truth: np.ndarray, found: np.ndarray, spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> EvaluatedView:
+    """A case whose first cell is centred at the origin, and whose cloud is the true cells."""
+    cloud = PointCloud(np.argwhere(truth)[::7] * np.array(spacing))
+    colors = [(0, 158, 115), (240, 228, 66), (86, 180, 233)]
+    return EvaluatedView("case", cloud, truth, found, np.zeros(3), np.array(spacing), colors)
+
+
+def test_wrong_segments_are_those_of_the_confusion_matrix() -> None:
     rng = np.random.default_rng(4)
     truth, found = (rng.integers(0, 4, (8, 9, 10)).astype(np.uint8) for _ in range(2))
-    grids = error_grids(truth, found)
-    over, under = ((truth == 0) & (found > 0)).sum(), ((truth > 0) & (found == 0)).sum()
-    np.testing.assert_array_equal(np.bincount(grids["reconstruction error"].ravel())[2:], [over, under])
-    wrong = ((truth > 0) & (found > 0) & (truth != found)).sum()
-    assert (grids["segmentation error"] == 2).sum() == wrong
-    assert (grids["reconstruction"] > 0).sum() == (found > 0).sum()
-    assert not (error_grids(truth, truth)["segmentation error"] == 2).any()
+    error = segmentation_error(labelled(truth, found))
+    assert (error == 2).sum() == ((truth > 0) & (found > 0) & (truth != found)).sum()
+    assert (error > 0).sum() == ((truth > 0) & (found > 0)).sum()
+    assert not (segmentation_error(labelled(truth, truth)) == 2).any()
+
+
+def test_offsets_are_pale_within_the_tolerance_and_full_at_the_end_of_the_scale() -> None:
+    shown = offset_colors(np.array([-9.0, -FULL_CELLS, -TOLERANCE_CELLS, 0.0, TOLERANCE_CELLS, FULL_CELLS, 9.0]))
+    np.testing.assert_array_equal(shown, [UNDER, UNDER, PALE, PALE, PALE, OVER, OVER])
+    ramp = offset_colors(np.linspace(TOLERANCE_CELLS, FULL_CELLS, 9))
+    assert (np.diff(ramp[:, 0]) < 0).all()  # the red of blue falls
+
+
+def test_a_reconstruction_that_is_right_but_for_rounding_is_drawn_pale() -> None:
+    grid = np.indices((40, 40, 40)).transpose(1, 2, 3, 0)
+    truth = (np.linalg.norm(grid - 19.5, axis=-1) < 14.0).astype(np.uint8)
+    moved = (np.linalg.norm(grid - [19.8, 19.3, 19.6], axis=-1) < 14.1).astype(np.uint8)
+    assert (truth != moved).sum() > 400  # which the staircases would show as speckle
+    pale = np.isclose(offset_triangles(labelled(truth, moved)).colors, np.asarray(PALE) / 255, atol=0.08).all(axis=1)
+    assert pale.mean() > 0.99
+    exact = offset_triangles(labelled(truth, truth)).colors
+    np.testing.assert_allclose(exact, np.broadcast_to(np.asarray(PALE) / 255, exact.shape))
 
 
 def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -> None:
     truth = np.zeros((20, 20, 20), np.uint8)
     truth[5:15, 5:10, 5:15], truth[5:15, 10:15, 5:15] = 1, 2
     found = truth.copy()
-    found[15:18, 5:15, 5:15], found[5:7, 5:15, 5:15], found[8:12, 5:15, 5:15] = 1, 0, 1
-    cloud = PointCloud(np.argwhere(truth)[::7].astype(float))
-    colors = [(0, 158, 115), (240, 228, 66)]
-    case = EvaluatedView("box", cloud, truth, found, np.zeros(3), np.ones(3), colors)
-    error_picture(tmp_path / "e.png", [case], size=60)
+    found[15:18, 5:15, 5:15], found[5:8, 5:15, 5:15], found[10:12, 5:15, 5:15] = 1, 0, 1
+    error_picture(tmp_path / "e.png", [labelled(truth, found)], size=60)
     picture = np.asarray(Image.open(tmp_path / "e.png"))
-    columns = np.array_split(picture[:, 12:], 7, axis=1)
+    assert hue_is(picture[-44:], OVER).any()
+    assert hue_is(picture[-44:], UNDER).any()
+    columns = np.array_split(picture[:-44, 12:], 8, axis=1)
     shows = [[bool(hue_is(column, c).sum() > 20) for c in (OVER, UNDER, WRONG)] for column in columns]
-    assert shows[3] == [True, True, False]
-    assert shows[5] == [False, False, True]
-    for plain in (0, 1, 2, 6):
+    assert shows[3] == shows[4] == [True, True, False]
+    assert shows[6] == [False, False, True]
+    for plain in (0, 1, 2, 7):
         assert not any(shows[plain])
     assert [f.name for f in tmp_path.iterdir()] == ["e.png"]
+
+
+def test_an_error_on_the_far_side_is_seen_from_behind_only(tmp_path: Path) -> None:
+    truth = np.zeros((20, 20, 20), np.uint8)
+    truth[5:15, 5:15, 5:12] = 1
+    found = truth.copy()
+    found[7:13, 7:13, 12:16] = 1
+    error_picture(tmp_path / "e.png", [labelled(truth, found)], size=60)
+    columns = np.array_split(np.asarray(Image.open(tmp_path / "e.png"))[:-44, 12:], 8, axis=1)
+    assert [bool(hue_is(columns[k], OVER).sum() > 20) for k in (3, 4)] == [False, True]
 
 
 def test_an_empty_prediction_can_be_drawn(tmp_path: Path) -> None:
     truth = np.zeros((6, 6, 6), np.uint8)
     truth[2:4, 2:4, 2:4] = 1
-    cloud = PointCloud(np.argwhere(truth).astype(float))
-    case = EvaluatedView("none", cloud, truth, np.zeros_like(truth), np.zeros(3), np.ones(3), [PALETTE[0]])
-    error_picture(tmp_path / "e.png", [case], size=40)
-    assert (tmp_path / "e.png").stat().st_size > 500
+    error_picture(tmp_path / "e.png", [labelled(truth, np.zeros_like(truth))], size=40)
+    assert hue_is(np.asarray(Image.open(tmp_path / "e.png"))[:-44], UNDER).any()  # all of it is missing
 
 
 # --- sheets ----------------------------------------------------------------------------------------------------------
@@ -197,12 +242,12 @@ def test_the_preview_shows_cloud_and_segments_and_turns_with_the_frame(tmp_path:
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "up.png")), picture)
 
 
-def test_the_scene_preview_has_three_pictures_for_each_state(tmp_path: Path) -> None:
+def test_a_preview_of_states_has_three_pictures_for_each_state(tmp_path: Path) -> None:
     camera = Camera.from_fov(24, 24, 0.6)
     mesh = SegmentedMesh((ball((0, 0, 3), 0.5, (255, 0, 0)),))
     depth = DepthImage(np.pad(np.full((8, 8), 2.6), 8), camera)
     views = [View(mesh, depth, rigid(np.eye(3), np.array([0.0, 0.0, -3.0 * i])), ()) for i in (1, 2)]
-    scene_preview(tmp_path / "s.png", views, "two states", size=50)
+    preview_states(tmp_path / "s.png", views, "two states", size=50)
     picture = np.asarray(Image.open(tmp_path / "s.png"))
     thirds = np.array_split(picture[:, 12:], 9, axis=1)
     reds = [int(hue_is(part, (255, 0, 0)).sum()) for part in thirds]

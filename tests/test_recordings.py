@@ -12,10 +12,11 @@ from PIL import Image
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.io.config import InputConfig
-from mereo.io.intrinsics import CameraWarning
-from mereo.io.readers import read_intrinsics
+from mereo.io.intrinsics import CameraWarning, read_intrinsics
 from mereo.io.ros_recordings import recorded_frame, recorded_frames
-from mereo.reconstruction.observation import read_observation
+from mereo.io.sensor_frame import read_frame
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.stream_sources import frames_of
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")
 
@@ -122,9 +123,21 @@ def test_the_depth_topic_is_found_and_read(tmp_path: Path, name: str, ros: int) 
         content = frame.read()
         assert isinstance(content, DepthImage) and content.camera == CAMERA
         np.testing.assert_array_equal(content.depth, depth / 1000)
-    seen = read_observation(path, InputConfig(frame_index=2))
+    seen = read_frame(path, InputConfig(frame_index=2))
     assert len(seen.cloud) == 47 and seen.unit_m == 1.0
     assert seen.source == f"{path.name}, /camera/depth/image_raw at 3.000 s"
+    assert seen.depth is not None
+    np.testing.assert_array_equal(seen.depth.depth, DEPTH_MM[2] / 1000)
+
+
+def test_a_stream_reads_the_same_frames(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", 1, depth_topics)
+    frames = list(frames_of(str(path), InputConfig(), IsolationConfig(box=(-9, -9, 0, 9, 9, 9))))
+    assert [frame.time_s for frame in frames] == [1.0, 2.0, 3.0]
+    for index, frame in enumerate(frames):
+        alone = read_frame(path, InputConfig(frame_index=index))
+        assert frame.name == alone.message
+        np.testing.assert_array_equal(frame.load().points, alone.cloud.points)
 
 
 def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
@@ -186,8 +199,8 @@ def test_point_clouds_keep_their_missing_points_until_asked(tmp_path: Path) -> N
     path = write_bag(tmp_path / "a.mcap", 2, lambda m: {"/points": [m.cloud(points)]})
     np.testing.assert_array_equal(recorded_frame(path).read(), points.astype(np.float64))
     with pytest.raises(ValueError, match="1 of 80 points without a measurement.*--drop-invalid"):
-        read_observation(path)
-    assert len(read_observation(path, InputConfig(drop_invalid=True)).cloud) == 79
+        read_frame(path)
+    assert len(read_frame(path, InputConfig(drop_invalid=True)).cloud) == 79
 
 
 def test_distortion_counts_unless_the_topic_is_rectified(tmp_path: Path) -> None:
@@ -229,7 +242,7 @@ def test_what_a_recording_lacks_is_said(tmp_path: Path) -> None:
         ({"unit_m": 0.001}, "comes in metres: leave out --unit-m"),
     ):
         with pytest.raises(ValueError, match=expected) as caught:
-            read_observation(path, InputConfig(**options))  # type: ignore[arg-type]
+            read_frame(path, InputConfig(**options))  # type: ignore[arg-type]
         assert "\n" not in str(caught.value)
     blind = write_bag(tmp_path / "blind.bag", 1, lambda m: {"/d/image": [m.image(DEPTH_MM[0], "16UC1")]})
     with pytest.raises(ValueError, match="has no CameraInfo.*--intrinsics"):

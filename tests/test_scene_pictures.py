@@ -11,8 +11,8 @@ from toy_scene import toy_scene
 from mereo.cli.scene_commands import ScenePreview
 from mereo.scenes.registry import SCENES
 from mereo.scenes.scene import Scene
-from mereo.visualization import scene_previews
-from mereo.visualization.scene_previews import SIZE, preview_all, scene_row
+from mereo.visualization import previews
+from mereo.visualization.previews import TILE_PX, preview_all, scene_row
 
 
 def toy(name: str) -> Scene:
@@ -24,20 +24,20 @@ def colored(picture: np.ndarray) -> np.ndarray:
 
 
 def test_every_scene_has_a_view() -> None:
-    assert set(scene_previews.VIEWS) == set(SCENES)
+    assert set(previews.SCENE_VIEWS) == set(SCENES)
 
 
 def test_a_row_is_three_states_at_one_scale_and_a_depth_image() -> None:
     rest, first, second, depth = scene_row(toy("robot"), seed=1)
-    assert all(picture.shape == (SIZE, SIZE, 3) for picture in (rest, first, second, depth))
+    assert all(picture.shape == (TILE_PX, TILE_PX, 3) for picture in (rest, first, second, depth))
     shown = [colored(picture) for picture in (rest, first, second)]
-    assert all(700 < mask.sum() < 0.8 * SIZE**2 for mask in shown)
-    margin = np.ones((SIZE, SIZE), dtype=bool)
+    assert all(700 < mask.sum() < 0.8 * TILE_PX**2 for mask in shown)
+    margin = np.ones((TILE_PX, TILE_PX), dtype=bool)
     margin[2:-2, 2:-2] = False
     together = np.logical_or.reduce(shown)
     assert not (together & margin).any()  # nothing is cut off
     sides = [np.ptp(np.flatnonzero(together.any(axis=axis))) for axis in (0, 1)]
-    assert max(sides) > 0.8 * SIZE  # and no room is wasted
+    assert max(sides) > 0.8 * TILE_PX  # and no room is wasted
     assert (rest != first).any() and (first != second).any()
     assert (np.abs(depth.astype(int) - 237).max(axis=-1) > 20).mean() > 0.02
     again = scene_row(toy("robot"), seed=1)
@@ -51,14 +51,14 @@ def test_the_sheet_has_a_row_of_four_for_every_scene(monkeypatch: pytest.MonkeyP
         loaded.append(name)
         return toy(name)
 
-    monkeypatch.setattr(scene_previews, "load_scene", load)
-    monkeypatch.setattr(scene_previews, "SCENES", ("robot", "sheet", "tumor"))
+    monkeypatch.setattr(previews, "load_scene", load)
+    monkeypatch.setattr(previews, "SCENES", ("robot", "sheet", "tumor"))
     preview_all(tmp_path / "all.png", seed=2)
     assert loaded == ["robot", "sheet", "tumor"]
     picture = np.asarray(Image.open(tmp_path / "all.png"))
-    row = SIZE + 24 + 12
-    assert picture.shape == (12 + 2 * row, 12 + 8 * (SIZE + 12), 3)
-    cells = [picture[12 + r * row :, 12 + c * (SIZE + 12) :][:SIZE, :SIZE] for r in (0, 1) for c in range(8)]
+    row = TILE_PX + 24 + 12
+    assert picture.shape == (12 + 2 * row, 12 + 8 * (TILE_PX + 12), 3)
+    cells = [picture[12 + r * row :, 12 + c * (TILE_PX + 12) :][:TILE_PX, :TILE_PX] for r in (0, 1) for c in range(8)]
     filled = [bool((cell < 250).any()) for cell in cells]
     assert filled == [True] * 12 + [False] * 4
     assert np.array_equal(cells[4], scene_row(toy("sheet"), 2)[0])

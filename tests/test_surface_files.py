@@ -10,7 +10,7 @@ import trimesh
 from written_results import CENTER, COLORS, NAMES, SIDES, segments
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.io.readers import read_segmented_mesh
+from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.writers.glb import write_segments_glb
 from mereo.io.writers.obj import write_segments_obj
 from mereo.io.writers.ply import write_segments_ply

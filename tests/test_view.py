@@ -50,7 +50,7 @@ def toy_inspection() -> Told:
     points = np.concatenate([segment.vertices[::2] for segment in mesh.segments])
     cloud = PointCloud(points[points[:, 2] <= 162.0])
     model = Model(Network(PRESETS["tiny"].network, 4).eval(), mesh.names, mesh.colors)
-    return Told(cloud, Reconstruction(mesh, grid, (), {}, 0, False), model, model.encode(cloud), np.eye(4))
+    return Told(cloud, Reconstruction(mesh, grid, (), {}, 0, False, model.encode(cloud), np.eye(4)), model)
 
 
 @pytest.fixture

@@ -1,8 +1,13 @@
 """Reconstruct deformable objects with all their segments, hidden side included, from one depth image or point cloud.
 
 The public names below are loaded on first use (PEP 562), so that ``import mereo`` is instant and needs no torch.
+
+Importing it sets ``OMP_WAIT_POLICY=passive`` for this process and those it starts, unless the variable is set already:
+threads that wait for each other then sleep instead of spinning, which a busy machine needs. OpenMP reads the variable
+once, when torch is loaded; a program that imports torch before mereo must set it itself.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +18,7 @@ if TYPE_CHECKING:
     from mereo.geometry.camera import PointCloud as PointCloud
     from mereo.geometry.mesh import Segment as Segment
     from mereo.geometry.mesh import SegmentedMesh as SegmentedMesh
-    from mereo.io.readers import read_camera as read_camera
+    from mereo.io.intrinsics import read_camera as read_camera
     from mereo.io.readers import read_depth_image as read_depth_image
     from mereo.io.readers import read_point_cloud as read_point_cloud
     from mereo.models.model import Model as Model
@@ -22,6 +27,10 @@ if TYPE_CHECKING:
     from mereo.scenes.registry import load_scene as load_scene
     from mereo.synthesis.examples import synthesize as synthesize
     from mereo.visualization.result_files import write_reconstruction as write_reconstruction
+
+# Here and not where torch is used, because this runs before every import of torch that mereo makes. A thread that spins
+# at a barrier holds the core that the thread it waits for needs: beside other work each barrier may cost a time slice.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _HOME = {
     "Camera": "geometry.camera",
@@ -33,14 +42,14 @@ _HOME = {
     "evaluate": "evaluation.scoring",
     "load_model": "models.weights",
     "load_scene": "scenes.registry",
-    "read_camera": "io.readers",
+    "read_camera": "io.intrinsics",
     "read_depth_image": "io.readers",
     "read_point_cloud": "io.readers",
     "reconstruct": "reconstruction.pipeline",
     "synthesize": "synthesis.examples",
     "write_reconstruction": "visualization.result_files",
 }
-"""The module of each public name."""
+"""Module of each public name, below ``mereo``."""
 
 __all__ = [*_HOME, "__version__"]
 

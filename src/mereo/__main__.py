@@ -12,32 +12,29 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo.cli import commands, scene_commands
-from mereo.cli.align_command import Align
-from mereo.cli.bench_command import BenchCommand
-from mereo.cli.experiment_command import Experiment
-from mereo.cli.release_command import Release
-from mereo.cli.stream_command import StreamCommand
-from mereo.cli.view_command import ViewCommand
+from mereo.cli import commands, scene_commands, tool_commands
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
 Choice = TypeVar("Choice")
 
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
+"""Environment variable that shows where an error comes from."""
+
 USER_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 """Exit codes; the last two are 128 plus the signal's number, as shells report them."""
 
 
 @runtime_checkable
 class Command(Protocol):
-    """What the arguments are read into: one of the classes of ``mereo.cli.commands``."""
+    """Command that arguments are read into: a class of ``commands``, ``scene_commands`` or ``tool_commands``."""
 
-    def run(self) -> None: ...
+    def run(self) -> None:
+        """Do the work, and print what a person wants to know of it."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code. With MEREO_TRACEBACK=1 errors are raised as they are."""
+    """Run the command line, and return the exit code. With MEREO_TRACEBACK=1 errors are raised as they are."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments in (["--version"], ["-V"]):
         print(f"mereo {version()}")
@@ -60,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def version() -> str:
-    """The installed version."""
+    """Version of the installed package, or that there is none."""
     try:
         return importlib.metadata.version("mereo")
     except importlib.metadata.PackageNotFoundError:
@@ -68,7 +65,7 @@ def version() -> str:
 
 
 def one_line(error: Exception) -> str:
-    """The error's sentence; for an error of the operating system its file and reason."""
+    """Sentence of an error; for one of the operating system its file and reason."""
     if isinstance(error, OSError) and error.strerror:
         reason = error.strerror[0].lower() + error.strerror[1:]
         place = f"{error.filename}: " if error.filename else ""
@@ -87,7 +84,7 @@ def _stop(message: str, code: int) -> int:
 
 
 def parse(arguments: list[str]) -> Command:
-    """The command that these arguments mean; exits with 2 after a message when they mean none."""
+    """Command that these arguments mean; exits with 2 after a message when they mean none."""
     command: Command = tyro.cli(
         _syntax(_chosen(arguments, "--preset", PRESETS, "base"), _chosen(arguments, "--sensor", SENSORS, "paper")),
         args=arguments or ["--help"],
@@ -118,18 +115,18 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
         | Annotated[commands.Reconstruct, subcommand("reconstruct")]
-        | Annotated[Align, subcommand("align")]
-        | Annotated[ViewCommand, subcommand("view")]
-        | Annotated[StreamCommand, subcommand("stream")]
+        | Annotated[tool_commands.Align, subcommand("align")]
+        | Annotated[tool_commands.ViewCommand, subcommand("view")]
+        | Annotated[tool_commands.StreamCommand, subcommand("stream")]
         | Annotated[commands.Export, subcommand("export")]
-        | Annotated[Experiment, subcommand("experiment")]
-        | Annotated[BenchCommand, subcommand("bench")]
-        | Annotated[Release, subcommand("release")]
+        | Annotated[tool_commands.Experiment, subcommand("experiment")]
+        | Annotated[tool_commands.BenchCommand, subcommand("bench")]
+        | Annotated[tool_commands.Release, subcommand("release")]
     )
 
 
 def _starting(command: type, **defaults: Any) -> type:
-    """The command with other defaults for these options."""
+    """Command with other defaults for these options."""
     changed = [(name, command.__annotations__[name], field(default=value)) for name, value in defaults.items()]
     return make_dataclass(
         command.__name__, changed, bases=(command,), frozen=True, namespace={"__doc__": command.__doc__}
@@ -141,7 +138,7 @@ def _group(members: tuple[tuple[type, str], ...]) -> Any:
 
 
 def _chosen(arguments: list[str], option: str, choices: Mapping[Any, Choice], otherwise: str) -> Choice:
-    """What an option chooses, which must be known before parsing because the other defaults depend on it."""
+    """Choice of an option, which must be known before parsing because the other defaults depend on it."""
     values = [a.partition("=")[2] for a in arguments if a.startswith(f"{option}=")]
     values += [after for before, after in pairwise(arguments) if before == option]
     return choices[values[-1] if values and values[-1] in choices else otherwise]

@@ -1,1 +1,1 @@
-"""Commands, and what they print."""
+"""Command line: the commands, and what they print."""

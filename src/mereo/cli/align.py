@@ -42,10 +42,11 @@ def align_file(
         scan: the full-resolution point cloud.
         scene: the scene's name or file.
         output: folder to create.
-        start: the start file, see ``rough_start``; either this or ``weights``.
+        start: the start file, see ``initial_poses.read_start``; either this or ``weights``.
         weights: a shipped name or a file, from which a start is made.
         scene_unit_mm: millimetres per scene unit, where the scene does not say.
-        as_one, hold: see ``placement.place``.
+        as_one: the object is rigid, see ``placement.place``.
+        hold: names of segments that stay, see ``placement.place``.
         force: replace an existing folder.
     """
     if (start is None) == (weights is None):
@@ -89,7 +90,13 @@ def _start(
 
 
 def print_placement(placement: Placement, title: str, unit: str) -> None:
-    """A table of the segments; lengths in millimetres."""
+    """Print a table of the segments, lengths in millimetres, and how much of the scan they explain.
+
+    Args:
+        placement: in the scan's frame and unit.
+        title: of the table.
+        unit: of the scan.
+    """
     mm = 1000 * UNITS_M[unit]
     table = Table(title=f"{title}; millimetres and degrees", title_justify="left", box=None, padding=(0, 2, 0, 0))
     for column in ("segment", "placed by"):

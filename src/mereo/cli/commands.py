@@ -1,4 +1,4 @@
-"""The command line: one dataclass per command, its fields the options, ``run`` the work.
+"""Commands of the command line: one dataclass for each, its fields the options, ``run`` the work.
 
 ``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
 """
@@ -28,6 +28,7 @@ class Demo:
     output: Path = Path("out/demo")
 
     def run(self) -> None:
+        """Reconstruct and print every input of the demo that can be had."""
         from mereo.cli.demo import main
 
         main(self.output)
@@ -38,6 +39,7 @@ class Doctor:
     """Show versions, device, CPU features and extras, and how to install what is missing."""
 
     def run(self) -> None:
+        """Print what is installed and what this machine offers."""
         from mereo.cli.doctor import diagnose
 
         diagnose()
@@ -48,6 +50,7 @@ class AssetsList:
     """Name the downloadable meshes and scans, with licence and credit."""
 
     def run(self) -> None:
+        """Print every asset with its licence, credit and place."""
         from mereo.scenes.assets import ASSETS, location
 
         for asset in ASSETS.values():
@@ -66,6 +69,7 @@ class AssetsGet:
     names: Positional[tuple[str, ...]] = ()
 
     def run(self) -> None:
+        """Fetch assets and print where they are."""
         from mereo.scenes.assets import ASSETS, get
 
         for name in self.names or ASSETS:
@@ -101,6 +105,7 @@ class Generate:
     settings: Annotated[GenerateConfig, arg(name="")] = field(default_factory=GenerateConfig)
 
     def run(self) -> None:
+        """Write the folder of labelled examples."""
         from mereo.synthesis.shards import generate
 
         generate(
@@ -134,6 +139,7 @@ class Train:
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
+        """Train, and print where the weights are."""
         from mereo.training.trainer import train
 
         print(f"weights: {train(self.dataset, self.output, self.config)}")
@@ -169,6 +175,7 @@ class Evaluate:
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
 
     def run(self) -> None:
+        """Write scores and pictures of their errors, and print the table."""
         from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
 
         settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)
@@ -192,11 +199,11 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Reconstruct:
-    """Reconstruct all segments from one frame: a depth image (PNG, TIFF, EXR, NPY), a point cloud (PLY, PCD, XYZ, NPY,
-    NPZ, ZDF) or a ROS recording (bag, MCAP).
+    """Reconstruct all segments from one frame: a depth image, a point cloud or a ROS recording.
 
     Attributes:
-        input: the file; results are in its frame and units.
+        input: depth image (PNG, TIFF, EXR, NPY), point cloud (PLY, PCD, XYZ, NPY, NPZ, ZDF) or ROS recording (bag,
+            MCAP); results are in its frame and units.
         weights: a shipped name or a file.
         output: folder to create.
         resolution: grid cells along the longest side.
@@ -218,6 +225,7 @@ class Reconstruct:
     force: bool = False
 
     def run(self) -> None:
+        """Write the folder of results and print the segments."""
         from mereo.cli.reconstruct import reconstruct_file
 
         reconstruct_file(
@@ -250,13 +258,14 @@ class Export:
     force: bool = False
 
     def run(self) -> None:
+        """Write the folder with both graphs of a network."""
         from mereo.models.export.onnx_export import export_weights
 
         export_weights(self.weights, self.output, self.format, self.force)
 
 
 def part_of(shard: str) -> tuple[int, int]:
-    """``"1/4"`` is part 1 of 4, counted from 0."""
+    """Part and number of parts of a shard: ``"1/4"`` is part 1 of 4, counted from 0. Raises ``ValueError``."""
     part, _, parts = shard.partition("/")
     if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
         raise ValueError(f"the shard is {shard!r}; it must be i/n with i from 0 to n - 1: give for example --shard 0/4")

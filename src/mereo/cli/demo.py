@@ -11,8 +11,8 @@ from rich.table import Table
 
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.sample_views import load_frame
-from mereo.evaluation.scans import bunny_scan, scan_in_camera
+from mereo.evaluation.sample_views import load_view
+from mereo.evaluation.scans import bunny_posed
 from mereo.evaluation.scoring import grid_confusion, predict_grid
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
@@ -42,14 +42,14 @@ OWN_OBJECT = """[bold]On your own data[/bold]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One input of the demo.
+    """Input of the demo with its truth.
 
     Attributes:
         name: of the output folder.
         title: one line about it.
         weights: a shipped name.
         cloud, frame: the input as its sensor gives it.
-        camera_cloud, truth: the same cloud in a camera frame, and the right answer there.
+        truth: the right answer, in a camera frame.
     """
 
     name: str
@@ -57,7 +57,6 @@ class Case:
     weights: str
     cloud: PointCloud
     frame: CloudAxes
-    camera_cloud: PointCloud
     truth: TruthGrid
 
 
@@ -76,25 +75,25 @@ def main(output: str | Path = Path("out/demo")) -> None:
 
 
 def _inputs() -> Iterator[Callable[[], Case]]:
-    """The real scan first, then frames of other objects."""
+    """Inputs of the demo: the real scan first, then frames of other objects."""
     yield _scan_case
     for name in FRAMES:
         yield partial(_frame_case, name)
 
 
 def _scan_case() -> Case:
-    scan, _ = bunny_scan(REAL_SCAN)
-    camera_cloud, truth, _ = scan_in_camera(REAL_SCAN)
+    scan = bunny_posed(REAL_SCAN)
+    _, truth, _ = scan.in_camera()
     title = f"{REAL_SCAN}: a real Cyberware range scan of the Stanford bunny, metres"
-    return Case(REAL_SCAN, title, "bunny", scan, "scanner", camera_cloud, truth_grid(truth))
+    return Case(REAL_SCAN, title, "bunny", scan.cloud, scan.frame, truth_grid(truth))
 
 
 def _frame_case(name: str) -> Case:
-    frame = load_frame(name)
-    camera = frame.depth.camera
-    cloud = frame.depth.to_points()
+    view = load_view(name)
+    camera = view.depth.camera
+    cloud = view.depth.to_points()
     title = f"{name}: a rendered {camera.width} x {camera.height} depth image with noise, scene units"
-    return Case(name, title, name, cloud, "camera", cloud, frame.truth)
+    return Case(name, title, name, cloud, "camera", view.truth)
 
 
 def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
@@ -104,7 +103,7 @@ def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
         result, case.cloud, folder, frame=case.frame, force=True, title=case.title, weights=case.weights
     )
     written_s = time.perf_counter() - started
-    predicted = predict_grid(model, case.camera_cloud, case.truth)
+    predicted = predict_grid(model, result.code, case.truth)
     scores = intersection_over_union(
         grid_confusion(case.truth, predicted, len(segment_names(model)[0])), model.segmented
     )

@@ -23,13 +23,14 @@ PURPOSES: dict[str, str] = {
     "simulation": "states from finite elements",
     "cluster": "data generation on several machines",
     "align": "ground truth from scans",
+    "docs": "the documentation as pages",
     "dev": "tests and checks",
 }
-"""What each extra of pyproject.toml is for; which packages it means is read from the installed metadata."""
+"""Purpose of each extra of pyproject.toml; which packages it means is read from the installed metadata."""
 
 
 def diagnose() -> None:
-    """Print versions, device, threads, CPU features and extras, one fact a line."""
+    """Print versions, device, threads, load, CPU features and extras, one fact a line."""
     for line in (*_platform(), *_packages(), *_device(), *_extras()):
         print(line)
 
@@ -53,7 +54,7 @@ def _packages() -> Iterator[str]:
 
 
 def requirements(extra: str) -> list[str]:
-    """What pyproject.toml declares for ``extra``, for example ``tensorboard>=2.18``; ``""`` is mereo itself."""
+    """Requirements that pyproject.toml declares for an extra, such as ``tensorboard>=2.18``; ``""`` is mereo itself."""
     try:
         declared = importlib.metadata.requires("mereo") or []
     except importlib.metadata.PackageNotFoundError:
@@ -68,7 +69,7 @@ def requirements(extra: str) -> list[str]:
 
 
 def install_command(missing: list[str]) -> str:
-    """The command line that installs these requirements for the running Python."""
+    """Command line that installs these requirements for the running Python."""
     return shlex.join([sys.executable, "-m", "pip", "install", *missing])
 
 
@@ -92,10 +93,32 @@ def _device() -> Iterator[str]:
     else:
         yield _row("device", "cpu")
     yield _row("threads", f"{torch.get_num_threads()} of {os.cpu_count()} cores")
+    yield _row("wait policy", os.environ.get("OMP_WAIT_POLICY", "not set"))
+    if hasattr(os, "getloadavg"):
+        yield _row("load", describe_load(os.getloadavg()[0], os.cpu_count() or 1, torch.get_num_threads()))
     features = cpu_features()
     for name, present in features.items():
         yield _row(name, {True: "yes", False: "no", None: "unknown"}[present])
     yield _row("bfloat16", _bfloat16())
+
+
+def describe_load(load: float, cores: int, threads: int) -> str:
+    """Sentence on how busy the machine is, and the OMP_NUM_THREADS that would help where it is.
+
+    Args:
+        load: processes that ran or wanted to, mean of the last minute.
+        cores: of the machine.
+        threads: that OpenMP would use.
+    """
+    found = f"{load:.1f} on {cores} cores"
+    free = max(1, round(cores - load))
+    if load >= 1.5 * cores:  # fewer threads then get a smaller share of the cores and gain nothing
+        return f"{found}, which is crowded: everything waits for a core"
+    if load < cores / 2 or threads <= free:
+        return found
+    return (
+        f"{found}, which is busy: OMP_NUM_THREADS={free} would help, as all threads wait for the one that shares a core"
+    )
 
 
 def _bfloat16() -> str:

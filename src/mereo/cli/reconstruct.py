@@ -8,12 +8,13 @@ from rich.table import Table
 
 from mereo.io.atomic_files import new_directory
 from mereo.io.config import DEFAULT_FILES, FilesConfig, InputConfig
+from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import STRAY_SHARE, stray_share
-from mereo.reconstruction.observation import SizeWarning, read_observation, size_warning
+from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.visualization.result_files import write_files
 
@@ -30,10 +31,26 @@ def reconstruct_file(
     files: FilesConfig = DEFAULT_FILES,
     force: bool = False,
 ) -> Reconstruction:
-    """``mereo reconstruct``: read one frame of a sensor, reconstruct, write a new directory, print what was found."""
+    """Read one frame of a sensor, reconstruct it, write a new directory, print what was found: ``mereo reconstruct``.
+
+    Args:
+        input: a depth image, a point cloud or a ROS recording.
+        weights: a shipped name or a file.
+        output: folder to create.
+        resolution: cells along the longest side of the object's box.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
+        files: which files are written, and in which unit.
+        force: replace an existing folder.
+
+    Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``read_frame``, ``find_object`` and
+    ``reconstruct`` do.
+    """
     formats = chosen_formats(files.formats)  # a missing extra is said before the work, not after
     with new_directory(output, force) as directory:
-        seen = read_observation(input, reading, isolation)
+        frame = read_frame(input, reading)
+        seen = find_object(frame, isolation)
         print(seen)
         apart = 0.0 if isolation.largest_cluster else stray_share(seen.cloud)
         if apart > STRAY_SHARE:
@@ -42,17 +59,17 @@ def reconstruct_file(
         warning = size_warning(seen, model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
-        result = reconstruct(seen.cloud, model, resolution, seen.frame, label_points="points" in formats)
-        facts = {"title": seen.source, "weights": str(weights), "resolution": resolution, "points": len(seen.cloud)}
+        result = reconstruct(seen.cloud, model, resolution, frame.axes, label_points="points" in formats)
+        facts = {"title": frame.source, "weights": str(weights), "resolution": resolution, "points": len(seen.cloud)}
         facts |= {"device": model.device.type, "precision": model.working_precision}
-        write_files(directory, result, seen.cloud, seen.frame, files, seen.unit_m, {**facts, **seen.facts()})
-    print_segments(result, f"{seen.source}, {len(seen.cloud)} points")
+        write_files(directory, result, seen.cloud, frame.axes, files, frame.unit_m, {**facts, **seen.facts()})
+    print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result
 
 
 def print_segments(result: Reconstruction, title: str) -> None:
-    """A table of the segments, and a line of the stages' seconds."""
+    """Print a table of the segments, and a line of the stages' seconds."""
     table = Table(title=title, title_justify="left")
     table.add_column("segment")
     for column in ("volume", "confidence", "components", "centroid"):

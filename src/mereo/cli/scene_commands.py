@@ -1,4 +1,7 @@
-"""The commands ``mereo scene ...``: list, write, check, draw and export scenes. See ``commands``."""
+"""The commands ``mereo scene ...``: list, write, check, draw and export scenes.
+
+See ``mereo.cli.commands`` for how commands are written.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +15,7 @@ class SceneList:
     """Name the built-in scenes."""
 
     def run(self) -> None:
+        """Print the names of the built-in scenes."""
         from mereo.scenes.registry import SCENES
 
         for name in SCENES:
@@ -34,6 +38,7 @@ class SceneNew:
     units: Literal["mm", "cm", "m", "in"] | None = None
 
     def run(self) -> None:
+        """Write the scene file, and print what to do next."""
         from mereo.scenes.files.template import write_scene_file
 
         path = write_scene_file(self.files, self.output, self.units)
@@ -55,6 +60,7 @@ class SceneCheck:
     repair: bool = False
 
     def run(self) -> None:
+        """Print what is found, and write repaired copies where asked to."""
         from mereo.scenes.files.check import check_scene
 
         check_scene(self.scene, self.repair)
@@ -77,9 +83,9 @@ class ScenePreview:
     seed: int = 0
 
     def run(self) -> None:
+        """Write the picture of random states."""
         from mereo.scenes.registry import load_scene
-        from mereo.visualization.previews import preview_scene
-        from mereo.visualization.scene_previews import preview_all
+        from mereo.visualization.previews import preview_all, preview_scene
 
         if self.all == bool(self.scene):
             given = f"both {self.scene!r} and --all are" if self.all else "neither a scene nor --all is"
@@ -104,6 +110,7 @@ class SceneExport:
     output: Path
 
     def run(self) -> None:
+        """Write the mesh file of the segments at rest."""
         import numpy as np
 
         from mereo.io.writers.glb import write_segments_glb

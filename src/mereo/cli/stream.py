@@ -62,7 +62,7 @@ def stream_reconstructions(
 
 
 def line(outcome: Outcome[Reconstruction]) -> dict[str, Any]:
-    """What is printed of one frame; lengths in the input's unit, times in milliseconds."""
+    """JSON that is printed of one frame; lengths in the input's unit, times in milliseconds."""
     facts: dict[str, Any] = {
         "frame": outcome.name,
         "time_s": outcome.time_s,

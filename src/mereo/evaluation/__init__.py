@@ -1,1 +1,1 @@
-"""The metric of the paper, truth, test sets, and real scans."""
+"""Metrics of the paper (IoU, mIoU), ground truth, test sets, and real scans with their registration."""

@@ -1,4 +1,4 @@
-"""Truth on a grid: what a reconstruction is scored against."""
+"""Ground truth on a grid: what a reconstruction is scored against."""
 
 from dataclasses import dataclass
 
@@ -10,12 +10,12 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
 
 BOX_MARGIN = 0.25
-"""The paper's boxes are enlarged by 50 %: by a quarter of their size on each side."""
+"""Share of its size by which a segment's box is enlarged on each side: by 50 % in all, as in the paper."""
 
 
 @dataclass(frozen=True, eq=False)
 class TruthGrid:
-    """The right answer for an evaluation (paper, appendix B).
+    """Ground truth of an evaluation: true labels on a grid, and which of its cells count (paper, appendix B).
 
     Attributes:
         grid: true labels at the centres of the cells into which the joint box of all segments is divided.
@@ -27,7 +27,7 @@ class TruthGrid:
 
 
 def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:
-    """Divide the joint box of all segments into ``cells`` ** 3 cells and label their centres."""
+    """Ground truth at the centres of ``cells`` ** 3 cells, into which the joint box of all segments is divided."""
     low, high = mesh.bounds
     spacing = (high - low) / cells
     origin = low + spacing / 2

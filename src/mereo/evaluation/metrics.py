@@ -1,6 +1,7 @@
-"""The paper's metrics (appendix B): IoU and mIoU from one confusion matrix over a whole test set."""
+"""Metrics of the paper (appendix B): IoU and mIoU from one confusion matrix over a whole test set."""
 
 from dataclasses import dataclass
+from math import isnan
 
 import numpy as np
 from jaxtyping import Float, Int, Integer
@@ -30,9 +31,12 @@ def confusion_matrix(
 
 
 def intersection_over_union(confusion: Int[np.ndarray, "c c"], segmented: bool = True) -> Scores:
-    """``TP / (TP + FP + FN)``; class 0 is empty space, whose false positives count against the segments.
+    """Intersections over union, ``TP / (TP + FP + FN)``, from a confusion matrix.
 
-    Not ``segmented`` means that class 1 is the whole object: then there is no mIoU, as for the paper's L1 loss.
+    Args:
+        confusion: counts of points by true (row) and predicted (column) class; 0 is empty space, whose false positives
+            count against the segments.
+        segmented: False means that class 1 is the whole object; then there is no mIoU, as for the paper's L1 loss.
     """
     with np.errstate(invalid="ignore"):
         hit = np.diag(confusion)[1:].astype(float)
@@ -43,3 +47,8 @@ def intersection_over_union(confusion: Int[np.ndarray, "c c"], segmented: bool =
     present = per_segment[~np.isnan(per_segment)]
     miou = float(present.mean()) if segmented and len(present) else float("nan")
     return Scores(float(iou), miou, per_segment)
+
+
+def format_score(score: float | None, missing: str = "-") -> str:
+    """Score with three decimals as a table shows it, or ``missing`` where it is undefined (NaN, or JSON's null)."""
+    return missing if score is None or isnan(score) else f"{score:.3f}"

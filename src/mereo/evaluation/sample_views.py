@@ -1,6 +1,6 @@
-"""Truth on a grid, and test frames: a depth image with the truth behind it, in one small file.
+"""Sample views: a depth image with the truth behind it, in one small file, to try a model on.
 
-Two frames, rendered from test seeds, come with the package, so that a fresh clone can be tried without any download.
+A few views, rendered from test seeds, come with the package, so that a fresh clone can be tried without any download.
 """
 
 from dataclasses import dataclass
@@ -22,17 +22,18 @@ SHIPPED = Path(__file__).parents[1] / "frames"
 
 
 DEPTH_STEP = 0.005
-"""Depth is stored as whole multiples of this many scene units, a twentieth of the sensor's noise."""
+"""Step of the stored depth in scene units, a twentieth of the sensor's noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class SampleView:
-    """One view with its truth.
+    """One rendered view of a scene with its truth.
 
     Attributes:
-        scene, seed: where it comes from: example 0 of this test seed.
+        scene: name of the scene.
+        seed: test seed of which it is example 0.
         depth: the noisy depth image, scene units.
-        truth: in the camera frame.
+        truth: true labels on a grid, in the camera frame.
     """
 
     scene: str
@@ -41,60 +42,66 @@ class SampleView:
     truth: TruthGrid
 
 
-def make_frame(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> SampleView:
-    """Example 0 of a test seed, its depth rounded as ``save_frame`` stores it."""
+def make_view(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> SampleView:
+    """Example 0 of a test seed as a sample view, its depth rounded as ``save_view`` stores it.
+
+    Raises ``ValueError`` where the depth is too large for the file.
+    """
     view = sample_view(load_scene(scene).for_seed(seed), GenerateConfig(), example_rng(seed, 0))
     rounded = np.rint(view.depth.depth / DEPTH_STEP)
     if rounded.max() > 65535:
         raise ValueError(
-            f"scene {scene!r} is {view.depth.depth.max():.4g} units away; a frame stores up to {65535 * DEPTH_STEP:g}: "
-            "move its camera workspace closer"
+            f"scene {scene!r} is {view.depth.depth.max():.4g} units away; a sample view stores up to "
+            f"{65535 * DEPTH_STEP:g}: move its camera workspace closer"
         )
     return SampleView(scene, seed, DepthImage(rounded * DEPTH_STEP, view.depth.camera), truth_grid(view.mesh, cells))
 
 
-def save_frame(path: str | Path, frame: SampleView) -> None:
-    """Write a compressed .npz (about 50 kB): 16-bit depth, intrinsics, true labels."""
-    camera, grid = frame.depth.camera, frame.truth.grid
+def save_view(path: str | Path, view: SampleView) -> None:
+    """Write a sample view as a compressed .npz (about 50 kB): 16-bit depth, intrinsics, true labels."""
+    camera, grid = view.depth.camera, view.truth.grid
     with atomic_file(path) as partial:
         np.savez_compressed(
             partial,
-            scene=np.array(frame.scene),
-            seed=np.array(frame.seed),
-            depth=np.rint(frame.depth.depth / DEPTH_STEP).astype(np.uint16),
+            scene=np.array(view.scene),
+            seed=np.array(view.seed),
+            depth=np.rint(view.depth.depth / DEPTH_STEP).astype(np.uint16),
             depth_step=np.array(DEPTH_STEP),
             intrinsics=np.array(
                 [camera.focal_x_px, camera.focal_y_px, camera.center_x_px, camera.center_y_px], dtype=np.float64
             ),
             labels=grid.labels,
-            kept=frame.truth.kept,
+            kept=view.truth.kept,
             origin=grid.origin,
             spacing=grid.spacing,
             names=np.asarray(grid.names),
         )
 
 
-def shipped_frames() -> tuple[str, ...]:
-    """Names that ``load_frame`` knows without a path."""
+def shipped_views() -> tuple[str, ...]:
+    """Names of the views that come with the package, which ``load_view`` knows without a path."""
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.npz")))
 
 
-def load_frame(name: str | Path) -> SampleView:
-    """A shipped frame by name, or a file. Raises ``FileNotFoundError`` or ``ValueError``."""
+def load_view(name: str | Path) -> SampleView:
+    """Sample view that is shipped under a name, or read from a file.
+
+    Raises ``FileNotFoundError`` where there is none, ``ValueError`` for a file that is something else.
+    """
     shipped = SHIPPED / f"{name}.npz"
     path = shipped if shipped.is_file() else Path(name)
     if not path.is_file():
-        known = ", ".join(shipped_frames()) or "none"
-        raise FileNotFoundError(f"there is no frame {str(name)!r}; give a .npz file or a shipped name: {known}")
+        known = ", ".join(shipped_views()) or "none"
+        raise FileNotFoundError(f"there is no sample view {str(name)!r}; give a .npz file or a shipped name: {known}")
     try:
         # opened here because numpy leaves a damaged file open
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            return _frame({key: file[key] for key in file.files})
+            return _view_of({key: file[key] for key in file.files})
     except (KeyError, ValueError, OSError, EOFError, BadZipFile) as error:
-        raise ValueError(f"{path} is not a frame of mereo ({error}); write it with `save_frame`") from None
+        raise ValueError(f"{path} is not a sample view of mereo ({error}); write it with `save_view`") from None
 
 
-def _frame(stored: dict[str, np.ndarray]) -> SampleView:
+def _view_of(stored: dict[str, np.ndarray]) -> SampleView:
     height, width = stored["depth"].shape
     camera = Camera(width, height, *(float(value) for value in stored["intrinsics"]))
     names = tuple(str(name) for name in stored["names"])

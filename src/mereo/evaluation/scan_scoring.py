@@ -11,15 +11,15 @@ from mereo.models.model import Model
 
 
 def evaluate_scans(model: Model, *, truths: Sequence[str | Path] = (), cells: int = CELLS) -> Evaluation:
-    """Scores on real scans.
+    """Scores of a model on real scans.
 
     Args:
         model: the trained model.
         truths: truth files, or their folders, of ``mereo align``; none means the four scans of the bunny.
-        cells: of the grid along each axis.
+        cells: cells of the grid along each axis.
 
     Raises ``ValueError`` for another object's model or two scans of one name, ``FileNotFoundError`` for a missing file,
-    and ``assets.AssetUnavailable`` where a scan of the bunny cannot be had.
+    and ``AssetUnavailable`` where a scan of the bunny cannot be had.
     """
     scans = [read_truth(path) for path in truths] if truths else [bunny_posed(name) for name in SCANS]
     names = [scan.name for scan in scans]

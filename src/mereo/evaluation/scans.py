@@ -58,9 +58,9 @@ SCANS = tuple(BUNNY_SCAN_POSES)
 
 
 def bunny_scan(name: str) -> tuple[PointCloud, Float[np.ndarray, "4 4"]]:
-    """A real scan in its scanner frame, metres, and ``T_model_scan`` into the frame of bunny.off.
+    """Real scan of the bunny in its scanner frame, metres, and ``T_model_scan`` into the frame of bunny.off.
 
-    Raises ``ValueError`` for an unknown name and ``assets.AssetUnavailable`` where the scan cannot be had.
+    Raises ``ValueError`` for an unknown name and ``AssetUnavailable`` where the scan cannot be had.
     """
     if name not in SCANS:
         raise ValueError(f"there is no scan {name!r}; it must be one of {', '.join(SCANS)}: check the spelling")
@@ -68,7 +68,7 @@ def bunny_scan(name: str) -> tuple[PointCloud, Float[np.ndarray, "4 4"]]:
 
 
 def bunny_truth(name: str) -> SegmentedMesh:
-    """The scanned bunny's segments in the scanner frame, metres.
+    """Segments of the scanned bunny in the scanner frame, metres.
 
     Accuracy: the scan lies within 0.1 mm (median) of this surface.
     """
@@ -84,13 +84,13 @@ def bunny_truth(name: str) -> SegmentedMesh:
 
 @dataclass(frozen=True, eq=False)
 class PosedScan:
-    """A real scan with its truth.
+    """Real scan with its truth: the object's segments where they are in it.
 
     Attributes:
-        name: for tables.
-        cloud: in the scan's own frame and unit.
+        name: name in tables.
+        cloud: the scan, in its own frame and unit.
         truth: the segments, in the same.
-        frame: the axes of both: "camera" (x right, y down, z forward from the camera at the origin) or "scanner".
+        frame: axes of both: "camera" (x right, y down, z forward from the camera at the origin) or "scanner".
     """
 
     name: str
@@ -99,17 +99,17 @@ class PosedScan:
     frame: CloudAxes
 
     def in_camera(self) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
-        """Cloud and truth in a camera frame, and ``T_camera_scan``."""
+        """Scan and truth in a camera frame, in the scan's unit, and ``T_camera_scan``."""
         T_camera_scan = into_camera(self.cloud.points, self.frame)
         cloud = PointCloud(transform_points(T_camera_scan, self.cloud.points))
         return cloud, self.truth.transformed(T_camera_scan), T_camera_scan
 
 
 def bunny_posed(name: str) -> PosedScan:
-    """A real scan of the bunny with its truth; raises as ``bunny_scan``."""
+    """Real scan of the bunny with its truth; raises as ``bunny_scan`` does."""
     return PosedScan(name, bunny_scan(name)[0], bunny_truth(name), "scanner")
 
 
 def scan_in_camera(name: str) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
-    """A real scan and its truth in a camera frame, metres, and ``T_camera_scan``."""
+    """Real scan of the bunny and its truth in a camera frame, metres, and ``T_camera_scan``."""
     return bunny_posed(name).in_camera()

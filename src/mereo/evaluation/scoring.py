@@ -1,4 +1,4 @@
-"""Scores on test sets (paper, appendix B), and on synthetic views of a scene; for real scans see ``scan_evaluation``.
+"""Scores on test sets (paper, appendix B), and on synthetic views of a scene; for real scans see ``scan_scoring``.
 
 The joint box of all true segments is divided into 100^3 cells; their centres are labelled by the truth and by the
 model, and those outside every segment's enlarged box are dropped. One confusion matrix is summed over the whole set;
@@ -6,7 +6,7 @@ IoU and mIoU come from it, and the mean over single examples is reported beside 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.progress import track
 
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.evaluation.metrics import Scores, confusion_matrix, format_score, intersection_over_union
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
-from mereo.models.model import Model
+from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.registry import SCENES, load_scene
@@ -28,17 +28,25 @@ from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 
-PICTURES = 4
-"""The first few examples are drawn with their errors."""
+KEPT_VIEWS = 4
+"""Number of examples, the first ones, that keep their labels and are drawn with their errors."""
 
+PICTURE_MARGIN = 12
+"""Cells drawn around the truth's box: what a model puts there does not count, but belongs into a picture of it."""
 
 CELLS = 100
-"""The paper's grid along each axis."""
+"""Cells of the paper's grid along each axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class TestCase:
-    """One cloud with its truth, both in the same camera frame."""
+    """Cloud to be reconstructed and the truth to score it by, both in the same camera frame.
+
+    Attributes:
+        name: name in tables, different from other cases' of the set.
+        cloud: what the model is given.
+        truth: true labels on a grid.
+    """
 
     __test__ = False  # not a test, whatever pytest thinks of the name
 
@@ -49,14 +57,16 @@ class TestCase:
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedView:
-    """One row of the paper's figure of reconstructions.
+    """View with its true and its predicted labels: a row of the paper's figure of reconstructions.
 
     Attributes:
-        name: the label at the left.
-        cloud: the input.
-        reference, predicted: labels on the same grid; 0 is empty space.
-        origin, spacing: voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the cloud's frame.
-        colors: of the segments; label k has ``colors[k - 1]``.
+        name: label at the left of the row.
+        cloud: what the model was given.
+        reference: true labels; 0 is empty space.
+        predicted: labels by the model, on the same grid.
+        origin: centre of voxel [0, 0, 0] in the cloud's frame; that of [i, j, k] is ``origin + [i, j, k] * spacing``.
+        spacing: distances of the voxels' centres along each axis.
+        colors: colours of the segments; label k has ``colors[k - 1]``.
     """
 
     name: str
@@ -70,30 +80,30 @@ class EvaluatedView:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Scores of a test set.
+    """Result of a test set: its confusion matrix, from which its scores come, and the scores of each example.
 
     Attributes:
-        names: of the segments.
+        names: names of the segments.
         confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
         examples: scores of each test case by its name.
-        cases: the first few with their labels, for pictures.
+        views: the first few with their labels, for pictures.
         segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
     """
 
     names: tuple[str, ...]
     confusion: Int[np.ndarray, "c c"]
     examples: dict[str, Scores]
-    cases: tuple[EvaluatedView, ...] = field(default=())
+    views: tuple[EvaluatedView, ...] = field(default=())
     segmented: bool = True
 
     @property
     def scores(self) -> Scores:
-        """Over the whole set."""
+        """Scores over the whole set, from its one confusion matrix."""
         return intersection_over_union(self.confusion, self.segmented)
 
     @property
     def example_mean(self) -> tuple[float, float]:
-        """IoU and mIoU averaged over the examples."""
+        """Mean IoU and mean mIoU over the examples; NaN where no example has a mIoU."""
         each = self.examples.values()
         mious = [s.miou for s in each if not np.isnan(s.miou)]
         return float(np.mean([s.iou for s in each])), float(np.mean(mious)) if mious else float("nan")
@@ -102,26 +112,30 @@ class Evaluation:
 # --- one cloud -------------------------------------------------------------------------------------------------------
 
 
-def predict_grid(model: Model, cloud: PointCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
-    """The model's labels on the grid of ``truth``, evaluated coarse to fine."""
-    logits = partial(model.logits, model.encode(cloud))
+def predict_grid(model: Model, seen: PointCloud | EncodedCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
+    """Labels by the model on the grid of ``truth``, evaluated coarse to fine; ``seen`` is a cloud, or its code."""
+    code = seen if isinstance(seen, EncodedCloud) else model.encode(seen)
+    logits = partial(model.logits, code)
     grid = truth.grid
     x, y, z = grid.labels.shape
     return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
 
 
 def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segments: int) -> Int[np.ndarray, "c c"]:
-    """True against predicted labels of the points that count; all ``segments`` are one where the model knows one."""
+    """Confusion matrix of the points that count; where the model knows one segment, all true ones are taken as one."""
     labels = np.minimum(truth.grid.labels[truth.kept], segments)
     return confusion_matrix(labels, predicted[truth.kept], segments + 1)
 
 
-def grid_scores(model: Model, cloud: PointCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
-    """The paper's evaluation of one cloud; ``truth`` is in the cloud's frame and units."""
+def grid_scores(model: Model, seen: PointCloud | EncodedCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
+    """Scores of one cloud, or its code, as in the paper; ``truth`` is in the cloud's frame and units.
+
+    Raises ``ValueError`` where the model knows other segments than the truth has.
+    """
     check_names(model, truth.names)
     grid = truth_grid(truth, cells)
     segments = len(segment_names(model)[0])
-    return intersection_over_union(grid_confusion(grid, predict_grid(model, cloud, grid), segments), model.segmented)
+    return intersection_over_union(grid_confusion(grid, predict_grid(model, seen, grid), segments), model.segmented)
 
 
 def check_names(model: Model, names: Sequence[str]) -> None:
@@ -146,15 +160,15 @@ def evaluate(
     progress: bool = False,
     settings: GenerateConfig | None = None,
 ) -> Evaluation:
-    """Scores on synthetic views of a scene, seen as in training: through a noisy depth image.
+    """Scores of a model on synthetic views of a scene, seen as in training: through a noisy depth image.
 
     Args:
         model: the trained model.
         scene: a scene, its name or its file; by default the built-in one that the model was trained on.
-        examples: how many; example i is made from (seed, i) alone.
-        seed: at least ``config.TEST_SEED_START``: smaller ones are for training.
-        cells: of the grid along each axis.
-        progress: show a bar with the time left.
+        examples: number of views; example i is made from (seed, i) alone.
+        seed: at least ``TEST_SEED_START``: smaller ones are for training.
+        cells: cells of the grid along each axis.
+        progress: whether to show a bar with the time left.
         settings: the camera (image size, noise, sensor); by default the paper's.
 
     Raises ``ValueError`` for a training seed, no examples, or another object than the model's.
@@ -172,7 +186,7 @@ def evaluate(
 
 
 def trained_scene(model: Model) -> str:
-    """The built-in scene in the weights' provenance; raises ``ValueError`` where there is none."""
+    """Name of the built-in scene that a model was trained on; raises ``ValueError`` where its provenance says none."""
     scene = model.provenance.get("scene")
     if not isinstance(scene, str):
         raise ValueError("the weights do not say which scene they were trained on; name it with --scene")
@@ -190,33 +204,49 @@ def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, i
 
 
 def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progress: bool) -> Evaluation:
-    """One confusion matrix over ``case(0) ... case(count - 1)``, which are made one at a time."""
+    """Scores of a model on ``case(0) ... case(count - 1)``, which are made one at a time, as they may be large."""
     names, colors = segment_names(model)
     total = np.zeros((len(names) + 1,) * 2, dtype=np.int64)
     examples: dict[str, Scores] = {}
-    pictures: list[EvaluatedView] = []
-    for one, predicted in _predictions(model, case, count, progress):
+    views: list[EvaluatedView] = []
+    for one, code, predicted in _predictions(model, case, count, progress):
         confusion = grid_confusion(one.truth, predicted, len(names))
         total += confusion
         examples[one.name] = intersection_over_union(confusion, model.segmented)
-        if len(pictures) < PICTURES:
-            pictures.append(_picture_case(one, predicted, colors))
-    return Evaluation(names, total, examples, tuple(pictures), model.segmented)
+        if len(views) < KEPT_VIEWS:
+            views.append(_evaluated_view(one, model, code, colors))
+    return Evaluation(names, total, examples, tuple(views), model.segmented)
+
+
+def _evaluated_view(one: TestCase, model: Model, code: EncodedCloud, colors: Sequence[Color]) -> EvaluatedView:
+    """Truth and prediction on the truth's grid and ``PICTURE_MARGIN`` cells around it."""
+    wide = _widened(one.truth)
+    reference = np.minimum(wide.grid.labels, np.uint8(len(colors)))
+    predicted = predict_grid(model, code, wide)
+    return EvaluatedView(one.name, one.cloud, reference, predicted, wide.grid.origin, wide.grid.spacing, colors)
+
+
+def _widened(truth: TruthGrid) -> TruthGrid:
+    """The same cells and ``PICTURE_MARGIN`` more on each side, which are empty, since the box holds every segment."""
+    grid = truth.grid
+    labels, kept = (np.pad(values, PICTURE_MARGIN) for values in (grid.labels, truth.kept))
+    return TruthGrid(replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing), kept)
 
 
 def _predictions(
     model: Model, case: Callable[[int], TestCase], count: int, progress: bool
-) -> Iterator[tuple[TestCase, UInt8[np.ndarray, "x y z"]]]:
+) -> Iterator[tuple[TestCase, EncodedCloud, UInt8[np.ndarray, "x y z"]]]:
     for index in track(range(count), "evaluating", console=Console(stderr=True), disable=not progress):
         one = case(index)
-        yield one, predict_grid(model, one.cloud, one.truth)
+        code = model.encode(one.cloud)
+        yield one, code, predict_grid(model, code, one.truth)
 
 
 # --- results ---------------------------------------------------------------------------------------------------------
 
 
 def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
-    """What ``metrics.json`` holds."""
+    """Content of ``metrics.json``: ``facts`` first, then definition, scores and confusion matrix."""
     scores, (iou, miou) = evaluation.scores, evaluation.example_mean
     return {
         **facts,
@@ -233,26 +263,14 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def markdown_table(evaluation: Evaluation) -> str:
-    """The whole set and the mean over its examples; a dash where a score is undefined."""
+    """Markdown table of the whole set and the mean over its examples; a dash where a score is undefined."""
     scores, (iou, miou) = evaluation.scores, evaluation.example_mean
     names = " | ".join(evaluation.names)
-    values = " | ".join(_rounded(value) for value in scores.per_segment)
+    values = " | ".join(format_score(value) for value in scores.per_segment)
     blank = " | ".join("" for _ in evaluation.names)
     return (
         f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
         f"|---|---|---|{'---|' * len(evaluation.names)}\n"
-        f"| whole set | {_rounded(scores.iou)} | {_rounded(scores.miou)} | {values} |\n"
-        f"| mean over examples | {_rounded(iou)} | {_rounded(miou)} | {blank} |\n"
+        f"| whole set | {format_score(scores.iou)} | {format_score(scores.miou)} | {values} |\n"
+        f"| mean over examples | {format_score(iou)} | {format_score(miou)} | {blank} |\n"
     )
-
-
-def _rounded(score: float) -> str:
-    return "-" if np.isnan(score) else f"{score:.3f}"
-
-
-def _picture_case(one: TestCase, predicted: UInt8[np.ndarray, "x y z"], colors: Sequence[Color]) -> EvaluatedView:
-    """Only points that count are shown."""
-    grid = one.truth.grid
-    reference = np.minimum(grid.labels, np.uint8(len(colors)))
-    shown = np.where(one.truth.kept, predicted, np.uint8(0))
-    return EvaluatedView(one.name, one.cloud, reference, shown, grid.origin, grid.spacing, colors)

@@ -1,1 +1,1 @@
-"""The paper's experiments, and speed against roofline and baseline."""
+"""Experiments: the paper's tables and figures, and the speed of each stage against roofline and baseline."""

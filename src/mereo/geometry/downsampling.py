@@ -1,7 +1,7 @@
-"""Clouds of millions of points, thinned evenly in space."""
+"""Fewer points of a cloud: at random, or evenly in space."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from scipy.spatial import cKDTree
 
 MAX_POINTS = 50_000
@@ -9,6 +9,13 @@ MAX_POINTS = 50_000
 
 SPACING_SAMPLE = 1000
 """Points whose nearest neighbour is looked up for the spacing; its median is then good to a few percent."""
+
+
+def random_subset(rows: Shaped[np.ndarray, "n *r"], limit: int) -> Shaped[np.ndarray, "m *r"]:
+    """At most ``limit`` of the rows, drawn at random but always the same; all, in their order, where they are few."""
+    if len(rows) <= limit:
+        return rows
+    return rows[np.random.default_rng(0).choice(len(rows), limit, replace=False)]
 
 
 def thin_to_grid(points: Float[np.ndarray, "n 3"], limit: int) -> Int[np.ndarray, " m"]:

@@ -46,3 +46,20 @@ def look_at(
     y = np.cross(z, x)
     cosine, sine = np.cos(roll_rad), np.sin(roll_rad)
     return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)
+
+
+def fit_rigid(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
+) -> Float[np.ndarray, "4 4"]:
+    """``T_target_source`` that brings ``source`` nearest to ``target`` in least squares (Kabsch, 1976), never mirrored.
+
+    Args:
+        source: points, any unit; where they lie on a line, any turn about it is as good, and one is taken.
+        target: where each of them should go.
+        weights: of the squared distances, not negative and not all 0; by default all count alike.
+    """
+    middle, aim = (np.average(points, axis=0, weights=weights) for points in (source, target))
+    offsets = target - aim if weights is None else weights[:, None] * (target - aim)
+    u, _, v = np.linalg.svd(offsets.T @ (source - middle))
+    rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    return rigid(rotation, aim - rotation @ middle)

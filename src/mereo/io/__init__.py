@@ -1,1 +1,1 @@
-"""Every file format, in and out."""
+"""File formats of every kind, in and out."""

@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from mereo.geometry.camera import Camera
-
 
 @contextmanager
 def atomic_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
@@ -83,7 +81,7 @@ def _swap_directory(partial: Path, path: Path) -> None:
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """A fresh sibling name with the suffix of ``path``; on any exception, Ctrl-C included, what is there is removed."""
+    """Yield a fresh sibling name with the suffix of ``path``; on any exception (Ctrl-C too) remove what is there."""
     partial = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.partial{path.suffix}")
     made: list[Path] = []
     try:
@@ -103,7 +101,7 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 
 def _make_parents(directory: Path) -> list[Path]:
-    """Make ``directory``; returns the directories that were missing, the deepest first."""
+    """Make ``directory``; the directories that were missing are returned, the deepest first."""
     missing = [place for place in (directory, *directory.parents) if not place.exists()]
     directory.mkdir(parents=True, exist_ok=True)
     return missing
@@ -119,36 +117,56 @@ def _remove(partial: Path, made: list[Path]) -> None:
             directory.rmdir()
 
 
+def claim_directory(directory: Path, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
+    """Settings that a directory of earlier work holds, or None where it was made with ``settings`` just now.
+
+    Hidden files do not count: a process that was killed while writing leaves them.
+
+    Args:
+        directory: where work is done that may be stopped and continued; made when it is missing.
+        name: of the JSON file in it that says what the work is.
+        settings: what that file says of a new directory.
+        kind: of the directory, for messages: "a dataset".
+
+    Raises:
+        FileExistsError: it is a file, or holds something but no such file.
+        ValueError: its file holds no settings.
+    """
+    path = directory / name
+    if directory.exists() and not directory.is_dir():
+        raise FileExistsError(f"{directory} is a file; {kind} is a directory: choose another --output")
+    if path.is_file():
+        return _read_settings(path)
+    if directory.is_dir() and any(not file.name.startswith(".") for file in directory.iterdir()):
+        raise FileExistsError(f"{directory} is not empty and holds no {name}; choose another --output")
+    write_json(path, settings)
+    return None
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} holds no settings; what it belongs to cannot be continued: choose another --output")
+    return found
+
+
 def write_json(path: str | Path, value: Any) -> None:
-    """Indented JSON; arrays become lists, NaN and infinity null (JSON has neither)."""
+    """Write ``to_json`` of a value, indented, whole or not at all."""
     with atomic_file(path) as partial:
-        partial.write_text(json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n", "utf-8")
+        partial.write_text(json.dumps(to_json(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n", "utf-8")
 
 
-def _plain(value: Any) -> Any:
-    """Numpy and path values as what JSON knows."""
+def to_json(value: Any) -> Any:
+    """Value in terms that JSON knows: arrays become lists, paths text, NaN and infinity null (JSON has neither)."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): to_json(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return to_json(value.tolist())
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [to_json(item) for item in value]
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
-
-
-def write_camera(path: str | Path, camera: Camera) -> None:
-    """Intrinsics that ``mereo.io.readers.read_camera`` reads back exactly; pixel centres are stated to be at 0.5."""
-    write_json(
-        path,
-        {
-            "width": camera.width,
-            "height": camera.height,
-            "fx": camera.focal_x_px,
-            "fy": camera.focal_y_px,
-            "cx": camera.center_x_px,
-            "cy": camera.center_y_px,
-            "pixel_center": 0.5,
-        },
-    )

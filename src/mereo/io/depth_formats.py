@@ -1,7 +1,7 @@
 """Parsers of depth image formats: PNG, TIFF, EXR and numpy arrays.
 
-Each returns the values as stored, integers or floats, or raises any exception whose text completes "cannot be read as
-a depth image (...)"; ``mereo.io.readers`` turns it into the sentence a user sees. Integers need a depth scale,
+Each parser returns the values as stored, integers or floats, or raises any exception whose text completes "cannot be
+read as a depth image (...)"; ``read_raw_depth`` turns it into the sentence a user sees. Integers need a depth scale,
 floats are metres.
 """
 
@@ -13,28 +13,32 @@ import numpy as np
 from jaxtyping import Float, Real
 from PIL import Image
 
+from mereo.io.errors import readable
+
 MILLIMETRES, METRES = 1000.0, 1.0
-"""Depth scales of integers and of floats where nothing else is said."""
+"""Depth scales of integer and of floating images where nothing else is said, in units per metre."""
 
 NOTHING_M = 1e9
-"""Renderers store 1e10 where a ray met nothing."""
+"""Depth from which on nothing was measured: renderers store 1e10 where a ray met nothing."""
 
 NARROWEST = 16
-"""Columns of an array that is an image; with fewer it is a list of points, or of points with something else."""
+"""Least number of columns of an image; with fewer an array is a list of points, or of points with something else."""
 
 EXR_CHANNELS = ("z", "v", "y", "r", "depth", "distance")
 """Last parts of the names that a depth channel goes by; v is Blender's, r that of an image saved as grey colour."""
 
 Raw = Real[np.ndarray, "h w"]
+"""Values of a depth image as they are stored."""
 
 
 def read_raw_depth(path: Path) -> Raw:
-    """The values of a file that ``is_depth_image``."""
-    return DEPTH_READERS[path.suffix.lower()](path)
+    """Values of a file that ``is_depth_image``, as stored. Raises ``FileNotFoundError`` or ``ValueError``."""
+    with readable(path, "depth image"):
+        return DEPTH_READERS[path.suffix.lower()](path)
 
 
 def is_depth_image(path: Path) -> bool:
-    """Whether this is read as a depth image and not as a point cloud: by suffix, and NPY files by their shape."""
+    """Whether a file is read as a depth image and not as a point cloud: by suffix, and NPY files by their shape."""
     if path.suffix.lower() != ".npy":
         return path.suffix.lower() in DEPTH_READERS
     try:
@@ -45,7 +49,7 @@ def is_depth_image(path: Path) -> bool:
 
 
 def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:
-    """Depth in metres, 0 where nothing was measured.
+    """Depth in metres from stored values, 0 where nothing was measured.
 
     In floats NaN and infinity say so (ROS REP 118), and values from ``NOTHING_M`` up.
 
@@ -120,3 +124,4 @@ DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
     ".exr": _exr,
     ".npy": _npy,
 }
+"""Parser of each suffix."""

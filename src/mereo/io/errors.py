@@ -7,7 +7,14 @@ from pathlib import Path
 
 @contextmanager
 def readable(path: Path, kind: str) -> Iterator[None]:
-    """Refuse missing and empty files, and turn a library's exception into one sentence."""
+    """Refuse missing and empty files, and turn what a library raises in the block into one sentence.
+
+    Args:
+        path: the file that is read.
+        kind: what it should be, for the sentence: "point cloud".
+
+    Raises ``FileNotFoundError`` or ``ValueError``; ``MemoryError`` and ``ImportError`` pass as they are.
+    """
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a {kind} is needed: check the path")
     if path.is_dir():

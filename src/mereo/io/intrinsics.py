@@ -26,19 +26,22 @@ from mereo.geometry.camera import Camera
 from mereo.io.errors import readable
 
 NAMED = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
-"""Focal lengths and principal point: plain, RealSense, nerfstudio."""
+"""Names of focal lengths and principal point: plain, RealSense, nerfstudio."""
 
 MATRICES = ("intrinsic_matrix", "K", "k", "cam_K", "camera_matrix")
-"""3 x 3, or 9 numbers row by row: ROS 1, ROS 2, BOP, ROS's calibrator; Open3D's first one is column by column."""
+"""Names of camera matrices, 3 x 3 or 9 numbers row by row; the first is Open3D's, column by column.
+
+The others are of ROS 1, ROS 2, BOP and ROS's calibrator."""
 
 NESTED = ("intrinsic", "intrinsics", "depth_intrinsics")
-"""Where files that hold more than intrinsics keep them."""
+"""Names of the blocks in which files that hold more keep intrinsics."""
 
 Fields = dict[str, Any]
+"""Names and values of a file of intrinsics."""
 
 
 class CameraWarning(UserWarning):
-    """Something about a camera is not used; what is measured with it may be off."""
+    """Warning that something about a camera is not used, so that what is measured with it may be off."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Intrinsics:
 
 
 def read_camera(path: str | Path, size: tuple[int, int] | None = None) -> Camera:
-    """The pinhole of ``read_intrinsics``."""
+    """Pinhole camera from a JSON or ROS YAML file, see ``read_intrinsics``."""
     return read_intrinsics(path, size).camera
 
 
@@ -92,7 +95,14 @@ def read_intrinsics(
 
 
 def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> Camera:
-    """The pinhole of these fields; ``ValueError`` says which are missing."""
+    """Pinhole camera that these fields of a file state.
+
+    Args:
+        fields: names and values, see ``read_intrinsics``.
+        size: (width, height) in pixels where the fields do not say.
+
+    Raises ``ValueError`` that says which fields are missing.
+    """
     focal_x, focal_y, center_x, center_y = _pinhole(fields)
     width, height = _image_size(fields, size)
     shift = 0.5 - float(fields.get("pixel_center", 0.5 if "fl_x" in fields else 0.0))
@@ -100,7 +110,7 @@ def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> C
 
 
 def _yaml(text: str) -> object:
-    """The first document; OpenCV's header and type tags are not YAML to others."""
+    """First document of a YAML file; OpenCV's header and type tags are not YAML to others."""
     plain = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
     return next(iter(yaml.safe_load_all(plain.removeprefix("\n---"))), None)
 
@@ -109,7 +119,7 @@ def _yaml(text: str) -> object:
 
 
 def _frame(fields: Fields, stem: str | None, index: int | None) -> Fields:
-    """The fields of one frame; ``fields`` itself where it describes one camera."""
+    """Fields of one frame; ``fields`` itself where it describes one camera."""
     if _states_a_camera(fields):
         return fields
     frames = fields.get("frames")
@@ -199,7 +209,7 @@ def _depth_scale(fields: Fields) -> float | None:
 
 
 def warn_of_distortion(camera: Camera, fields: Fields, source: str) -> None:
-    """One ``CameraWarning`` where coefficients are not zero: the image is taken as rectified."""
+    """Warn with one ``CameraWarning`` where coefficients are not zero: the image is taken as rectified."""
     coefficients, model = _coefficients(fields)
     if not coefficients.any():
         return
@@ -214,7 +224,7 @@ def warn_of_distortion(camera: Camera, fields: Fields, source: str) -> None:
 
 
 def _coefficients(fields: Fields) -> tuple[Float[np.ndarray, " n"], str]:
-    """k1, k2, p1, p2, k3 ... as OpenCV orders them, and the model's name."""
+    """Distortion coefficients k1, k2, p1, p2, k3 ... as OpenCV orders them, and the model's name."""
     model = str(fields.get("distortion_model", fields.get("camera_model", fields.get("model", ""))))
     for key in ("D", "d", "distortion_coefficients", "coeffs", "distortion"):
         values = fields.get(key)
@@ -226,7 +236,7 @@ def _coefficients(fields: Fields) -> tuple[Float[np.ndarray, " n"], str]:
 
 
 def _shift_px(camera: Camera, coefficients: Float[np.ndarray, " n"]) -> float:
-    """How far the lens moves the farthest corner (OpenCV's Brown-Conrady or rational model)."""
+    """Pixels by which the lens moves the farthest corner (OpenCV's Brown-Conrady or rational model)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients[:8], (0, 8 - len(coefficients[:8])))
     u, v = np.array([0, camera.width] * 2), np.array([0, 0, camera.height, camera.height])
     x, y = (u - camera.center_x_px) / camera.focal_x_px, (v - camera.center_y_px) / camera.focal_y_px

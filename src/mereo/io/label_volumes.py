@@ -28,11 +28,11 @@ MARGIN = 4
 """Empty cells around the object: a segment at the border of the volume is closed there."""
 
 LEAST_VOLUME = 0.6
-"""A segment that keeps less of its volume than this is too thin for the grid."""
+"""Share of its volume that a segment keeps at least; what keeps less is too thin for the grid."""
 
 
 LEAST_MARGIN = 1e-3
-"""A tie between two segments at a node would make faces without area there."""
+"""Least distance of a margin from zero: a tie between two segments at a node would make faces without area there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +51,12 @@ class LabelVolume:
 
 
 def is_volume(path: Path) -> bool:
-    """Whether the name is that of a label volume."""
+    """Whether a file's name is that of a label volume."""
     return path.name.lower().endswith(VOLUME_SUFFIXES)
 
 
 def read_label_volume(path: Path) -> LabelVolume:
-    """A NIfTI or NRRD file of whole numbers.
+    """Label volume from a NIfTI or NRRD file of whole numbers.
 
     Raises ``FileNotFoundError``, ``ValueError`` for anything but three dimensions of whole numbers from 0 up, and
     ``ImportError`` without the extra `medical`.
@@ -104,7 +104,7 @@ def _nrrd(nrrd: Any, path: Path) -> Content:
 
 
 def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:
-    """From an anatomical frame, for example left-posterior-superior or LPS; others are taken as they are."""
+    """Transform to RAS from an anatomical frame, such as left-posterior-superior or LPS; others stay as they are."""
     words = space.lower().split("-") if "-" in space else list(space.lower())
     words = [{"l": "left", "r": "right", "p": "posterior", "a": "anterior", "i": "inferior"}.get(w, w) for w in words]
     negative = [word in ("left", "posterior", "inferior") for word in words[:3]]
@@ -123,7 +123,7 @@ def _slicer_names(header: Mapping[str, Any]) -> dict[int, str]:
 
 
 def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) -> SegmentedMesh:
-    """A closed surface for each name, smoothed, in the volume's world coordinates.
+    """Closed surface of each named label, smoothed, in the volume's world coordinates.
 
     Labels become shares of the cells of a coarser grid, each smoothed by a Gaussian. The object is where they add up to
     more than a half, and in it a segment is where its share is the largest: marching cubes gives neighbours the same
@@ -182,7 +182,7 @@ class _Grid:
 
     @classmethod
     def around(cls, mask: Bool[np.ndarray, "x y z"], transform: Float[np.ndarray, "4 4"], cells: int) -> "_Grid":
-        """Over all that is set, with about ``cells`` along the longest side; a cell is a whole number of voxels."""
+        """Grid over all that is set, with about ``cells`` along the longest side; cells are whole numbers of voxels."""
         sides = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
         first, end = np.array([side[0] for side in sides]), np.array([side[-1] + 1 for side in sides])
         voxel = np.linalg.norm(transform[:3, :3], axis=0)
@@ -191,7 +191,7 @@ class _Grid:
         return cls(first, -(-(end - first) // block), block, transform)
 
     def share(self, mask: Bool[np.ndarray, "x y z"]) -> Float32[np.ndarray, "a b c"]:
-        """What part of each cell is set, smoothed, with ``MARGIN`` empty cells around."""
+        """Share of each cell that is set, smoothed, with ``MARGIN`` empty cells around."""
         end = np.minimum(self.first + self.counts * self.block, mask.shape)
         part = mask[tuple(slice(a, b) for a, b in zip(self.first, end, strict=True))]
         part = np.pad(part, [(0, int(n)) for n in self.counts * self.block - part.shape])
@@ -204,7 +204,7 @@ class _Grid:
         return smooth
 
     def surface(self, margin: Float32[np.ndarray, "a b c"], name: str, number: int) -> Segment | None:
-        """Where ``margin`` is 0, outward oriented, in world coordinates; None where it is nowhere positive."""
+        """Surface where ``margin`` is 0, outward oriented, in world coordinates; None where it is nowhere positive."""
         if margin.max() <= 0:
             return None
         vertices, faces, _, _ = marching_cubes(margin, 0.0, gradient_direction="ascent")

@@ -15,10 +15,11 @@ VIEWER_ROOT = "camera_frame"
 """Name of the root node of our own GLB files; below it, vertices are in the input's camera frame."""
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf")
+"""Suffixes of mesh files that are read."""
 
 
 def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
-    """The segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order.
+    """Segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order.
 
     A file with several named parts (GLB nodes, OBJ objects or groups, 3MF objects) gives one segment each; a file with
     one part gives one segment called after its GLB node, or else after the file. A directory stands for the mesh files
@@ -51,7 +52,7 @@ def _mesh_files(path: Path) -> list[Path]:
 
 
 Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
-"""Name, colour if known, vertices, faces."""
+"""Part of a mesh file: name, colour if known, vertices, faces."""
 
 
 def _parts(path: Path) -> list[Part]:
@@ -68,7 +69,7 @@ def _parts(path: Path) -> list[Part]:
 
 
 def _obj_parts(path: Path) -> list[Part]:
-    """Own parser, because trimesh gives the parts of an OBJ file in no stable order. Polygons become fans."""
+    """Parts of an OBJ file, by an own parser because trimesh gives them in no stable order. Polygons become fans."""
     positions: list[list[float]] = []
     faces: list[list[int]] = []
     owners: list[tuple[str, str]] = []
@@ -87,7 +88,7 @@ def _obj_parts(path: Path) -> list[Part]:
 
 
 def _obj_index(cell: str, count: int) -> int:
-    """``vertex/texture/normal`` counted from 1, or from the end when negative."""
+    """Index of a vertex from ``vertex/texture/normal``, counted from 1, or from the end when negative."""
     index = int(cell.split("/")[0])
     index = index - 1 if index > 0 else count + index
     if not 0 <= index < count:
@@ -98,7 +99,7 @@ def _obj_index(cell: str, count: int) -> int:
 def _split_parts(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], owners: list[tuple[str, str]], stem: str
 ) -> list[Part]:
-    """One part per object, or per group where there is only one object; unused vertices are left out."""
+    """Parts of a file: one per object, or per group where there is only one object; unused vertices are left out."""
     level = 0 if len({key[0] for key in owners}) > 1 else 1
     labels = [key[level] or key[0] for key in owners]
     names = list(dict.fromkeys(labels))
@@ -139,7 +140,7 @@ def _part(scene: Any, node: str, stem: str) -> Part:
 
 
 def _color(geometry: Any) -> Color | None:
-    """The exact colour of our own files, else a material's or uniform vertex colour, else none."""
+    """Colour of a part: the exact one of our own files, else a material's or uniform vertex colour, else none."""
     own = geometry.metadata.get("color")
     if own is not None:
         return int(own[0]), int(own[1]), int(own[2])

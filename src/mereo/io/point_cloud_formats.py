@@ -1,7 +1,7 @@
 """Parsers of point-cloud formats: PLY, PCD, text, numpy arrays and ZDF.
 
-Each returns [n, 3] positions, NaN rows included, or raises any exception whose text completes "cannot be read as a
-point cloud (...)"; ``mereo.io.readers`` turns it into the sentence a user sees.
+Each parser returns [n, 3] positions, NaN rows included, or raises any exception whose text completes "cannot be read
+as a point cloud (...)"; ``mereo.io.readers`` turns it into the sentence a user sees.
 """
 
 import re
@@ -32,10 +32,11 @@ PLY_TYPES = {
     "double": "f8",
     "float64": "f8",
 }
+"""Numpy type of each of PLY's."""
 
 
 def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """The vertices only: faces and scanner grids, which may be larger, are not read."""
+    """Vertices of a PLY file only: faces and scanner grids, which may be larger, are not read."""
     content = path.read_bytes()
     order, elements, start = _ply_header(content)
     count = next((count for name, count, _ in elements if name == "vertex"), 0)
@@ -57,7 +58,7 @@ def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 
 def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str]]]], int]:
-    """The format, each element's name, count and properties (type and name), and where the data starts."""
+    """Header of a PLY file: format, name, count and properties (type and name) of each element, start of the data."""
     match = re.search(rb"^end_header[ \t]*\r?\n?", content[:65536], re.MULTILINE)
     if not content.startswith(b"ply") or match is None:
         raise ValueError("it has no PLY header")
@@ -73,7 +74,7 @@ def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str
 
 
 def _ply_by_trimesh(path: Path, count: int) -> Float[np.ndarray, "n 3"]:
-    """Unusual files, where something stands before the vertices."""
+    """Vertices of unusual PLY files, where something stands before the vertices."""
     loaded: Any = trimesh.load(path, file_type="ply", process=False)
     # trimesh returns the rows it finds; a file cut short is only noticed by counting them
     _expect(len(loaded.vertices), count)
@@ -81,7 +82,7 @@ def _ply_by_trimesh(path: Path, count: int) -> Float[np.ndarray, "n 3"]:
 
 
 def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Comment lines (# or //) anywhere and other lines before the first row of numbers are skipped."""
+    """Rows of a text file; comment lines (# or //) and others before the first row of numbers are skipped."""
     lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
     first = next((i for i, line in enumerate(lines[:100]) if _is_row(line)), None)
     if first is None:
@@ -136,7 +137,7 @@ def _check_array(array: np.ndarray) -> Float[np.ndarray, "n 3"]:
 
 
 def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """ascii, binary and binary_compressed; organized clouds come row by row, with their NaN rows."""
+    """Points of a PCD file: ascii, binary, binary_compressed; organized clouds come row by row, with their NaN rows."""
     header, body = _pcd_header(path.read_bytes())
     count, row = int(header["POINTS"][0]), _pcd_row(header)
     if not {"x", "y", "z"} <= set(row.names or ()):
@@ -187,7 +188,7 @@ def _pcd_ascii(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3
 
 
 def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3"]:
-    """Two sizes, then LZF data with all values of one field together (a structure of arrays)."""
+    """Points of a compressed body: two sizes, then LZF data with all values of one field together."""
     if len(body) < 8:
         raise ValueError("it is truncated after its header")
     packed, unpacked = (int(size) for size in np.frombuffer(body, "<u4", 2))
@@ -203,7 +204,7 @@ def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray,
 
 
 def _lzf_decompress(data: bytes, size: int) -> bytes:
-    """Marc Lehmann's LZF: runs of literals, or copies of ``length`` bytes from ``offset`` back in the output."""
+    """Decompress Marc Lehmann's LZF: runs of literals, or copies of ``length`` bytes from ``offset`` back."""
     output, at = bytearray(), 0
     while at < len(data):
         control, at = data[at], at + 1
@@ -228,7 +229,7 @@ def _lzf_decompress(data: bytes, size: int) -> bytes:
 
 
 def _zdf_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Organized, millimetres, NaN where nothing was measured."""
+    """Points of a ZDF file: organized, millimetres, NaN where nothing was measured."""
     if find_spec("netCDF4") is None:
         raise ImportError(f"{path} needs netCDF4, which is not installed: pip install 'mereo[sensors]'")
     import netCDF4
@@ -250,3 +251,4 @@ CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n 3"]]] = {
     **dict.fromkeys((".npy", ".npz"), _array_points),
     ".zdf": _zdf_points,
 }
+"""Parser of each suffix."""

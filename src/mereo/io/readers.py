@@ -1,4 +1,4 @@
-"""Readers: point clouds, depth images, masks, intrinsics and segmented meshes from files.
+"""Readers of point clouds, depth images and masks; ``mereo.io.sensor_frame`` reads whichever a file holds.
 
 Every reader raises ``FileNotFoundError`` or a ``ValueError`` of one sentence (value, rule, cure), whatever the parsing
 library raised. Nothing is repaired silently: missing points are refused unless the caller asks to drop them. Depth
@@ -14,28 +14,17 @@ from PIL import Image
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.depth_formats import DEPTH_READERS, metres, read_raw_depth
 from mereo.io.errors import readable
-from mereo.io.intrinsics import Intrinsics, read_camera, read_intrinsics
-from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.point_cloud_formats import CLOUD_READERS
 
-__all__ = [
-    "Intrinsics",
-    "read_camera",
-    "read_depth_image",
-    "read_intrinsics",
-    "read_mask",
-    "read_point_cloud",
-    "read_segmented_mesh",
-]
-
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
+"""Range of an image's median depth, unless the caller says otherwise; beyond it the unit is wrong."""
 
 
 # --- point clouds ----------------------------------------------------------------------------------------------------
 
 
 def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud:
-    """The points of a PLY, PCD, XYZ/TXT/PTS/ASC/CSV, NPY, NPZ or ZDF file, in the file's units and frame.
+    """Points of a PLY, PCD, XYZ/TXT/PTS/ASC/CSV, NPY, NPZ or ZDF file, in the file's units and frame.
 
     Args:
         path: the file; its suffix names the format. Arrays are [n, 3] or organized [h, w, 3]; text has x, y, z in its
@@ -64,7 +53,7 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
 
 
 def valid_points(points: Float[np.ndarray, "n 3"], path: str | Path, drop_invalid: bool) -> Float[np.ndarray, "m 3"]:
-    """The points that are measurements; ``path`` says where they come from. Raises as ``read_point_cloud`` does."""
+    """Points that are measurements; ``path`` says where they come from. Raises as ``read_point_cloud`` does."""
     if len(points) == 0:
         raise ValueError(f"{path} holds 0 points; the object must be visible: check the export")
     finite = np.isfinite(points).all(axis=1)
@@ -93,7 +82,7 @@ def read_depth_image(
     mask_path: str | Path | None = None,
     plausible_m: tuple[float, float] = PLAUSIBLE_DEPTH_M,
 ) -> DepthImage:
-    """A PNG, TIFF, EXR or NPY image as depth in metres; 0 where nothing was measured or the mask is 0.
+    """Depth in metres of a PNG, TIFF, EXR or NPY image; 0 where nothing was measured or the mask is 0.
 
     Args:
         path: the image, 16-bit or floating; 0 means no measurement, and in floating ones NaN and infinity do too.
@@ -114,9 +103,7 @@ def read_depth_image(
         raise ValueError(
             f"{path} has the suffix {path.suffix!r}; a depth image is one of {known}: convert or rename it"
         )
-    with readable(path, "depth image"):
-        raw = read_raw_depth(path)
-    return usable_depth(DepthImage(metres(raw, depth_scale), camera), path, mask_path, plausible_m)
+    return usable_depth(DepthImage(metres(read_raw_depth(path), depth_scale), camera), path, mask_path, plausible_m)
 
 
 def usable_depth(
@@ -125,7 +112,7 @@ def usable_depth(
     mask_path: str | Path | None = None,
     plausible_m: tuple[float, float] = PLAUSIBLE_DEPTH_M,
 ) -> DepthImage:
-    """A depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does."""
+    """Depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does."""
     depth = image.depth
     if mask_path is not None:
         depth = np.where(read_mask(mask_path, (image.camera.width, image.camera.height)), depth, 0.0)
@@ -142,7 +129,7 @@ def usable_depth(
 
 
 def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
-    """An image's pixels that are not 0 (in any channel but alpha); ``size`` is the expected (width, height)."""
+    """Pixels of an image that are not 0 (in any channel but alpha); ``size`` is the expected (width, height)."""
     path = Path(path)
     with readable(path, "mask image"), Image.open(path) as image:
         # a 1-bit or palette image is taken by what it shows, anything else by its stored values

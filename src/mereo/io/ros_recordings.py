@@ -26,22 +26,24 @@ from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
 IMAGE, CLOUD, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 FRAMES = (IMAGE, COMPRESSED, CLOUD)
+"""Types of messages that hold frames."""
 
 COMPRESSED_DEPTH, COMPRESSED_HEADER = "compressedDepth", 12
-"""Of a compressed image's format, where it is depth; and the bytes before its PNG: a number and two quantizations."""
+"""Word in the format of a compressed depth image, and the bytes before its PNG: a number and two quantizations."""
 
 DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+"""Numpy type of each encoding of a depth image."""
 
 FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""sensor_msgs/PointField: datatype to numpy."""
+"""Numpy type of each datatype of sensor_msgs/PointField."""
 
 Content = DepthImage | Float[np.ndarray, "n 3"]
-"""Depth in metres, or points in metres with NaN where nothing was measured."""
+"""Content of a message: depth in metres, or points in metres with NaN where nothing was measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedFrame:
-    """One message.
+    """Message of a recording, decoded when it is asked for.
 
     Attributes:
         topic: where it was published.
@@ -53,9 +55,19 @@ class RecordedFrame:
     stamp_ns: int
     read: Callable[[], Content]
 
+    @property
+    def time_s(self) -> float:
+        """Time at which the message was recorded, in seconds."""
+        return self.stamp_ns / 1e9
+
+    @property
+    def name(self) -> str:
+        """Topic and time of the message, for people."""
+        return f"{self.topic} at {self.time_s:.3f} s"
+
 
 def is_recording(path: Path) -> bool:
-    """Whether this is a bag: .bag, .mcap, .db3, or the directory of a ROS 2 bag."""
+    """Whether a file is a bag: .bag, .mcap, .db3, or the directory of a ROS 2 bag."""
     return path.suffix.lower() in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
@@ -65,7 +77,7 @@ def recorded_frames(
     camera: Camera | None = None,
     depth_scale: float | None = None,
 ) -> Iterator[RecordedFrame]:
-    """The frames of one topic in the order of recording.
+    """Frames of one topic in the order of recording.
 
     Args:
         path: the bag.
@@ -132,7 +144,7 @@ def _open(path: Path) -> Any:
 
 
 def _depth_topic(reader: Any, path: Path) -> str:
-    """The first image topic whose first message is a depth image, else a compressed one, else the first of clouds."""
+    """Topic of depth: the first of images whose first message is one, else of compressed ones, else of clouds."""
     images, compressed, clouds = (
         sorted({c.topic for c in reader.connections if c.msgtype == kind and c.msgcount}) for kind in FRAMES
     )
@@ -158,7 +170,7 @@ def _first(reader: Any, topic: str) -> Any:
 
 
 def _camera(reader: Any, topic: str, path: Path) -> Camera:
-    """From the CameraInfo topic that shares the most leading names with ``topic``."""
+    """Camera from the CameraInfo topic that shares the most leading names with ``topic``."""
     infos = sorted({c.topic for c in reader.connections if c.msgtype == INFO and c.msgcount})
     if not infos:
         raise ValueError(f"{path} has no CameraInfo; the intrinsics of {topic} are needed: give --intrinsics FILE")
@@ -201,7 +213,7 @@ def _depth_image(message: Any, camera: Camera, depth_scale: float | None) -> Dep
 
 
 def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -> DepthImage:
-    """16UC1 as it is; 32FC1 as inverse depth in 16 bits, ``a / (value - b)`` metres, 0 where nothing was measured."""
+    """Depth of a compressed image: 16UC1 as it is; 32FC1 as inverse depth, ``a / (value - b)`` metres, 0 if none."""
     encoding, _, codec = (part.strip() for part in message.format.partition(";"))
     if not codec.startswith(COMPRESSED_DEPTH) or encoding not in DEPTH_ENCODINGS or codec.endswith("rvl"):
         raise ValueError(

@@ -1,7 +1,7 @@
 """Recorded states from files: vertex or node positions per frame, as simulators export them.
 
 The formats are in docs/design/0008-simulated-states.md. This module reads and checks what files say by themselves;
-``simulated`` fits them to an object.
+``mereo.scenes.recorded_states`` fits them to an object.
 """
 
 import re
@@ -15,8 +15,13 @@ from jaxtyping import Float, Int
 from mereo.io.errors import readable
 
 FRAME_SUFFIXES = (".npz", ".ply", ".obj", ".stl", ".off")
+"""Suffixes of files that hold a state each."""
+
 TETRAHEDRAL = ("rest_nodes", "tetrahedra", "nodes", "displacements")
+"""Names of the arrays of tetrahedral states."""
+
 REST = ".rest"
+"""End of an array's name that holds a segment at rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +43,7 @@ class TetrahedralRecord:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceRecord:
-    """Vertex positions of segments.
+    """Vertex positions of the segments' surfaces.
 
     Attributes:
         vertices: for each segment by name its positions in all frames, in its file's order.
@@ -52,7 +57,7 @@ class SurfaceRecord:
 
 
 def read_states(path: Path, names: tuple[str, ...]) -> TetrahedralRecord | SurfaceRecord:
-    """The states in an NPZ file or a directory; ``names`` are the object's segments.
+    """States in an NPZ file or a directory; ``names`` are the object's segments.
 
     Raises ``FileNotFoundError`` and ``ValueError`` naming the file, the array and the frame.
     """
@@ -121,7 +126,7 @@ def _tetrahedral(path: Path, arrays: dict[str, np.ndarray]) -> TetrahedralRecord
 
 
 def _floats(path: Path, key: str, array: np.ndarray, axes: int) -> np.ndarray:
-    """Positions [..., 3], finite; the first bad frame or row is named."""
+    """Positions [..., 3] that are finite; the first bad frame or row is named."""
     wanted = "[frames, vertices, 3]" if axes == 3 else "[vertices, 3]"
     if array.ndim != axes or array.shape[-1] != 3 or not np.issubdtype(array.dtype, np.floating):
         raise ValueError(
@@ -159,7 +164,7 @@ def _numbered(count: int) -> tuple[str, ...]:
 
 
 def _directory(path: Path, names: tuple[str, ...]) -> SurfaceRecord:
-    """One NPZ file per frame, one folder of meshes per segment, or meshes of the only segment."""
+    """States in a directory: an NPZ file per frame, a folder of meshes per segment, or meshes of the only segment."""
     folders = sorted(item.name for item in path.iterdir() if item.is_dir() and not item.name.startswith("."))
     files = _frame_files(path)
     if folders and not files:
@@ -176,7 +181,7 @@ def _directory(path: Path, names: tuple[str, ...]) -> SurfaceRecord:
 
 
 def _frame_files(path: Path) -> list[Path]:
-    """Without ``rest.*``, in natural order: 2 before 10."""
+    """Files of a directory without ``rest.*``, in natural order: 2 before 10."""
     files = [file for file in path.iterdir() if file.suffix.lower() in FRAME_SUFFIXES and file.stem != "rest"]
     return sorted(files, key=lambda file: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", file.name)])
 
@@ -227,7 +232,7 @@ def _joined(path: Path, found: dict[str, Frames]) -> SurfaceRecord:
 
 
 def mesh_vertices(path: Path) -> Float[np.ndarray, "_ 3"]:
-    """All vertices of a mesh file in its own order; an STL file has three for each face."""
+    """Vertices of a mesh file in its own order; an STL file has three for each face."""
     with readable(path, "mesh"):
         if path.suffix.lower() == ".obj":  # trimesh orders an OBJ file's vertices by faces and texture seams
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()

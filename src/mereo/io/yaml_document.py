@@ -20,7 +20,7 @@ Place = Sequence[int | str]
 
 
 class Document:
-    """A YAML mapping.
+    """YAML mapping with the lines that its values stand on.
 
     Attributes:
         path: the file.
@@ -52,7 +52,7 @@ class Document:
         self._refuse_repeated(root)
 
     def _refuse_repeated(self, node: yaml.Node) -> None:
-        """YAML takes the last of two equal keys in silence."""
+        """Refuse keys that stand twice: YAML takes the last of two in silence."""
         if isinstance(node, yaml.SequenceNode):
             for item in node.value:
                 self._refuse_repeated(item)
@@ -66,7 +66,7 @@ class Document:
                 self._refuse_repeated(value)
 
     def pair(self, place: Place) -> tuple[yaml.Node, yaml.Node]:
-        """The key's and the value's node at a place, or of the innermost block around it that is there.
+        """Node of the key and of the value at a place, or of the innermost block around it that is there.
 
         For the items of a list both are the item. A name in ``place`` that no key has, such as the tag that pydantic
         puts between an item and its keys, is passed over.
@@ -80,23 +80,23 @@ class Document:
         return key, value
 
     def at(self, place: Place) -> str:
-        """``file:line`` of a place, or of the innermost block around it."""
+        """File and line (``file:line``) of a place, or of the innermost block around it."""
         return f"{self.path}:{self.pair(place)[0].start_mark.line + 1}"
 
     @contextmanager
     def named_at(self, place: Place) -> Iterator[None]:
-        """Errors on what a place names, such as a file, begin with the place's line."""
+        """Let errors on what a place names, such as a file, begin with the place's line."""
         try:
             yield
         except (ValueError, FileNotFoundError) as error:
             raise type(error)(f"{self.at(place)}: {error}") from error
 
     def error(self, place: Place, message: str) -> ValueError:
-        """An error at a place, to be raised."""
+        """Error at a place, to be raised."""
         return ValueError(f"{self.at(place)}: {message}")
 
     def validated(self, model: type[Model]) -> Model:
-        """The document as the fields of ``model``; ``ValueError`` says what is wrong first, from the top."""
+        """Document as the fields of ``model``; ``ValueError`` says what is wrong first, from the top."""
         try:
             return model.model_validate(self.data)
         except ValidationError as error:
@@ -109,7 +109,7 @@ class Document:
         raise self.error(problems[0]["loc"], self._sentence(problems[0], model) + more)
 
     def _sentence(self, problem: ErrorDetails, model: type[BaseModel]) -> str:
-        """Value, rule and cure."""
+        """Sentence of value, rule and cure."""
         place, kind = problem["loc"], problem["type"]
         key, value = str(place[-1]) if place else "the file", problem["input"]
         context = problem.get("ctx", {})
@@ -134,7 +134,7 @@ class Document:
         return f"`{_key_of(place)}` is {value!r}; {rule}: correct it"
 
     def _known_keys(self, place: Place, model: type[BaseModel]) -> list[str]:
-        """The keys that are allowed where an unknown one is, found by asking the models for a block like that."""
+        """Keys that are allowed where an unknown one is, found by asking the models for a block like that."""
         fields = _fields_at(place[:-1], model)
         used = self.pair(place[:-1])[1]
         have = {k.value for k, _ in used.value} if isinstance(used, yaml.MappingNode) else set()
@@ -142,13 +142,13 @@ class Document:
 
 
 def _key_of(place: Place) -> str:
-    """``angle`` of ("deformations", 0, "bend", "angle", 1): the innermost key."""
+    """Innermost key of a place: ``angle`` of ("deformations", 0, "bend", "angle", 1)."""
     keys = [step for step in place if isinstance(step, str) and step != "[key]"]
     return keys[-1] if keys else "value"
 
 
 def _types(model: type[BaseModel]) -> list[str]:
-    """The types of deformation, from the schema."""
+    """Types of deformation, from the schema."""
     schema = model.model_json_schema()
     return list(schema["properties"]["deformations"]["anyOf"][0]["items"]["discriminator"]["mapping"])
 
@@ -163,7 +163,7 @@ def _fields_at(place: Place, model: type[BaseModel]) -> list[str]:
 
 
 def _inner(schema: dict[str, Any], block: dict[str, Any], step: int | str) -> dict[str, Any]:
-    """The schema of one step further in: of a key, a list's item, or the item of a named type."""
+    """Schema of one step further in: of a key, a list's item, or the item of a named type."""
     inner: dict[str, Any] = block["items"] if isinstance(step, int) else block.get("properties", {}).get(step, block)
     if "discriminator" in block and isinstance(step, str):
         inner = {"$ref": block["discriminator"]["mapping"][step]}
@@ -175,6 +175,6 @@ def _inner(schema: dict[str, Any], block: dict[str, Any], step: int | str) -> di
 
 
 def similar(word: str, known: list[str]) -> str:
-    """ "did you mean ...?" for a misspelt word, else what is known."""
+    """Cure for an unknown word: "did you mean ...?" where one is like it, else what is known."""
     close = get_close_matches(word, known, n=1)
     return f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"

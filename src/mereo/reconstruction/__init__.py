@@ -1,1 +1,1 @@
-"""From a sensor's frame to closed surfaces of every segment."""
+"""The inference path: from a sensor's frame to closed surfaces of every segment."""

@@ -1,4 +1,4 @@
-"""A field of class logits on a grid, evaluated coarse to fine: the dense labels at a fraction of the cost.
+"""Labels of a field on a dense grid, from evaluations coarse to fine: the same at a fraction of the cost.
 
 Every ``COARSE``-th node is evaluated; cells that may hold a change of label are halved until one step wide; all
 other nodes take the label of the cell they lie in. Which cells may hold one?
@@ -7,7 +7,7 @@ other nodes take the label of the cell they lie in. Which cells may hold one?
 - Those where the lead of the winning class falls so steeply that it may vanish inside (``_sloping_cells``), except
   beside a surface that is already known.
 - Then no evaluated node may contradict the label assumed beside it; where one does, that neighbour is evaluated too,
-  and so on (``_follow``). So a surface that is met anywhere is followed to its end.
+  and so on (``_halve``). So a surface that is met anywhere is followed to its end.
 
 What can be missed is a part that lies between the nodes of the coarse lattice, touches no evaluated node, and casts no
 slope on its surroundings. The tests compare with the dense grid on closed forms and on trained networks.
@@ -22,18 +22,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 Field = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n c"]]
-"""Class logits at points."""
+"""Function from points to their class logits."""
 
 COARSE = 4
-"""Every fourth node is always evaluated: 1.6 % of the grid."""
+"""Nodes from one that is always evaluated to the next: every fourth, 1.6 % of the grid."""
 
 REACH = 1.0
-"""How far slopes are trusted to go on; larger values refine more cells that hold no change of label."""
+"""Trust in slopes to go on; larger values refine more cells that hold no change of label."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """A field on a grid.
+    """Field on a grid: labels, and logits where it was evaluated.
 
     Attributes:
         labels: the class of the largest logit; the lowest one of equals.
@@ -47,7 +47,7 @@ class Sampled:
 
 
 class _Evaluator:
-    """The field at nodes of the finest grid; keeps every answer."""
+    """Field at nodes of the finest grid; keeps every answer."""
 
     def __init__(self, field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"]) -> None:
         self.field, self.origin, self.spacing = field, origin, spacing
@@ -63,13 +63,14 @@ class _Evaluator:
         return logits.argmax(axis=1).astype(np.uint8), rows
 
     def logits(self) -> Float[np.ndarray, "m c"]:
+        """All answers so far, in the order of their rows."""
         return np.concatenate(self.chunks)
 
 
 def sample_dense(
     field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"], shape: tuple[int, int, int]
 ) -> Sampled:
-    """The field at every node ``origin + [i, j, k] * spacing``."""
+    """Field evaluated at every node ``origin + [i, j, k] * spacing``."""
     evaluate = _Evaluator(field, origin, spacing)
     labels, rows = evaluate(_all_nodes(shape))
     return Sampled(labels.reshape(shape), rows.reshape(shape), evaluate.logits())
@@ -78,7 +79,7 @@ def sample_dense(
 def sample_coarse_to_fine(
     field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"], shape: tuple[int, int, int]
 ) -> Sampled:
-    """The labels of ``sample_dense`` from few evaluations; every cell with a change of label is known exactly."""
+    """Labels of ``sample_dense`` from few evaluations; every cell with a change of label is known exactly."""
     evaluate = _Evaluator(field, origin, spacing)
     # whole coarse cells: up to three nodes beyond the grid are evaluated too and cut off at the end
     cells = [-(-(nodes - 1) // COARSE) for nodes in shape]
@@ -90,7 +91,7 @@ def sample_coarse_to_fine(
         changing, sloping = changing_cells(labels), _sloping_cells(rows, evaluate.logits())
         if step == COARSE:
             active = _over_neighbors(changing | sloping, np.logical_or)
-        else:  # beside a surface that is known the lead is small because of it, and `_follow` watches there
+        else:  # beside a surface that is known the lead is small because of it, and `_halve` watches there
             active = changing | (sloping & ~_over_neighbors(changing, np.logical_or))
         step //= 2
         labels, rows = _halve(labels, rows, active, step, evaluate)
@@ -127,7 +128,7 @@ def _sloping_cells(rows: Int[np.ndarray, "x y z"], logits: Float[np.ndarray, "m 
 
 
 def over_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
-    """``combine`` over the eight corners of each cell."""
+    """Values of each cell's eight corners, joined by ``combine``."""
     for axis in range(3):
         count = values.shape[axis]
         values = combine(
@@ -143,41 +144,35 @@ def _halve(
     step: int,
     evaluate: _Evaluator,
 ) -> tuple[UInt8[np.ndarray, "u v w"], Int[np.ndarray, "u v w"]]:
-    """The next lattice, ``step`` fine nodes apart: active cells evaluated, others filled with their corners' label."""
+    """Labels and rows of the next lattice, ``step`` fine nodes apart.
+
+    Active cells are evaluated, others filled with their corners' label. Then every skipped node beside one of another
+    label is evaluated, until none is left: so no evaluated node contradicts the label assumed beside it, and a surface
+    once met is followed to its end.
+    """
     shape = tuple(2 * n - 1 for n in labels.shape)
     # a node between coarse nodes takes the one below: all corners of a cell that is not active agree
     fine_labels = labels[np.ix_(*(np.arange(n) // 2 for n in shape))]
     fine_rows = np.full(shape, -1, dtype=np.int32)
     fine_rows[::2, ::2, ::2] = rows
-    wanted = active
-    for axis in range(3):
-        doubled = np.repeat(wanted, 2, axis=axis)
-        ends = [(0, 0)] * 3
-        ends[axis] = (0, 1)
-        wanted = np.pad(doubled, ends)
-        ends[axis] = (1, 0)
-        wanted |= np.pad(doubled, ends)
-    _follow(fine_labels, fine_rows, np.argwhere(wanted & (fine_rows < 0)), step, evaluate)
+    wanted = np.argwhere(_nodes_of(active) & (fine_rows < 0))
+    while len(wanted):
+        place = tuple(wanted.T)
+        fine_labels[place], fine_rows[place] = evaluate(step * wanted)
+        low, high = np.maximum(wanted.min(axis=0) - 1, 0), wanted.max(axis=0) + 2
+        part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        wanted = low + np.argwhere(_contradicted(fine_labels[part], fine_rows[part] < 0, wanted - low))
     return fine_labels, fine_rows
 
 
-def _follow(
-    labels: UInt8[np.ndarray, "x y z"],
-    rows: Int[np.ndarray, "x y z"],
-    wanted: Int[np.ndarray, "m 3"],
-    step: int,
-    evaluate: _Evaluator,
-) -> None:
-    """Evaluate nodes, then every skipped node beside one of another label, until none is left. Changes the arrays.
-
-    So no evaluated node contradicts the label assumed beside it, and a surface once met is followed to its end.
-    """
-    while len(wanted):
-        place = tuple(wanted.T)
-        labels[place], rows[place] = evaluate(step * wanted)
-        low, high = np.maximum(wanted.min(axis=0) - 1, 0), wanted.max(axis=0) + 2
-        part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        wanted = low + np.argwhere(_contradicted(labels[part], rows[part] < 0, wanted - low))
+def _nodes_of(cells: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "u v w"]:
+    """Nodes of the lattice half as wide that lie in or on these cells."""
+    for axis in range(3):
+        doubled = np.repeat(cells, 2, axis=axis)
+        before, after = [(0, 0)] * 3, [(0, 0)] * 3
+        before[axis], after[axis] = (1, 0), (0, 1)
+        cells = np.pad(doubled, after) | np.pad(doubled, before)
+    return cells
 
 
 def _contradicted(
@@ -196,7 +191,7 @@ def _contradicted(
 
 
 def _over_neighbors(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
-    """``combine`` over each node or cell and the 26 around it."""
+    """Values of each node or cell and the 26 around it, joined by ``combine``."""
     for axis in range(3):
         grown = values.copy()
         low, high = [slice(None)] * 3, [slice(None)] * 3

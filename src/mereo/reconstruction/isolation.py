@@ -1,4 +1,4 @@
-"""Getting the object out of what a camera saw: cropping, the largest plane, outliers, the largest cluster.
+"""Isolation of the object in what a camera saw: cropping, the largest plane, outliers, the largest cluster.
 
     PointCloud -depth range-> -box-> -plane-> -thin-> -cluster-> -outliers-> PointCloud
 
@@ -25,25 +25,27 @@ PLANE_SPACINGS = 3.0
 """Half the thickness of a plane in the middle of the cloud; the noise of depth cameras is a few pixels wide."""
 
 PLANE_SHARE = 0.1
-"""The largest plane must hold this share of the points, or there is none."""
+"""Share of the points that the largest plane must hold, or there is none."""
 
 OUTLIER_NEIGHBORS, OUTLIER_STD = 16, 6.0
-"""A point is an outlier where the mean distance to this many neighbours is beyond the mean over the cloud plus this
-many standard deviations (Rusu et al., RAS 2008; PCL's StatisticalOutlierRemoval). The 1 or 2 that are common elsewhere
-take surfaces that are seen edge-on, and with them the outline that the network's frame is made from."""
+"""Neighbours whose mean distance makes an outlier, and standard deviations by which it must exceed the cloud's mean.
+
+Rusu et al., RAS 2008; PCL's StatisticalOutlierRemoval. The 1 or 2 standard deviations that are common elsewhere take
+surfaces that are seen edge-on, and with them the outline that the network's frame is made from."""
 
 CLUSTER_NEIGHBORS, CLUSTER_GAP = 12, 10.0
-"""A point belongs together with this many nearest neighbours, as far as they are less than this many spacings away.
+"""Nearest neighbours that a point belongs together with, as far as they are less than this many spacings away.
+
 Nearest neighbours adapt to density: a surface seen edge-on, whose points are far apart, hangs together, while two dense
 sheets at the same distance do not. With a gap of 6, clean views lost up to 2 % of their points."""
 
 STRAY_SHARE = 0.005
-"""Less than this beside the largest cluster is not worth a word."""
+"""Share of the points beside the largest cluster from which on it is worth a word."""
 
 
 @dataclass(frozen=True)
 class IsolationStep:
-    """What one step did.
+    """Record of what one step left out.
 
     Attributes:
         name: the step, as its option is called.
@@ -62,9 +64,10 @@ class IsolationStep:
 
 
 Keep = tuple[Bool[np.ndarray, " n"], str]
-"""Which points a step keeps, and what it found in words."""
+"""Points that a step keeps, and what it found in words."""
 
 Step = Callable[[Float[np.ndarray, "_ 3"]], Keep]
+"""Function from points to those it keeps."""
 
 
 def isolate(
@@ -74,7 +77,7 @@ def isolate(
     frame: CloudAxes = "camera",
     rng: np.random.Generator | None = None,
 ) -> tuple[PointCloud, tuple[IsolationStep, ...]]:
-    """The points of the object, and what each step left out.
+    """Points of the object, and what each step left out.
 
     Args:
         seen: everything that was seen, any unit.
@@ -110,6 +113,7 @@ CURES = {
     "outliers": "leave out --remove-outliers, or crop with --box first",
     "largest cluster": "leave out --largest-cluster, or crop with --box first",
 }
+"""Advice for each step that leaves too little."""
 
 
 def _numbers(position: Float[np.ndarray, "3"]) -> str:
@@ -119,7 +123,7 @@ def _numbers(position: Float[np.ndarray, "3"]) -> str:
 def _steps(
     config: IsolationConfig, unit_m: float, frame: CloudAxes, rng: np.random.Generator
 ) -> Iterator[tuple[str, Step]]:
-    """The steps that are on, in their order: what is cheap and sure comes first."""
+    """Steps that are on, in their order: what is cheap and sure comes first."""
     if config.depth_range is not None:
         near, far = (limit / unit_m for limit in config.depth_range)
         yield "depth range", lambda points: ((points[:, 2] >= near) & (points[:, 2] <= far), "")
@@ -163,13 +167,13 @@ def _thinned(points: Float[np.ndarray, "n 3"]) -> Keep:
 
 
 def _inliers(points: Float[np.ndarray, "n 3"]) -> Keep:
-    """See ``OUTLIER_STD``."""
+    """Points that are no outliers, see ``OUTLIER_STD``."""
     distance = cKDTree(points).query(points, k=min(OUTLIER_NEIGHBORS, len(points) - 1) + 1)[0][:, 1:].mean(axis=1)
     return distance <= distance.mean() + OUTLIER_STD * distance.std(), ""
 
 
 def clusters(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """The number of each point's cluster, the largest being 0; see ``CLUSTER_NEIGHBORS``."""
+    """Number of each point's cluster, the largest being 0; see ``CLUSTER_NEIGHBORS``."""
     count = min(CLUSTER_NEIGHBORS, len(points) - 1) + 1
     gap = CLUSTER_GAP * spacing(points)
     if gap == 0:  # all at one place
@@ -183,7 +187,7 @@ def clusters(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 
 
 def _largest_cluster(points: Float[np.ndarray, "n 3"], gap: float) -> Keep:
-    """With the clusters nearer than ``gap`` to it, those nearer than ``gap`` to them, and so on.
+    """Points of the largest cluster, of those nearer than ``gap`` to it, of those nearer to these, and so on.
 
     Clusters of fewer than ``MIN_POINTS`` are floating points and do not count.
     """
@@ -202,5 +206,5 @@ def _largest_cluster(points: Float[np.ndarray, "n 3"], gap: float) -> Keep:
 
 
 def stray_share(cloud: PointCloud) -> float:
-    """The share of the points, thinned evenly in space, that lies apart from the largest cluster."""
+    """Share of the points, thinned evenly in space, that lies apart from the largest cluster."""
     return float((clusters(cloud.points[thin_to_grid(cloud.points, MAX_POINTS)]) > 0).mean())

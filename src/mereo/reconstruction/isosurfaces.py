@@ -22,17 +22,18 @@ Nested = tuple[tuple[str, str], ...]
 """Pairs of names (inner, outer), see ``SegmentedMesh``."""
 
 MAX_NODES = 80_000_000
+"""Nodes that a grid may have."""
 
 LOCATE_CELLS = 48
-"""Cells along the longest side while the object is being located."""
+"""Number of cells along the longest side while the object is being located."""
 
 GROWTHS = 6
-"""How often a box may grow."""
+"""Times that a box may grow."""
 
 
 @dataclass(frozen=True, eq=False)
 class Extraction:
-    """What a field holds.
+    """Surfaces and labels that a field holds.
 
     Attributes:
         surfaces: every segment as a closed mesh, in the order of the names; without faces where it does not occur.
@@ -59,7 +60,8 @@ def extract(
         field: logits of empty space and of each segment, in this order.
         box: lower and upper corner of the region; a segment that leaves it is closed half a voxel outside.
         resolution: cells along the longest side; voxels are cubes.
-        names, colors: of the segments.
+        names: of the segments.
+        colors: of the segments.
         nested: which of them lie inside another; the outer one's surface is then that of both together.
 
     Raises ``ValueError`` for a resolution below 4, an empty box, or a grid over ``MAX_NODES`` nodes.
@@ -75,7 +77,7 @@ def extract_dense(
     colors: Sequence[Color],
     nested: Nested = (),
 ) -> Extraction:
-    """``extract`` with the field evaluated at every node: the reference, many times slower."""
+    """Surfaces and labels of a field, evaluated at every node: the reference of ``extract``, many times slower."""
     return _extract(sample_dense, field, box, resolution, names, colors, nested)
 
 
@@ -104,7 +106,7 @@ def _extract(
 def _grid(
     box: Float[np.ndarray, "2 3"], resolution: int
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], tuple[int, int, int]]:
-    """Origin, spacing and number of nodes; the grid may end up to one cell behind the box."""
+    """Origin, spacing and number of nodes of a grid, which may end up to one cell behind the box."""
     size = box[1] - box[0]
     if resolution < 4:
         raise ValueError(f"the resolution is {resolution}; at least 4 cells are needed: 64 to 256 are usual")
@@ -120,7 +122,7 @@ def _grid(
 
 
 def locate(field: Field, box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 3"]:
-    """The box of all segments, with a margin of two coarse voxels, found on a coarse grid.
+    """Box of all segments, with a margin of two coarse voxels, found on a coarse grid.
 
     ``box`` is where to look first; a side that a segment touches moves out by a quarter of the box, ``GROWTHS`` times
     at most, because the hidden part may reach far. Raises ``ValueError`` where the field knows only empty space.
@@ -146,9 +148,9 @@ def extract_whole(
     colors: Sequence[Color],
     nested: Nested = (),
 ) -> Extraction:
-    """``extract`` in a box that grows, at most ``GROWTHS`` times, where a segment touches it.
+    """Surfaces and labels of a field as ``extract`` finds them, in a box that grows where a segment touches it.
 
-    Raises ``ValueError`` where the field knows only empty space.
+    It grows at most ``GROWTHS`` times. Raises ``ValueError`` where the field knows only empty space.
     """
     found = extract(field, box, resolution, names, colors, nested)
     for _ in range(GROWTHS):
@@ -199,11 +201,10 @@ def _margin(
     logits: Float[np.ndarray, "m c"],
     held: list[int],
 ) -> Float[np.ndarray, "x y z"]:
-    """Largest logit of ``held`` less that of the others, its sign by the label; where nothing was evaluated only the
-    sign counts.
+    """Margin at each node: the largest logit of ``held`` less that of the others, its sign by the label.
 
-    A tie would put a vertex on a node, and marching cubes would make faces without area there; so ties are moved by a
-    millionth.
+    Where nothing was evaluated only the sign counts. A tie would put a vertex on a node, and marching cubes would make
+    faces without area there; so ties are moved by a millionth.
     """
     known = rows >= 0
     values = logits[rows[known]].astype(np.float64)

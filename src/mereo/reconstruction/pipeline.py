@@ -1,8 +1,10 @@
 """The inverse path: from what a camera saw of an object to all its segments, hidden side included.
 
-    PointCloud -normalize-> -encode-> code -query-> field -extract-> SegmentedMesh
+    PointCloud -normalize-> -encode-> EncodedCloud -query-> Field -locate, extract-> SegmentedMesh
+                                           '---------------- ask for more ----------------> Answer
 
-Everything that comes out is in the input's frame and units.
+``reconstruct`` undoes what ``mereo.synthesis.examples.synthesize`` does. Everything that comes out is in the input's
+frame and units.
 """
 
 import time
@@ -20,18 +22,18 @@ from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.models.model import Model
+from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import Field
 from mereo.reconstruction.isosurfaces import extract_whole, locate
 from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
-"""Where segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one lies behind it."""
+"""Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """An object with all its segments, in the input's frame and units.
+    """Object with all its segments, in the input's frame and units.
 
     Attributes:
         surfaces: every segment of the model as a closed mesh; without faces where it was not found. Which lie inside
@@ -41,6 +43,8 @@ class Reconstruction:
         timings_s: seconds of each stage.
         evaluated: points at which the network was asked for surfaces.
         clipped: whether a segment still reached the largest box and was closed there.
+        code: what the model made of the cloud; ask it for more with ``Model.query``, in the camera frame.
+        T_camera_input: from the input's frame to the camera frame.
         observed: the segment of each input point, where it was asked for.
     """
 
@@ -50,6 +54,8 @@ class Reconstruction:
     timings_s: dict[str, float]
     evaluated: int
     clipped: bool
+    code: EncodedCloud
+    T_camera_input: Float[np.ndarray, "4 4"]
     observed: SegmentedCloud | None = None
 
 
@@ -60,7 +66,7 @@ def reconstruct(
     frame: CloudAxes = "camera",
     label_points: bool = False,
 ) -> Reconstruction:
-    """All segments of the object that ``cloud`` shows.
+    """All segments of the object that a cloud shows, hidden side included.
 
     Args:
         cloud: points on the object, any unit and density.
@@ -73,26 +79,35 @@ def reconstruct(
     Raises ``ValueError`` for unusable clouds, and where the model finds no segment at all.
     """
     points = np.asarray(cloud.points if isinstance(cloud, PointCloud) else cloud, dtype=np.float64)
-    timings: dict[str, float] = {}
     T_camera_input = into_camera(points, frame)
-    with _timed(timings, "encode"):
+    names, colors = segment_names(model)
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "encode"):
         seen = transform_points(T_camera_input, points)
         code = model.encode(PointCloud(seen))
     field: Field = partial(model.logits, code)
-    names, colors = segment_names(model)
-    with _timed(timings, "locate"):
+    with _timed(seconds, "locate"):
         box = locate(field, code.normalizer.invert(SEARCH_BOX))
-    with _timed(timings, "extract"):
-        found = extract_whole(field, box, resolution, names, colors, model.nested if "ce" in model.loss else ())
-    with _timed(timings, "measure"):
+    with _timed(seconds, "extract"):
+        found = extract_whole(field, box, resolution, names, colors, model.nested if model.segmented else ())
+    with _timed(seconds, "measure"):
         segments = measure(found, model, code)
     observed = None
     if label_points:
-        with _timed(timings, "points"):
+        with _timed(seconds, "points"):
             observed = segment_points(field(seen), points, names, colors)
-    clipped = bool(found.grid.touched_sides().any())
-    result = Reconstruction(found.surfaces, found.grid, segments, timings, found.evaluated, clipped, observed)
-    return result if frame == "camera" else _turned_back(result, inverse_rigid(T_camera_input))
+    result = Reconstruction(
+        surfaces=found.surfaces,
+        labels=found.grid,
+        segments=segments,
+        timings_s=seconds,
+        evaluated=found.evaluated,
+        clipped=bool(found.grid.touched_sides().any()),
+        code=code,
+        T_camera_input=T_camera_input,
+        observed=observed,
+    )
+    return result if frame == "camera" else _turned_back(result)
 
 
 @contextmanager
@@ -107,9 +122,9 @@ def segment_names(model: Model) -> tuple[tuple[str, ...], tuple[Color, ...]]:
     return (model.names, model.colors) if model.segmented else (("object",), PALETTE[:1])
 
 
-def _turned_back(result: Reconstruction, T_scanner_camera: Float[np.ndarray, "4 4"]) -> Reconstruction:
-    """From the camera frame to the scanner's: half a turn about x reverses the grid along y and z."""
-    grid = result.labels
+def _turned_back(result: Reconstruction) -> Reconstruction:
+    """Result in the scanner's frame from that in the camera's: half a turn about x reverses the grid along y and z."""
+    T_scanner_camera, grid = inverse_rigid(result.T_camera_input), result.labels
     last = np.asarray(grid.labels.shape) - 1
     corner = grid.origin + grid.spacing * last * np.array([0, 1, 1])
     labels = LabelGrid(
@@ -127,6 +142,3 @@ def _turned_back(result: Reconstruction, T_scanner_camera: Float[np.ndarray, "4 
         for segment in result.segments
     )
     return replace(result, surfaces=result.surfaces.transformed(T_scanner_camera), labels=labels, segments=segments)
-
-
-# --- files -----------------------------------------------------------------------------------------------------------

@@ -7,18 +7,19 @@ from jaxtyping import Float
 from scipy import ndimage
 from scipy.special import expit, logsumexp, softmax
 
+from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color, Segment
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.isosurfaces import Extraction
 
 CONFIDENCE_VOXELS = 2000
-"""The confidence of a segment is a mean over at most this many of its voxels."""
+"""Most voxels of a segment over which its confidence is a mean."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundSegment:
-    """One segment in numbers, in the input's frame and units.
+    """Segment in numbers, in the input's frame and units.
 
     Attributes:
         name, label: of the segment.
@@ -46,7 +47,14 @@ def segment_points(
     names: tuple[str, ...],
     colors: tuple[Color, ...],
 ) -> SegmentedCloud:
-    """The segments of points from the model's logits there, of empty space first."""
+    """Segment of each point from the model's logits there.
+
+    Args:
+        logits: of empty space and each segment.
+        points: in the input's frame and unit.
+        names: of the segments.
+        colors: of the segments.
+    """
     parts = logits[:, 1:].astype(np.float64)
     return SegmentedCloud(
         points=points,
@@ -59,7 +67,7 @@ def segment_points(
 
 
 def measure(found: Extraction, model: Model, code: EncodedCloud) -> tuple[FoundSegment, ...]:
-    """Every segment in numbers."""
+    """Every segment of an extraction in numbers; ``code`` is what ``model`` made of the cloud."""
     owned = zip(found.surfaces.segments, found.surfaces.owned_volumes, strict=True)
     return tuple(
         _measure(found.grid, label, segment, float(volume), model, code)
@@ -74,9 +82,7 @@ def _measure(
     if len(voxels) == 0:
         nothing = np.full((2, 3), np.nan)
         return FoundSegment(segment.name, label, 0.0, nothing[0], nothing, float("nan"), 0, 0)
-    chosen = voxels
-    if len(voxels) > CONFIDENCE_VOXELS:
-        chosen = voxels[np.random.default_rng(0).choice(len(voxels), CONFIDENCE_VOXELS, replace=False)]
+    chosen = random_subset(voxels, CONFIDENCE_VOXELS)
     probability = model.query(code, grid.positions(chosen)).probability[:, label]
     low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
     part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]

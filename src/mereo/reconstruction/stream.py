@@ -1,4 +1,4 @@
-"""Frames as they come: the latest one is answered, older ones are dropped, a bad one is reported and passed over.
+"""Answers to frames as they come: the latest wins, older ones are dropped, a bad one is reported and passed over.
 
 A reading thread waits for frames; the caller's thread answers. Between them there is room for one frame: a newer one
 takes the place of one that still waits, so that an answer is never older than the last computation and memory never
@@ -14,13 +14,14 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from mereo.geometry.camera import PointCloud
+from mereo.reconstruction.latest_slot import LatestSlot
 
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
 class StreamFrame:
-    """A frame of a sequence.
+    """Frame of a sequence, decoded when it is answered.
 
     Attributes:
         name: for people: a file, a number.
@@ -35,7 +36,7 @@ class StreamFrame:
 
 @dataclass(frozen=True, eq=False)
 class Outcome(Generic[Result]):
-    """What became of a frame.
+    """Outcome of a frame: its answer or error, and the time it took.
 
     Attributes:
         name, time_s: of the frame.
@@ -53,48 +54,6 @@ class Outcome(Generic[Result]):
     latency_s: float
     work_s: float
     dropped: int
-
-
-class _Slot:
-    """Room for one frame between the two threads."""
-
-    def __init__(self, keep_all: bool) -> None:
-        self.keep_all, self.changed = keep_all, threading.Condition()
-        self.waiting: tuple[StreamFrame, float] | None = None
-        self.dropped, self.ended, self.stopped = 0, False, False
-        self.failure: Exception | None = None
-
-    def put(self, frame: StreamFrame) -> bool:
-        """Leave a frame, in place of one that waits or, with ``keep_all``, after it. False once nobody reads."""
-        with self.changed:
-            if self.keep_all:
-                self.changed.wait_for(lambda: self.waiting is None or self.stopped)
-            elif self.waiting is not None:
-                self.dropped += 1
-            self.waiting = (frame, time.perf_counter())
-            self.changed.notify_all()
-            return not self.stopped
-
-    def take(self) -> tuple[StreamFrame, float, int] | None:
-        """The waiting frame, when it arrived, and how many were dropped for it; None after the last."""
-        with self.changed:
-            self.changed.wait_for(lambda: self.waiting is not None or self.ended)
-            if self.waiting is None:
-                return None
-            (frame, arrived), dropped = self.waiting, self.dropped
-            self.waiting, self.dropped = None, 0
-            self.changed.notify_all()
-            return frame, arrived, dropped
-
-    def end(self, failure: Exception | None) -> None:
-        with self.changed:
-            self.ended, self.failure = True, failure
-            self.changed.notify_all()
-
-    def stop(self) -> None:
-        with self.changed:
-            self.stopped = True
-            self.changed.notify_all()
 
 
 def stream(
@@ -115,42 +74,53 @@ def stream(
     Yields one outcome per answered or failed frame. What goes wrong in one frame (``ValueError``, ``OSError``) is its
     outcome's error; what goes wrong in the sequence itself is raised after the outcomes before it.
     """
-    slot = _Slot(every_frame)
-    threading.Thread(target=_read, args=(frames, slot, recorded_pace), daemon=True, name="frames").start()
+    reading = _Reading(frames, recorded_pace, every_frame)
+    threading.Thread(target=reading.run, daemon=True, name="frames").start()
     try:
-        while (taken := slot.take()) is not None:
-            frame, arrived, dropped = taken
+        while (taken := reading.slot.take()) is not None:
+            frame = taken.item
             start, result, error = time.perf_counter(), None, ""
             try:
                 result = answer(frame.load())
             except (ValueError, OSError) as problem:
                 error = " ".join(str(problem).split()) or type(problem).__name__
             now = time.perf_counter()
-            yield Outcome(frame.name, frame.time_s, result, error, now - arrived, now - start, dropped)
-        if slot.failure is not None:
-            raise slot.failure
+            yield Outcome(frame.name, frame.time_s, result, error, now - taken.arrived_s, now - start, taken.replaced)
+        if reading.failure is not None:
+            raise reading.failure
     finally:
-        slot.stop()
+        reading.slot.stop()
 
 
-def _read(frames: Iterable[StreamFrame], slot: _Slot, recorded_pace: bool) -> None:
-    failure = None
-    try:
+class _Reading:
+    """The reading thread's side of a stream."""
+
+    def __init__(self, frames: Iterable[StreamFrame], recorded_pace: bool, every_frame: bool) -> None:
+        self.frames, self.recorded_pace, self.every_frame = frames, recorded_pace, every_frame
+        self.slot = LatestSlot[StreamFrame]()
+        self.failure: Exception | None = None
+
+    def run(self) -> None:
+        """Bring every frame to the slot, until it is stopped or the sequence ends."""
+        try:
+            self._bring()
+        except Exception as problem:  # raised in the caller's thread, after the outcomes before it
+            self.failure = problem
+        self.slot.end()
+
+    def _bring(self) -> None:
         start, zero = time.perf_counter(), None
-        for frame in frames:
+        for frame in self.frames:
             zero = frame.time_s if zero is None else zero
-            if recorded_pace:
+            if self.recorded_pace:
                 time.sleep(max(0.0, frame.time_s - zero - (time.perf_counter() - start)))
-            if not slot.put(frame):
+            if not self.slot.put(frame, wait=self.every_frame):
                 break
-    except Exception as problem:
-        failure = problem
-    slot.end(failure)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """A stream in numbers: answers per second, latencies in seconds, and what was not answered."""
+    """Numbers of a stream: answers per second, latencies in seconds, and what was not answered."""
 
     answered: int
     failed: int
@@ -168,7 +138,7 @@ class Summary:
 
 
 class Counter:
-    """Collects a summary while outcomes pass by."""
+    """Counter of outcomes that pass by, for their summary."""
 
     def __init__(self) -> None:
         self.start = time.perf_counter()
@@ -176,6 +146,7 @@ class Counter:
         self.failed = self.dropped = 0
 
     def add(self, outcome: Outcome[Result]) -> None:
+        """Count an outcome."""
         self.dropped += outcome.dropped
         if outcome.error:
             self.failed += 1
@@ -183,7 +154,7 @@ class Counter:
             self.latencies.append(outcome.latency_s)
 
     def summary(self) -> Summary:
-        """Up to now; latencies are NaN where nothing was answered."""
+        """Numbers of the stream up to now; latencies are NaN where nothing was answered."""
         seconds = time.perf_counter() - self.start
         count = len(self.latencies)
         median, worst = np.quantile(self.latencies, [0.5, 0.99]) if count else (np.nan, np.nan)

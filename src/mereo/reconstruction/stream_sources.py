@@ -1,4 +1,4 @@
-"""Where frames of a stream come from: a folder of files, a ROS recording, or file names on standard input."""
+"""Sources of a stream's frames: a folder of files, a ROS recording, or file names on standard input."""
 
 import sys
 import time
@@ -10,19 +10,20 @@ from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
 from mereo.io.depth_formats import is_depth_image
 from mereo.io.point_cloud_formats import CLOUD_READERS
-from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frames
+from mereo.io.ros_recordings import is_recording
+from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.isolation import isolate
-from mereo.reconstruction.observation import read_observation, recorded_points, recording_options
+from mereo.reconstruction.observation import find_object
 from mereo.reconstruction.stream import StreamFrame
 
 STANDARD_INPUT = "-"
+"""Source that means names of files on standard input."""
 
 
 def frames_of(
     source: str, reading: InputConfig, isolation: IsolationConfig, rate_hz: float = 30.0
 ) -> Iterator[StreamFrame]:
-    """The frames of a source, in order; each is decoded when it is answered.
+    """Frames of a source, in order; each is decoded when it is answered.
 
     Args:
         source: a folder of depth images or point clouds (in the order of their names), a ROS recording, or ``-`` for
@@ -47,7 +48,10 @@ def frames_of(
     files = sorted(file for file in path.iterdir() if _is_frame(file) and file != reading.mask)
     if not files:
         raise ValueError(f"{path} has no depth images or point clouds; a folder of frames is needed: check the path")
-    return (StreamFrame(file.name, i / rate_hz, _loader(file, reading, isolation)) for i, file in enumerate(files))
+    return (
+        StreamFrame(file.name, i / rate_hz, _loader(partial(read_frame, file, reading), isolation))
+        for i, file in enumerate(files)
+    )
 
 
 def _is_frame(file: Path) -> bool:
@@ -58,17 +62,14 @@ def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamF
     start = time.perf_counter()
     for line in sys.stdin:
         if name := line.strip():
-            yield StreamFrame(name, time.perf_counter() - start, _loader(Path(name), reading, isolation))
-
-
-def _loader(file: Path, reading: InputConfig, isolation: IsolationConfig) -> Callable[[], PointCloud]:
-    return lambda: read_observation(file, reading, isolation).cloud
+            load = _loader(partial(read_frame, name, reading), isolation)
+            yield StreamFrame(name, time.perf_counter() - start, load)
 
 
 def _recorded(path: Path, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame]:
-    def load(frame: RecordedFrame) -> PointCloud:
-        return isolate(recorded_points(frame, path, reading), isolation, frame=reading.frame)[0]
+    for message, read in read_frames(path, reading):
+        yield StreamFrame(message.name, message.time_s, _loader(read, isolation))
 
-    for frame in recorded_frames(path, *recording_options(reading)):
-        stamp_s = frame.stamp_ns / 1e9
-        yield StreamFrame(f"{frame.topic} at {stamp_s:.3f} s", stamp_s, partial(load, frame))
+
+def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], PointCloud]:
+    return lambda: find_object(read(), isolation).cloud

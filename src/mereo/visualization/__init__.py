@@ -1,1 +1,1 @@
-"""Renderer, figures, reports, folders of results, and the viewer."""
+"""Visualization: renderer, figures, reports, folders of results, and the viewer in a browser."""

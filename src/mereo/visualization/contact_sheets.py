@@ -30,7 +30,7 @@ def save_png(path: str | Path, picture: Picture) -> None:
 def contact_sheet(
     images: Sequence[Picture], captions: Sequence[str], columns: int, title: str = "", gap: int = 12
 ) -> Picture:
-    """Images in rows of ``columns`` on white, each with its caption below, ``title`` above all.
+    """Sheet of images in rows of ``columns`` on white, each with its caption below, ``title`` above all.
 
     Raises ``ValueError`` when there are no images, or not as many captions.
     """
@@ -57,7 +57,7 @@ def contact_sheet(
 
 
 def fit_font(size: int, text: str, width: int) -> Font:
-    """Pillow's own font, small enough for ``text`` to fit into ``width`` pixels."""
+    """Font of Pillow's own, small enough for ``text`` to fit into ``width`` pixels."""
     while size > 8 and font(size).getlength(text) > width:
         size -= 1
     return font(size)
@@ -65,7 +65,7 @@ def fit_font(size: int, text: str, width: int) -> Font:
 
 @cache
 def font(size: int) -> Font:
-    """Pillow's own font; unpacking it takes longer than drawing with it."""
+    """Font of Pillow's own in a size; unpacking it takes longer than drawing with it."""
     return ImageFont.load_default(size)
 
 
@@ -82,7 +82,7 @@ def depth_to_rgb(image: DepthImage, limits: tuple[float, float] | None = None) -
 
 
 def enlarge(picture: Picture, width: int) -> Picture:
-    """Whole pixels, without interpolation."""
+    """Picture enlarged to a width, pixel by pixel, without interpolation."""
     return np.asarray(Image.fromarray(picture).resize((width, width * picture.shape[0] // picture.shape[1]), 0))
 
 
@@ -97,14 +97,14 @@ def _draw_cloud(canvas: Canvas, points: Float[np.ndarray, "n 3"], radius_px: flo
 
 
 def cloud_picture(points: Float[np.ndarray, "n 3"], view: Viewpoint, size: tuple[int, int]) -> Picture:
-    """A point cloud coloured by depth, on white."""
+    """Picture of a point cloud coloured by depth, on white."""
     canvas = Canvas.empty(view, size)
     _draw_cloud(canvas, points)
     return canvas.picture()
 
 
 def legend(names: Sequence[str], colors: Sequence[Color], width: int) -> Picture:
-    """A swatch and a name for each segment, in as many rows as are needed."""
+    """Strip with a swatch and a name for each segment, in as many rows as are needed."""
     places, x, y = [], 12, 6
     for name in names:
         length = 22 + int(font(15).getlength(name)) + 20
@@ -120,8 +120,24 @@ def legend(names: Sequence[str], colors: Sequence[Color], width: int) -> Picture
     return np.asarray(strip)
 
 
+def scale_bar(
+    colors: Float[np.ndarray, "n 3"], title: str, words: tuple[str, str, str], width: int
+) -> UInt8[np.ndarray, "44 _ 3"]:
+    """Strip with a bar of colours from left to right, its title before it, and words below its ends and its middle."""
+    strip = Image.new("RGB", (width, 44), "white")
+    pen = ImageDraw.Draw(strip)
+    length = width // 4
+    left = (width - length) // 2
+    bar = np.broadcast_to(np.rint(colors).astype(np.uint8), (14, len(colors), 3))
+    strip.paste(Image.fromarray(np.ascontiguousarray(bar)).resize((length, 14)), (left, 2))
+    pen.text((left - 12, 9), title, fill=INK, font=fit_font(14, title, left - 24), anchor="rm")
+    for place, word, anchor in zip((0, length // 2, length), words, ("lm", "mm", "rm"), strict=True):
+        pen.text((left + place, 28), word, fill=INK, font=fit_font(14, word, length // 3), anchor=anchor)
+    return np.asarray(strip)
+
+
 def name_plate(name: str, width: int, height: int) -> Picture:
-    """A caption as a picture of its own; it may have several lines."""
+    """Caption as a picture of its own; it may have several lines."""
     longest = max(name.splitlines(), key=len, default="")
     plate = Image.new("RGB", (width, height), "white")
     pen = ImageDraw.Draw(plate)

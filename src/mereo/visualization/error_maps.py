@@ -1,6 +1,7 @@
-"""The paper's error pictures: over- and under-reconstruction, and wrong segments (figure of section 4.2)."""
+"""Error pictures after the paper's: what lies too far out or in, and wrong segments (figure of section 4.2)."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,27 @@ from scipy.ndimage import gaussian_filter
 
 from mereo.evaluation.scoring import EvaluatedView
 from mereo.geometry.mesh import Color
-from mereo.visualization.contact_sheets import Picture, cloud_picture, contact_sheet, name_plate, save_png
+from mereo.visualization.contact_sheets import Picture, cloud_picture, contact_sheet, name_plate, save_png, scale_bar
 from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
+from mereo.visualization.surface_offsets import surface_offset
 
-COLUMNS = ("point cloud", "reconstruction", "reconstruction error", "segmentation", "segmentation error", "reference")
+COLUMNS = (
+    *("point cloud", "reconstruction", "reconstruction error", "error from behind"),
+    *("segmentation", "segmentation error", "reference"),
+)
 PLAIN: Color = (146, 170, 198)
 PALE: Color = (222, 224, 228)
 OVER: Color = (31, 119, 214)
 UNDER: Color = (245, 130, 20)
 WRONG: Color = (214, 39, 60)
+TOLERANCE_CELLS = 0.5
+"""Surfaces that are no farther apart cannot be told apart on a grid; they count as right."""
+
+FULL_CELLS = 3.0
+"""From this distance on a surface has the full colour of ``OVER`` or ``UNDER``."""
+
+SCALE_TITLE = "reconstruction error, in cells of the grid"
+SCALE_WORDS = (f"-{FULL_CELLS:g}, too far in", "right", f"{FULL_CELLS:g}, too far out")
 
 
 def error_picture(
@@ -27,16 +40,17 @@ def error_picture(
     up: tuple[float, float, float] = (0.0, -1.0, 0.0),
     size: int = 240,
 ) -> None:
-    """Write the paper's figure of reconstructions, one row for each case, seven columns.
+    """Write the paper's figure of reconstructions, one row for each case, eight columns, and a scale of the errors.
 
-    Name, point cloud, reconstruction (all segments as one), reconstruction error (over blue, under orange),
-    segmentation, segmentation error (red where both are occupied, by different segments), reference. What is right is
-    pale.
+    Name, point cloud, reconstruction (all segments as one), reconstruction error (blue where the surface lies too far
+    out, orange where it lies too far in), the same from behind, segmentation, segmentation error (red where both are
+    occupied, by different segments), reference. What is right is pale.
 
     Args:
         path: the .png file.
         cases: the rows.
-        direction, up: how to look, in the cases' frame; the default is the camera's view.
+        direction: where to look, in the cases' frame; the default is the camera's view.
+        up: what is up in the picture, in the same frame.
         size: width and height of each picture in pixels.
     """
     images: list[Picture] = []
@@ -44,43 +58,51 @@ def error_picture(
     for case in cases:
         images += [name_plate(case.name, size // 2, size), *_error_row(case, direction, up, size)]
         captions += ["", *COLUMNS]
-    save_png(path, contact_sheet(images, captions, 1 + len(COLUMNS)))
+    sheet = contact_sheet(images, captions, 1 + len(COLUMNS))
+    scale = offset_colors(np.linspace(-FULL_CELLS, FULL_CELLS, 181))
+    save_png(path, np.concatenate([sheet, scale_bar(scale, SCALE_TITLE, SCALE_WORDS, sheet.shape[1])]))
 
 
 def _error_row(
     case: EvaluatedView, direction: tuple[float, float, float], up: tuple[float, float, float], size: int
 ) -> list[Picture]:
-    view = Viewpoint.along(_bounds(case), direction, up)
-    grids = error_grids(case.reference, case.predicted)
+    front, behind = (Viewpoint.along(_bounds(case), tuple(sign * np.asarray(direction)), up) for sign in (1, -1))
     segments = np.asarray(case.colors, dtype=float).reshape(-1, 3)
+    found, wrong = _labelled(case, (case.predicted > 0).astype(np.uint8), [PLAIN]), segmentation_error(case)
+    offset = offset_triangles(case)
     shown = (
-        (grids["reconstruction"], [PLAIN]),
-        (grids["reconstruction error"], [PALE, OVER, UNDER]),
-        (case.predicted, segments),
-        (grids["segmentation error"], [PALE, WRONG]),
-        (case.reference, segments),
+        *((found, front), (offset, front), (offset, behind), (_labelled(case, case.predicted, segments), front)),
+        *((_labelled(case, wrong, [PALE, WRONG]), front), (_labelled(case, case.reference, segments), front)),
     )
-    voxels = [_voxel_picture(case, grid, np.asarray(colors, dtype=float), view, size) for grid, colors in shown]
-    return [cloud_picture(case.cloud.points, view, (size, size)), *voxels]
+    pictures = [_solid_picture(triangles, view, size) for triangles, view in shown]
+    return [cloud_picture(case.cloud.points, front, (size, size)), *pictures]
 
 
-def error_grids(
-    reference: UInt8[np.ndarray, "x y z"], predicted: UInt8[np.ndarray, "x y z"]
-) -> dict[str, UInt8[np.ndarray, "x y z"]]:
-    """Where a prediction is wrong; 0 is not shown.
+def segmentation_error(case: EvaluatedView) -> UInt8[np.ndarray, "x y z"]:
+    """Grid of right and wrong segments: 1 where truth and prediction are the same, 2 where not, 0 if one is empty."""
+    both = (case.reference > 0) & (case.predicted > 0)
+    wrong: UInt8[np.ndarray, "x y z"] = (both * 1 + (both & (case.reference != case.predicted)) * 1).astype(np.uint8)
+    return wrong
 
-    ``reconstruction``: 1 where occupied. ``reconstruction error``: 1 right, 2 over- and 3 under-reconstructed.
-    ``segmentation error``, where both are occupied: 1 right, 2 another segment.
+
+def offset_triangles(case: EvaluatedView) -> Triangles:
+    """Surface of truth and reconstruction together, coloured by the distance between them (``offset_colors``).
+
+    So what was invented is seen, and what is missing as well, each the stronger the farther it is from the truth.
     """
-    there, found = reference > 0, predicted > 0
-    both = there & found
-    reconstruction = both * 1 + (found & ~there) * 2 + (there & ~found) * 3
-    segmentation = both * 1 + (both & (reference != predicted)) * 1
-    return {
-        "reconstruction": found.astype(np.uint8),
-        "reconstruction error": reconstruction.astype(np.uint8),
-        "segmentation error": segmentation.astype(np.uint8),
-    }
+    reference, predicted = case.reference > 0, case.predicted > 0
+    surface = voxel_triangles((reference | predicted).astype(np.uint8), np.zeros((1, 3)), case.origin, case.spacing)
+    middles = surface.vertices.reshape(-1, 4, 3).mean(axis=1)
+    cells = surface_offset(reference, predicted, case.spacing, (middles - case.origin) / case.spacing)
+    return replace(surface, colors=np.repeat(offset_colors(cells) / 255.0, 2, axis=0))
+
+
+def offset_colors(cells: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """Colours of distances: pale up to ``TOLERANCE_CELLS``, then blue (above 0: too far out) or orange; 0..255."""
+    share = np.clip((np.abs(cells) - TOLERANCE_CELLS) / (FULL_CELLS - TOLERANCE_CELLS), 0.0, 1.0)[:, None]
+    full = np.where(cells[:, None] > 0, np.asarray(OVER, dtype=float), np.asarray(UNDER, dtype=float))
+    colors: Float[np.ndarray, "n 3"] = (1 - share) * np.asarray(PALE, dtype=float) + share * full
+    return colors
 
 
 def _bounds(case: EvaluatedView) -> Float[np.ndarray, "2 3"]:
@@ -91,12 +113,15 @@ def _bounds(case: EvaluatedView) -> Float[np.ndarray, "2 3"]:
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
-def _voxel_picture(
-    case: EvaluatedView, grid: UInt8[np.ndarray, "x y z"], colors: Float[np.ndarray, "k 3"], view: Viewpoint, size: int
-) -> Picture:
+def _labelled(
+    case: EvaluatedView, grid: UInt8[np.ndarray, "x y z"], colors: Sequence[Color] | Float[np.ndarray, "k 3"]
+) -> Triangles:
+    return voxel_triangles(grid, np.asarray(colors, dtype=float) / 255.0, case.origin, case.spacing)
+
+
+def _solid_picture(shown: Triangles, view: Viewpoint, size: int) -> Picture:
     canvas = Canvas.empty(view, (size, size))
-    if grid.any():
-        canvas.draw_triangles(voxel_triangles(grid, colors / 255.0, case.origin, case.spacing))
+    canvas.draw_triangles(shown)
     return canvas.picture()
 
 
@@ -106,7 +131,7 @@ def voxel_triangles(
     origin: Float[np.ndarray, "3"],
     spacing: Float[np.ndarray, "3"],
 ) -> Triangles:
-    """The faces between occupied voxels and empty space, coloured by value (``colors[value - 1]``, 0..1).
+    """Faces between occupied voxels and empty space, coloured by value (``colors[value - 1]``, 0..1).
 
     Normals are those of the smoothed occupancy, so that a curved body does not look like a staircase.
     """

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Int
 from PIL import Image
 
+from mereo.evaluation.metrics import format_score
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
 from mereo.visualization.reconstruction_report import BUDGET_BYTES
@@ -42,16 +43,19 @@ img { width: 100%; border-radius: 8px; background: #fff; display: block; }
 footer { color: var(--soft); font-size: 13px; }
 """  # noqa: E501 (lines of CSS)
 
+DASH = "–"
+"""Mark of a score that is undefined."""
+
 
 def write_evaluation_report(
     path: str | Path, metrics: Mapping[str, Any], colors: Sequence[Color], picture: str | Path
 ) -> None:
-    """Write the page, under ``BUDGET_BYTES``.
+    """Write the page of an evaluation's scores, under ``BUDGET_BYTES``.
 
     Args:
         path: the .html file.
-        metrics: what ``metrics.json`` holds, see ``evaluation.metrics``; NaN is shown as a dash.
-        colors: of the segments.
+        metrics: what ``metrics.json`` holds, see ``scoring.metrics``; NaN is shown as a dash.
+        colors: colours of the segments.
         picture: a PNG file; it is made smaller where it is too large for the page.
 
     Raises ``ValueError`` where even then the page is too large.
@@ -90,7 +94,7 @@ def write_evaluation_report(
 def _overall(*figures: float) -> str:
     titles = ("IoU, whole set", "mIoU, whole set", "IoU, mean over examples", "mIoU, mean over examples")
     each = zip(titles, figures, strict=True)
-    shown = "".join(f"<div><b>{_number(value)}</b><span>{title}</span></div>" for title, value in each)
+    shown = "".join(f"<div><b>{format_score(value, DASH)}</b><span>{title}</span></div>" for title, value in each)
     return f'<section><div class="big">{shown}</div></section>'
 
 
@@ -131,11 +135,7 @@ def _examples(per_example: Mapping[str, Mapping[str, float]]) -> str:
 
 def _bar(value: float) -> str:
     width = 0.0 if np.isnan(value) else 100 * value
-    return f'<span class="bar"><i style="width:{width:.0f}%"></i></span>{_number(value)}'
-
-
-def _number(value: float) -> str:
-    return "–" if np.isnan(value) else f"{value:.3f}"
+    return f'<span class="bar"><i style="width:{width:.0f}%"></i></span>{format_score(value, DASH)}'
 
 
 def _percent(share: float) -> str:

@@ -1,20 +1,20 @@
-"""Pictures: previews of scenes and of reconstructions, and (from ``error_pictures``) the paper's error pictures.
+"""Previews: a reconstruction from several sides, random states of one scene, and all built-in scenes on one sheet.
 
 Everything is drawn by ``mereo.visualization.renderer``, without a display.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from mereo.evaluation.scoring import EvaluatedView
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.scenes.registry import SCENES, load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -28,27 +28,35 @@ from mereo.visualization.contact_sheets import (
     legend,
     save_png,
 )
-from mereo.visualization.error_maps import error_picture
 from mereo.visualization.renderer import Viewpoint, shade
 
-__all__ = [
-    "EvaluatedView",
-    "contact_sheet",
-    "depth_to_rgb",
-    "error_picture",
-    "preview_scene",
-    "render_cloud_and_segments",
-    "save_png",
-    "scene_preview",
-    "shade",
-]
+Vector = tuple[float, float, float]
 
 CAMERA_VIEWS = {
     "as the camera sees it": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
     "from its right": ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
     "from behind": ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0)),
 }
-"""Viewing direction and up, in the camera frame."""
+"""Viewing direction and up of the pictures of a reconstruction, in the camera frame."""
+
+TILE_PX = 192
+"""Width and height of a picture on the sheet of all scenes: two pixels for each of the depth image."""
+
+SCENE_VIEWS: Mapping[str, tuple[Vector, Vector]] = {
+    "human": ((0.3, -0.3, -1.0), (0.0, 1.0, 0.0)),
+    "robot": ((0.9, 0.8, -0.45), (0.0, 0.0, 1.0)),
+    "bunny": ((0.3, -0.3, -1.0), (0.0, 1.0, 0.0)),
+    "lizard": ((0.3, 0.5, -1.0), (0.0, 0.0, 1.0)),
+    "rope": ((-0.3, 0.4, -1.0), (-1.0, 0.0, 0.0)),
+    "skull": ((0.35, 0.8, -0.6), (1.0, 0.0, 0.0)),
+    "engine": ((0.35, 1.0, -0.35), (0.0, 0.0, 1.0)),
+    "liver": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
+    "shapes": ((0.5, 1.0, -0.6), (0.0, 0.0, 1.0)),
+    "sheet": ((0.3, 0.8, -0.75), (0.0, 0.0, 1.0)),
+    "tumor": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
+    "liver-simulated": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
+}
+"""Viewing direction and up from which each built-in scene is drawn on the sheet of all, in the scene's frame."""
 
 
 def render_cloud_and_segments(
@@ -59,7 +67,7 @@ def render_cloud_and_segments(
     size: int = 420,
     frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
 ) -> None:
-    """Write a preview: the input cloud (top) and the segments (bottom) from the camera, its right and behind.
+    """Write a preview of a reconstruction: input cloud (top), segments (bottom); from the camera, its right and behind.
 
     Args:
         path: the .png file.
@@ -92,27 +100,27 @@ def _joint_bounds(*clouds: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "2 3"]
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
-# --- scenes ----------------------------------------------------------------------------------------------------------
+# --- states of one scene ---------------------------------------------------------------------------------------------
 
 
 def preview_scene(scene: Scene, path: str | Path, seed: int = 0, states: int = 9) -> None:
-    """Write ``scene_preview`` of random states; state i comes from (seed, i) alone."""
+    """Write ``preview_states`` of random states of a scene; state i comes from (seed, i) alone."""
     settings = GenerateConfig()
     views = [sample_view(scene, settings, example_rng(seed, index)) for index in range(states)]
     # a workspace around the whole object has no meaningful axis; mesh files are mostly y up
     up = (0.0, 1.0, 0.0) if scene.workspace.aperture_rad >= 2 * np.pi else scene.workspace.axis
-    scene_preview(path, views, f"{scene.name}: {states} random states", up=up)
+    preview_states(path, views, f"{scene.name}: {states} random states", up=up)
 
 
-def scene_preview(
+def preview_states(
     path: str | Path,
     views: Sequence[View],
     title: str = "",
     size: int = 220,
     across: int = 3,
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    up: Vector = (0.0, 0.0, 1.0),
 ) -> None:
-    """Write a sheet of random states: for each, what the camera sees, the state from a fixed side, the depth image.
+    """Write a sheet of states: for each, what the camera sees, the state from a fixed side, the depth image.
 
     The fixed side is the same world direction for all states; an arrow shows where the camera looks from.
 
@@ -135,7 +143,7 @@ def scene_preview(
     save_png(path, contact_sheet(images, captions, 3 * across, title))
 
 
-def _from_side(view: View, size: int, up: tuple[float, float, float]) -> Picture:
+def _from_side(view: View, size: int, up: Vector) -> Picture:
     world = view.mesh.transformed(view.T_world_camera)
     center = world.bounds.mean(axis=0)
     radius = float(np.linalg.norm(world.bounds[1] - world.bounds[0])) / 2
@@ -163,3 +171,45 @@ def _arrow(center: Float[np.ndarray, "3"], toward: Float[np.ndarray, "3"], radiu
     quads = [(here + k * sides, beside + k * sides, beside + (k + 1) * sides, here + (k + 1) * sides) for k in range(4)]
     faces = np.concatenate([np.stack(corner, axis=1) for a, b, c, d in quads for corner in ((a, b, c), (a, c, d))])
     return Segment("camera direction", (40, 44, 52), vertices, faces)
+
+
+# --- all built-in scenes ---------------------------------------------------------------------------------------------
+
+
+def preview_all(path: str | Path, seed: int = 0) -> None:
+    """Write one sheet of all built-in scenes: each at rest, in two random states, and the second one's depth image.
+
+    The first three pictures of a scene have one viewpoint and one scale; the depth image is that of a random camera.
+    State i comes from (seed, i) alone.
+
+    Raises ``AssetUnavailable`` where a scene's mesh is neither here nor to be had.
+    """
+    images: list[Picture] = []
+    captions: list[str] = []
+    for name in SCENES:
+        scene = load_scene(name)
+        images += scene_row(scene, seed)
+        captions += [f"{name}, {len(scene.rest.segments)} segments", "random state", "random state", "its depth image"]
+    save_png(path, contact_sheet(images, captions, 8))
+
+
+def scene_row(scene: Scene, seed: int) -> list[Picture]:
+    """Pictures of a scene at rest and in two random states, from ``SCENE_VIEWS``, and the depth image of the second."""
+    views = [sample_view(scene, GenerateConfig(), example_rng(seed, index)) for index in (0, 1)]
+    meshes = [scene.rest, *(view.mesh.transformed(view.T_world_camera) for view in views)]
+    viewpoint = _common_viewpoint(meshes, *SCENE_VIEWS[scene.name])
+    return [
+        *(shade(mesh, viewpoint, (TILE_PX, TILE_PX)) for mesh in meshes),
+        enlarge(depth_to_rgb(views[1].depth), TILE_PX),
+    ]
+
+
+def _common_viewpoint(meshes: list[SegmentedMesh], direction: Vector, up: Vector) -> Viewpoint:
+    """Orthographic, and just large enough for all meshes."""
+    points = np.concatenate([segment.vertices for mesh in meshes for segment in mesh.segments])
+    turned = Viewpoint.along(meshes[0].bounds, direction, up).T_view_world
+    seen = transform_points(turned, points)
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    centered = turned.copy()
+    centered[:3, 3] -= (low + high) / 2
+    return Viewpoint(centered, half_size=1.04 * float((high - low)[:2].max()) / 2)

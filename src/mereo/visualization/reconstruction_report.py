@@ -16,12 +16,17 @@ import numpy as np
 from jaxtyping import Float, Int, UInt16
 
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, to_json
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, OUTER_OPACITY
 
 BUDGET_BYTES = 5_000_000
+"""Most bytes of a page."""
+
 CLOUD_POINTS = 60_000
+"""Most points of the cloud that the page shows."""
+
 DATA_MARKER = "/*DATA*/null"
 TITLE_MARKER = "<!--TITLE-->"
 STEPS = 65535
@@ -34,7 +39,7 @@ def write_report(
     summary: dict[str, Any],
     frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
 ) -> None:
-    """Write the page.
+    """Write the page of a reconstruction.
 
     Args:
         path: the .html file.
@@ -52,7 +57,7 @@ def write_report(
     page = files("mereo.visualization").joinpath("report.html").read_text(encoding="utf-8")
     data = _page_data(cloud, surfaces, summary, np.asarray(frame_rotation))
     # "</script>" inside a name must not end the script; \u003c is the same character to JSON
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, default=str).replace("<", "\\u003c")
     page = page.replace(TITLE_MARKER, escape(title)).replace(DATA_MARKER, text)
     encoded = page.encode("utf-8", errors="replace")
     if len(encoded) > BUDGET_BYTES:
@@ -67,7 +72,7 @@ def _page_data(
     points = _thin(cloud.points)
     low, high = _joint_bounds(points, surfaces)
     # binary room: a page's text and the summary take the rest; base64 grows data by a third
-    room = int((BUDGET_BYTES - 300_000 - len(json.dumps(_readable(summary)))) * 3 / 4) - 6 * len(points)
+    room = int((BUDGET_BYTES - 300_000 - len(json.dumps(to_json(summary), default=str))) * 3 / 4) - 6 * len(points)
     shown = _fit(surfaces, float((high - low).max()), room)
     return {
         "low": low.tolist(),
@@ -86,28 +91,13 @@ def _page_data(
             for full, part, opaque in zip(surfaces.segments, shown, surfaces.opaque, strict=True)
         ],
         "coarsened": any(len(a.faces) != len(b.faces) for a, b in zip(surfaces.segments, shown, strict=True)),
-        "summary": _readable(summary),
+        "summary": to_json(summary),
     }
 
 
-def _readable(value: Any) -> Any:
-    """Numpy values as plain ones; NaN and infinity as null."""
-    if isinstance(value, dict):
-        return {str(key): _readable(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_readable(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return _readable(value.tolist())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value if isinstance(value, str | int | float | bool | None) else str(value)
-
-
 def _thin(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """An evenly spread part of the cloud; a fixed seed, so that the page is the same every time."""
-    if len(points) <= CLOUD_POINTS:
-        return points
-    return points[np.sort(np.random.default_rng(0).choice(len(points), CLOUD_POINTS, replace=False))]
+    """The cloud, or ``CLOUD_POINTS`` of it in their order, the same every time."""
+    return points[np.sort(random_subset(np.arange(len(points)), CLOUD_POINTS))]
 
 
 def _joint_bounds(
@@ -139,7 +129,7 @@ def _fit(surfaces: SegmentedMesh, extent: float, room_bytes: int) -> list[Segmen
 
 
 def cluster(segment: Segment, cell: float) -> Segment:
-    """Vertices in the same cell of a cubic grid become their mean; faces that collapse or repeat are dropped.
+    """Coarser segment: vertices in one cell of a cubic grid become their mean, faces that collapse or repeat go.
 
     J. Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993. Fast and
     dependency-free; the result is for looking at and need not be closed.

@@ -1,4 +1,4 @@
-"""A small shaded renderer: rays against triangles by Embree, two-sided Lambert light, smooth normals, dark outlines.
+"""Renderer of shaded pictures: rays by Embree, two-sided Lambert light, smooth normals, dark outlines.
 
 It needs neither a display nor OpenGL. Notation: the view frame is x right, y down, z away from the viewer, as a
 camera's.
@@ -15,20 +15,20 @@ from scipy.sparse import csr_array
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Color, SegmentedMesh
-from mereo.geometry.transforms import inverse_rigid, rigid
+from mereo.geometry.transforms import inverse_rigid, look_at, rigid
 
 SUPERSAMPLE = 2
 BACKGROUND = 1.0
 SEE_THROUGH = 0.55
-"""How much of a nested segment shows through the one around it."""
+"""Share of a nested segment's colour that shows through the one around it."""
 
 CREASE_COSINE = 0.6
-"""Normals are smoothed across edges flatter than about 53 degrees, so that cuts and box edges stay sharp."""
+"""Cosine of the angle, about 53 degrees, from which on an edge is not smoothed: cuts and box edges stay sharp."""
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A virtual camera: orthographic with ``half_size``, or a pinhole with ``camera``.
+    """Virtual camera of a picture: orthographic with ``half_size``, or a pinhole with ``camera``.
 
     Attributes:
         T_view_world: rigid transform from the frame of the things shown to the view frame.
@@ -48,17 +48,15 @@ class Viewpoint:
         up: tuple[float, float, float],
         margin: float = 1.08,
     ) -> "Viewpoint":
-        """Orthographic along ``direction``, with ``up`` upwards, showing the whole box ``bounds``."""
-        forward = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
-        right = np.cross(forward, np.asarray(up, dtype=float))
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
+        """Orthographic view along ``direction``, with ``up`` upwards, that shows the whole box ``bounds``."""
+        turned = look_at(np.zeros(3), np.asarray(direction, dtype=float), np.asarray(up, dtype=float))
+        rotation = inverse_rigid(turned)[:3, :3]
         half = np.abs(rotation[:2]) @ (bounds[1] - bounds[0]) / 2
         return cls(rigid(rotation, -rotation @ bounds.mean(axis=0)), margin * max(float(half.max()), 1e-12))
 
     @classmethod
     def through(cls, camera: Camera, T_world_camera: Float[np.ndarray, "4 4"] | None = None) -> "Viewpoint":
-        """What a camera sees; the identity pose is the camera's own frame."""
+        """View of what a camera sees; by default things are in the camera's own frame."""
         return cls(np.eye(4) if T_world_camera is None else inverse_rigid(T_world_camera), camera=camera)
 
     def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -87,14 +85,14 @@ class Viewpoint:
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """What the renderer draws: triangles with one colour each and a normal at each corner.
+    """Triangles as the renderer draws them: one colour each, and a normal at each corner.
 
     Attributes:
-        vertices: positions.
-        faces: vertex indices.
+        vertices: positions of the corners.
+        faces: vertex indices of each triangle.
         colors: red, green, blue in 0..1 for each face.
         normals: unit normals at the three corners of each face; their sign is of no consequence.
-        owner: an outline is drawn where this number changes between faces.
+        owner: number of the part that each face belongs to; an outline is drawn where it changes.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -105,13 +103,14 @@ class Triangles:
 
     @classmethod
     def of(cls, mesh: SegmentedMesh, colors: list[Color] | None = None) -> "Triangles":
+        """Triangles of all segments in their colours, or in ``colors``, one for each segment."""
         vertices, faces, owner = mesh.merged()
         palette = np.asarray(mesh.colors if colors is None else colors, dtype=float).reshape(-1, 3) / 255.0
         return cls(vertices, faces, palette[owner], corner_normals(vertices, faces), owner)
 
 
 def corner_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
-    """Mean normal, weighted by angle, of those faces around a corner that are not beyond a crease from its own."""
+    """Normal at each corner of each face: the mean, weighted by angle, of those faces there that no crease parts."""
     edges = [_unit(vertices[np.roll(faces, -k, axis=1)] - vertices[faces]) for k in (1, 2)]
     angle = np.arccos(np.clip((edges[0] * edges[1]).sum(axis=-1), -1, 1)).ravel()
     flat = np.repeat(_unit(np.cross(edges[0][:, 0], edges[1][:, 0])), 3, axis=0)
@@ -130,7 +129,7 @@ def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """A picture in the making at ``SUPERSAMPLE`` times its size: colours in 0..1 and depth (infinite where empty)."""
+    """Picture in the making at ``SUPERSAMPLE`` times its size: colours in 0..1 and depth (infinite where empty)."""
 
     view: Viewpoint
     rgb: Float[np.ndarray, "h w 3"]
@@ -138,12 +137,12 @@ class Canvas:
 
     @classmethod
     def empty(cls, view: Viewpoint, size: tuple[int, int]) -> "Canvas":
-        """``size`` is (width, height) of the finished picture."""
+        """Blank picture; ``size`` is (width, height) when it is finished."""
         shape = (size[1] * SUPERSAMPLE, size[0] * SUPERSAMPLE)
         return cls(view, np.full((*shape, 3), BACKGROUND), np.full(shape, np.inf))
 
     def draw_triangles(self, shown: Triangles) -> None:
-        """Draw what is nearer than everything drawn before."""
+        """Draw triangles where they are nearer than everything drawn before."""
         height, width = self.depth.shape
         vertices = self.view.apply(shown.vertices)
         normals = shown.normals @ self.view.T_view_world[:3, :3].T
@@ -196,8 +195,13 @@ class Canvas:
         self.rgb[row, column] = colors[inside][visible]
         self.depth[row, column] = z[inside][visible]
 
+    def let_through(self, inner: "Canvas") -> None:
+        """Mix in what another canvas of the same view shows behind what is drawn here."""
+        hidden = np.isfinite(inner.depth) & (inner.depth > self.depth + 1e-6)
+        self.rgb[hidden] = (1 - SEE_THROUGH) * self.rgb[hidden] + SEE_THROUGH * inner.rgb[hidden]
+
     def picture(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Averaged down to the asked size."""
+        """Finished picture, averaged down to the asked size."""
         height, width = (side // SUPERSAMPLE for side in self.depth.shape)
         blocks = self.rgb.reshape(height, SUPERSAMPLE, width, SUPERSAMPLE, 3)
         return np.rint(255 * blocks.mean(axis=(1, 3))).astype(np.uint8)
@@ -235,7 +239,7 @@ def _light(normal: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"]) -> F
 def shade(
     mesh: SegmentedMesh, view: Viewpoint, size: tuple[int, int], colors: list[Color] | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A shaded picture of ``size`` (width, height) pixels on white, each segment in its colour (or ``colors``).
+    """Shaded picture of ``size`` (width, height) pixels on white, each segment in its colour (or ``colors``).
 
     Segments that are declared nested shine through those around them.
     """
@@ -247,6 +251,5 @@ def shade(
         within = Canvas.empty(view, size)
         parts = SegmentedMesh(tuple(mesh.segments[index] for index in inner))
         within.draw_triangles(Triangles.of(parts, [colors[index] for index in inner]))
-        hidden = np.isfinite(within.depth) & (within.depth > canvas.depth + 1e-6)
-        canvas.rgb[hidden] = (1 - SEE_THROUGH) * canvas.rgb[hidden] + SEE_THROUGH * within.rgb[hidden]
+        canvas.let_through(within)
     return canvas.picture()

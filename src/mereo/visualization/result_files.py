@@ -1,4 +1,4 @@
-"""Folders of results: what `mereo reconstruct` and `mereo evaluate` leave on disk."""
+"""Folders of results that `mereo reconstruct` and `mereo evaluate` leave on disk."""
 
 import time
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ def evaluate_weights(
     settings: GenerateConfig | None = None,
     inference: InferenceConfig = EXACT,
 ) -> Evaluation:
-    """``mereo evaluate``: write metrics.json, table.md, errors.png, report.html; print the table."""
+    """Score weights, write metrics.json, table.md, errors.png, report.html, and print the table: ``mereo evaluate``."""
     with new_directory(output) as directory:
         model = load_for(weights, inference)
         settings = settings or GenerateConfig()
@@ -63,7 +63,7 @@ def evaluate_weights(
 def evaluate_on_scans(
     model: Model, output: str | Path, *, truths: Sequence[str | Path] = (), cells: int = CELLS
 ) -> Evaluation:
-    """``mereo evaluate --scans``: scores on real scans, with the same files as ``evaluate_weights``."""
+    """Score a model on real scans, with the same files as ``evaluate_weights``: ``mereo evaluate --scans``."""
     with new_directory(output) as directory:
         evaluation = evaluate_scans(model, truths=truths, cells=cells)
         facts = {"scans": list(evaluation.examples), "truths": [str(path) for path in truths]}
@@ -73,16 +73,16 @@ def evaluate_on_scans(
 
 
 def write_evaluation(directory: Path, evaluation: Evaluation, facts: dict[str, Any]) -> None:
-    """metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON."""
+    """Write metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON."""
     found = metrics(evaluation, facts)
     write_json(directory / "metrics.json", found)
     (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
-    error_picture(directory / "errors.png", evaluation.cases)
-    write_evaluation_report(directory / "report.html", found, evaluation.cases[0].colors, directory / "errors.png")
+    error_picture(directory / "errors.png", evaluation.views)
+    write_evaluation_report(directory / "report.html", found, evaluation.views[0].colors, directory / "errors.png")
 
 
 def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:
-    """What ``summary.json`` holds: ``facts``, then each segment and the stages' seconds."""
+    """Content of ``summary.json``: ``facts``, then each segment and the stages' seconds."""
     segments = [
         {
             "name": found.name,

@@ -16,14 +16,17 @@ from mereo.visualization.previews import CAMERA_VIEWS
 from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
 
 SHOWN_POINTS = 40_000
-
+"""Most points of the scan that a picture shows."""
 
 SIZE = 420
-"""Of a picture in pixels."""
+"""Width and height of a picture in pixels."""
+
+TOO_FAR = (0.85, 0.1, 0.1)
+"""Colour of scan points that do not lie on the placed object."""
 
 
 def overlay(placement: Placement, cloud: PointCloud, scan: ScanFile) -> Picture:
-    """The scan on the placed segments (top), and its distance from them (bottom), as seen by the scanner and others."""
+    """Picture of a scan on the placed segments (top) and of its distance from them (bottom), from several sides."""
     to_camera = camera_axes(scan.frame)
     mesh = placement.mesh.transformed(to_camera)
     chosen = np.random.default_rng(0).permutation(len(cloud))[:SHOWN_POINTS]
@@ -31,8 +34,8 @@ def overlay(placement: Placement, cloud: PointCloud, scan: ScanFile) -> Picture:
     distance = Solids(mesh).nearest(points).distance
     views = {name: Viewpoint.along(mesh.bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
     mm = 1000 * UNITS_M[scan.unit] * placement.limit
-    colors = np.asarray(matplotlib.colormaps["viridis"](distance / placement.limit))[:, :3]
-    colors[distance > placement.limit] = (0.85, 0.1, 0.1)
+    near = np.asarray(matplotlib.colormaps["viridis"](distance / placement.limit))[:, :3]
+    colors = np.where((distance > placement.limit)[:, None], TOO_FAR, near)
     ink = np.zeros_like(points)
     top = [_drawn(view, mesh, points, ink) for view in views.values()]
     bottom = [_drawn(view, None, points, colors) for view in views.values()]

@@ -1,4 +1,4 @@
-"""What surfaces are coloured by: one number for each vertex, and the scale that turns numbers into colours."""
+"""Colours of surfaces by a number at each vertex, and the scales that turn numbers into colours."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,22 +13,23 @@ from mereo.models.model import Answer
 from mereo.visualization.error_maps import OVER, UNDER
 
 Ask = Callable[[Float[np.ndarray, "n 3"]], Answer]
-"""A model's answers at points in the frame of the surfaces."""
+"""Function that answers as a model does at points in the frame of the surfaces."""
 
 CONFIDENCE_STEP = 0.02
-"""How far to either side of a surface the model is asked, as a share of the object's longest side."""
+"""Distance to either side of a surface at which the model is asked, as a share of the object's longest side."""
 
 ERROR_SHARE = 0.05
-"""The scale of errors ends at this share of the true object's longest side."""
+"""Share of the true object's longest side at which the scale of errors ends."""
 
 
 @dataclass(frozen=True)
-class Scale:
-    """Colours for numbers from ``low`` to ``high``; what lies beyond has the colour of that end.
+class ColorScale:
+    """Scale of colours for numbers from ``low`` to ``high``; what lies beyond has the colour of that end.
 
     Attributes:
         title: what the numbers are.
-        low, high: ends.
+        low: number at the scale's lower end.
+        high: number at its upper end.
         stops: colours at equal distances from one end to the other.
         words: what the two ends mean.
     """
@@ -40,14 +41,14 @@ class Scale:
     words: tuple[str, str]
 
     def colors(self, values: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
-        """Red, green, blue of each number, linear between the stops; NaN is grey."""
+        """Colours (red, green, blue) of numbers, linear between the stops; NaN is grey."""
         places = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0) * (len(self.stops) - 1)
         stops = np.asarray(self.stops, dtype=float)
         mixed = np.stack([np.interp(places, np.arange(len(stops)), stops[:, k]) for k in range(3)], axis=1)
         return np.where(np.isnan(values)[:, None], 128.0, mixed).round().astype(np.uint8)
 
 
-CONFIDENCE = Scale(
+CONFIDENCE = ColorScale(
     "confidence of the surface",
     0.0,
     1.0,
@@ -58,22 +59,24 @@ SEEN: tuple[Color, ...] = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122
 EVEN: Color = (228, 230, 234)
 
 
-def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> Scale:
-    """For ``observed_distance`` of all segments: up to the largest but for a twentieth of the vertices."""
+def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> ColorScale:
+    """Scale for ``observed_distance`` of all segments; it ends at the largest but for a twentieth of the vertices."""
     joint = np.concatenate([*values, np.zeros(1)])
     high = max(float(np.quantile(joint, 0.95)), 1e-9)
-    return Scale("distance to the nearest observed point", 0.0, high, SEEN, ("0, seen", f"{high:.3g}{unit}, guessed"))
+    return ColorScale(
+        "distance to the nearest observed point", 0.0, high, SEEN, ("0, seen", f"{high:.3g}{unit}, guessed")
+    )
 
 
-def error_scale(truth: SegmentedMesh, unit: str) -> Scale:
-    """For ``surface_error``: orange where the reconstruction falls short, blue where it goes too far."""
+def error_scale(truth: SegmentedMesh, unit: str) -> ColorScale:
+    """Scale for ``surface_error``: orange where the reconstruction falls short, blue where it goes too far."""
     high = ERROR_SHARE * float((truth.bounds[1] - truth.bounds[0]).max())
     words = f"−{high:.2g}{unit}, too little", f"+{high:.2g}{unit}, too much"
-    return Scale("distance to the true surface", -high, high, (UNDER, EVEN, OVER), words)
+    return ColorScale("distance to the true surface", -high, high, (UNDER, EVEN, OVER), words)
 
 
 def confidence(surfaces: SegmentedMesh, ask: Ask) -> list[Float[np.ndarray, " _"]]:
-    """How decidedly the model changes its mind across each surface, from 0 to 1, at every vertex.
+    """Confidence of each surface at every vertex, 0 to 1: how decidedly the model changes its mind across it.
 
     On the surface itself the winner's probability says nothing: it is where the winner changes, so that two classes
     are equally likely there. Here the segment's probability a step inside is compared with that a step outside: 1 means
@@ -101,7 +104,7 @@ def _confidence(segment: Segment, labels: list[int], ask: Ask, step: float) -> F
 
 
 def observed_distance(surfaces: SegmentedMesh, observed: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, " _"]]:
-    """From every vertex to the nearest observed point: what is far from all of them is a guess."""
+    """Distance from every vertex to the nearest observed point: what is far from all of them is a guess."""
     tree = cKDTree(observed)
     return [tree.query(s.vertices)[0] if len(s.vertices) else np.zeros(0) for s in surfaces.segments]
 

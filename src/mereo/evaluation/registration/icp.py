@@ -39,36 +39,36 @@ from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid
 
 CELLS = 200
-"""Scan points are thinned to one in a cell of a two-hundredth of the object's diagonal."""
+"""Cells along the object's diagonal, in each of which one point of the scan is kept."""
 
 WHOLE_LIMITS = (0.15, 0.1, 0.06, 0.04, 0.025, 0.015, 0.01, 0.007, 0.005)
 SEGMENT_LIMITS = (0.05, 0.03, 0.02, 0.013, 0.009, 0.007, 0.005, 0.005)
-"""How far a point may lie from the surface in each round, in diagonals of the object, but see ``NOISE_LIMIT``."""
+"""Largest distance of a point from the surface in each round, in diagonals of the object, but see ``NOISE_LIMIT``."""
 
 NOISE_LIMIT = 5.0
-"""A limit is at least this many medians of the points' distances: it trims outliers, not the scanner's noise."""
+"""Medians of the points' distances that a limit is at least: it trims outliers, not the scanner's noise."""
 
 LEAST_POINTS = 40
 LEAST_SHARE = 0.02
-"""A body is moved only by this many points at least, which cover at least this share of its surface."""
+"""Least number of points that move a body, and least share of its surface that they must cover."""
 
 LOOSE = 0.002
-"""A direction whose curvature, per point and with the body's radius as unit, is below this is held. A flat square turns
+"""Curvature, per point and with the body's radius as unit, below which a direction is held. A flat square turns
 about its normal with 0 and tilts with 0.2; the bunny's right ear, seen from the side, has 0.008."""
 
 NEIGHBORS = 12
-"""Scan points from which the scanned surface's direction is estimated."""
+"""Number of scan points from which the scanned surface's direction is estimated."""
 
 FLATNESS = 1e-3
-"""The library's variance of a surface across itself, where that along it is 1. It adds those of scan and model, so that
-one point's distance counts 1 / (2 ``FLATNESS``), and its place on the surface 1/2."""
+"""Variance of a surface across itself that the library assumes, where that along it is 1. It adds those of scan and
+model, so that one point's distance counts 1 / (2 ``FLATNESS``), and its place on the surface 1/2."""
 
 ITERATIONS = 8
-"""Of ICP in each round; the next round goes on."""
+"""Steps of ICP in each round; the next round goes on from there."""
 
 
 def load_icp() -> ModuleType:
-    """The library that does ICP; raises ``ImportError`` with a sentence that names the extra."""
+    """Module of the library that does ICP; raises ``ImportError`` with a sentence that names the extra."""
     try:
         import small_gicp
     except ImportError:
@@ -84,13 +84,13 @@ def load_icp() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What is registered to, in its own frame and unit.
+    """Thinned scan that an object is registered to, in its own frame and unit.
 
     Attributes:
-        points: thinned.
+        points: points of the scan, one in each cell of a grid.
         viewpoint: where the scanner stood.
-        size: the object's diagonal.
-        area: of the surface that one point stands for.
+        size: diagonal of the object.
+        area: area of the surface that one point stands for.
     """
 
     points: Float[np.ndarray, "p 3"]
@@ -100,7 +100,10 @@ class Scan:
 
     @classmethod
     def of(cls, points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"], size: float) -> "Scan":
-        """Thin ``points`` of an object of diagonal ``size``. Raises ``ValueError`` for fewer than ``LEAST_POINTS``."""
+        """Scan of an object of diagonal ``size``, thinned.
+
+        Raises ``ValueError`` where fewer than ``LEAST_POINTS`` points are left.
+        """
         kept = thinned(points, size / CELLS)
         if len(kept) < LEAST_POINTS:
             raise ValueError(
@@ -113,12 +116,12 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Which segment each point lies on.
+    """Segment that each point of a scan lies on.
 
     Attributes:
-        owner: its index; -1 where the nearest surface is farther than ``limit``.
-        distance: to the nearest surface.
-        limit: in the scan's unit.
+        owner: index of the segment; -1 where the nearest surface is farther than ``limit``.
+        distance: distance to the nearest surface.
+        limit: largest distance that counts, in the scan's unit.
     """
 
     owner: Int[np.ndarray, " p"]
@@ -127,7 +130,7 @@ class Matches:
 
 
 def match(points: Float[np.ndarray, "p 3"], surfaces: SegmentedMesh, limit: float) -> Matches:
-    """Give each point to the segment of the nearest surface, if within ``limit`` or ``NOISE_LIMIT`` medians."""
+    """Segment of the nearest surface to each point, if within ``limit`` or ``NOISE_LIMIT`` medians of all distances."""
     filled = [index for index, segment in enumerate(surfaces.segments) if len(segment.faces)]
     nearest = Solids(SegmentedMesh(tuple(surfaces.segments[index] for index in filled))).nearest(points)
     limit = max(limit, NOISE_LIMIT * float(np.median(nearest.distance)))
@@ -140,13 +143,13 @@ def match(points: Float[np.ndarray, "p 3"], surfaces: SegmentedMesh, limit: floa
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Poses that fit a scan.
+    """Poses of an object's segments that fit a scan.
 
     Attributes:
-        poses: of every segment.
+        poses: ``T_scan_segment`` of every segment.
         fitted: whether the scan moved the segment's body in the last round; otherwise it shows too little of it.
-        held: in how many of six directions the body was held.
-        matches: of the last round.
+        held: number of the six directions in which the segment's body was held.
+        matches: segment of each point in the last round.
     """
 
     poses: Poses
@@ -163,16 +166,16 @@ def register(
     limits: Sequence[float],
     hold: bool = False,
 ) -> Registration:
-    """Move each body, a list of segments, onto the scan; all segments take part in saying whose a point is.
+    """Poses that bring each body, a list of segments, onto the scan; whose a point is, all segments together decide.
 
     Args:
-        shown: from ``exposed``.
-        scan: the scan.
-        poses: where to start.
+        shown: faces that can be seen, from ``exposed``.
+        scan: the thinned scan.
+        poses: poses to start from.
         bodies: indices of the segments that move together; what is in none stays.
-        limits: one for each round, in diagonals of the object.
-        hold: keep bodies where they are along directions that the scan does not constrain. Not from a rough start: from
-            there a body must also slide to where its points are.
+        limits: largest distance of a point in each round, in diagonals of the object.
+        hold: whether bodies stay where they are along directions that the scan does not constrain. Not from a rough
+            start: from there a body must also slide to where its points are.
     """
     fitted, held = np.zeros(len(poses), dtype=bool), np.zeros(len(poses), dtype=np.int64)
     for limit in limits:
@@ -191,14 +194,22 @@ def register(
 
 
 def shows(points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, area: float) -> bool:
-    """Whether these points, each standing for ``area``, cover enough of the side that faces the scanner."""
+    """Whether points of a scan, each standing for ``area``, cover enough of the surface that faces the scanner."""
     return len(points) >= LEAST_POINTS and len(points) * area >= LEAST_SHARE * float(face_areas(surface).sum())
 
 
 def icp(
     points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, limit: float, area: float, hold: bool
 ) -> tuple[Float[np.ndarray, "4 4"], int]:
-    """The rigid motion of ``surface`` onto ``points``, and in how many directions it is held."""
+    """Rigid motion of ``surface`` onto ``points``, in their frame, and the number of directions in which it is held.
+
+    Args:
+        points: points of the scan that lie on the surface.
+        surface: the faces that the scanner can see.
+        limit: largest distance of a point from the surface.
+        area: area of the surface that one point stands for.
+        hold: whether to leave out motion that the points do not constrain.
+    """
     library = load_icp()
     samples = sample_surface(surface, area)
     center = samples.mean(axis=(0, 1))
@@ -221,15 +232,15 @@ def icp(
     if hold:
         curvature = 2 * FLATNESS * result.H / max(result.num_inliers, 1)
         points_to_surface, held = constrained(points_to_surface, curvature)
-    motion = inverse_rigid(points_to_surface)
-    motion[:3, 3] = center - motion[:3, :3] @ center + radius * motion[:3, 3]
-    return motion, held
+    motion = inverse_rigid(points_to_surface)  # about the centre, in radii
+    rotation = motion[:3, :3]
+    return rigid(rotation, center - rotation @ center + radius * motion[:3, 3]), held
 
 
 def constrained(
     motion: Float[np.ndarray, "4 4"], curvature: Float[np.ndarray, "6 6"]
 ) -> tuple[Float[np.ndarray, "4 4"], int]:
-    """``motion`` without its part along directions (turns, then shifts) curved less than ``LOOSE``, and how many."""
+    """Motion without its part along directions (turns, then shifts) curved less than ``LOOSE``, and their number."""
     values, directions = np.linalg.eigh(curvature)
     firm = directions[:, values >= LOOSE]
     if firm.shape[1] == 6:

@@ -21,28 +21,29 @@ from mereo.evaluation.registration.visible_surface import diagonal
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.scanner_axes import into_camera
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import fit_rigid, inverse_rigid, rigid, transform_points
 from mereo.io.errors import readable
 from mereo.models.model import Model
 from mereo.scenes.rest_pose import rest_frame
 
 LEAST_PAIRS = 3
+"""Pairs of points at least; two leave a turn about their line."""
 
 LEAST_GUESSES = 30
-"""Points that a network must give to a segment for a start of its own."""
+"""Least number of points that a network must give to a segment for a start of its own."""
 
 SCALE_ERROR = 0.25
-"""A start whose scale differs more than this from the known one is of another unit; picked points are not this bad."""
+"""Share by which a start's scale may differ from the known one; beyond, the unit is another, not picking inaccurate."""
 
 MIRROR_ERROR = 0.2
-"""Pairs that fit this share of the largest residual may be mirrored or not: nearly flat, they do not tell."""
+"""Share of the largest residual below which pairs may be mirrored or not: nearly flat, they do not tell."""
 
 PAIR_ERROR = 0.1
 """Largest RMS distance of pairs after the best fit, in diagonals of the object."""
 
 
 def read_start(path: str | Path, rest: SegmentedMesh, scale: float | None = None) -> Start:
-    """The poses that a start file gives; segments that it does not name share the object's.
+    """Rough poses from a start file; segments that it does not name share the object's.
 
     Args:
         path: the JSON file.
@@ -140,10 +141,17 @@ def pose_of_pairs(
     scale: float | None,
     tolerance: float,
 ) -> Float[np.ndarray, "4 4"]:
-    """The similarity of known scale that takes ``model`` to ``scan`` best (Kabsch, 1976).
+    """Similarity of known scale that takes points of the model to those of the scan best (Kabsch, 1976).
+
+    Args:
+        model: points of the object at rest, scene units.
+        scan: the same points in the scan.
+        of: what the pairs are of, for messages.
+        scale: scan units per scene unit; None where it is not known, which is an error.
+        tolerance: largest RMS distance after the fit, scene units.
 
     Raises ``ValueError`` for fewer than three pairs, points on a line, an unknown or another scale, mirrored pairs, or
-    a residual above ``tolerance`` (scene units).
+    a residual above ``tolerance``.
     """
     if len(model) != len(scan) or len(model) < LEAST_PAIRS:
         raise ValueError(
@@ -154,7 +162,7 @@ def pose_of_pairs(
     spread = np.linalg.svd(source, compute_uv=False)
     if not spread[1] > 0.05 * spread[0]:
         raise ValueError(f"the points of the start of {of} lie on a line; they must span a triangle: pick another")
-    rotation = Rotation.align_vectors(target, source)[0].as_matrix()
+    rotation = fit_rigid(source, target)[:3, :3]
     found = float(np.sum(target * (source @ rotation.T)) / np.sum(source**2))
     if scale is None:
         raise ValueError(
@@ -177,15 +185,15 @@ def pose_of_pairs(
 
 
 def misfit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> float:
-    """RMS distance of centred pairs after the best rotation."""
-    rotation = Rotation.align_vectors(target, source)[0].as_matrix()
-    return float(np.sqrt(np.mean(np.sum((target - source @ rotation.T) ** 2, axis=1))))
+    """RMS distance of pairs of points after the best rigid motion."""
+    moved = transform_points(fit_rigid(source, target), source)
+    return float(np.sqrt(np.mean(np.sum((target - moved) ** 2, axis=1))))
 
 
 def start_from_model(
     model: Model, points: Float[np.ndarray, "n 3"], frame: CloudAxes, rest: SegmentedMesh, scale: float | None
 ) -> Start:
-    """Poses from a trained network: where it believes the seen points were at rest, fitted segment by segment.
+    """Rough poses from a trained network: where it believes the seen points were at rest, fitted segment by segment.
 
     A segment with fewer than ``LEAST_GUESSES`` points shares the object's pose. Raises ``ValueError`` for another
     object's model, one without rest coordinates, and an unknown scale.

@@ -15,28 +15,29 @@ from scipy.spatial.transform import Rotation
 from mereo.evaluation.registration.icp import SEGMENT_LIMITS, WHOLE_LIMITS, Registration, Scan, match, register
 from mereo.evaluation.registration.visible_surface import CONTACT, Poses, diagonal, exposed, facing, moved
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
 
 FAR = 1000.0
-"""A scanner's distance where the scan does not say it, in diagonals of the object."""
+"""Distance of a scanner where the scan does not say it, in diagonals of the object."""
 
 LEAST_EXPLAINED = 0.4
 """Share of the scan's points that must lie on the placed object: below, the start or the unit is wrong."""
 
 MEASURED = 200_000
-"""Residuals are taken at this many points at most."""
+"""Most points of the scan at which residuals are taken."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Rough poses.
+    """Rough poses of an object's segments, from which registration starts.
 
     Attributes:
-        poses: of every segment.
+        poses: ``T_scan_segment`` of every segment.
         own: whether the segment was given a pose of its own; the others share the object's.
-        how: for the truth file.
+        how: where they come from, for the truth file.
     """
 
     poses: Poses
@@ -46,18 +47,20 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class PlacedSegment:
-    """One segment in the scan. Lengths are in the scan's unit.
+    """Pose of one segment in the scan, and how well it fits. Lengths are in the scan's unit.
 
     Attributes:
-        name: of the segment.
-        T_scan_segment: from rest coordinates (scene units).
-        placed_by: "scan"; "object": as one with it, as asked; "start"; or "with NAME": at its place at rest relative to
-            that segment.
-        points: of the scan that lie on it.
-        median, rms, p95: of their distances; NaN without points.
-        shift: of its middle, from the start.
-        turn_deg: from the start.
-        held: in how many of six directions the scan did not constrain it.
+        name: name of the segment.
+        T_scan_segment: pose, from rest coordinates (scene units).
+        placed_by: what decided the pose: "scan"; "object": as one with it, as asked; "start"; or "with NAME": at its
+            place at rest relative to that segment.
+        points: number of the scan's points that lie on it.
+        median: median of their distances; NaN without points.
+        rms: root of their mean square; NaN without points.
+        p95: distance below which 95 % of them lie; NaN without points.
+        shift: distance of its middle from where it started.
+        turn_deg: angle from where it started.
+        held: number of the six directions in which the scan did not constrain it.
     """
 
     name: str
@@ -73,18 +76,18 @@ class PlacedSegment:
 
     @property
     def seen(self) -> bool:
-        """Whether the scan was asked for its place."""
+        """Whether the scan decided the segment's pose, by itself or as one with the object."""
         return self.placed_by in ("scan", "object")
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """All segments in the scan.
+    """Poses of all segments in a scan, and how much of it they explain.
 
     Attributes:
-        segments: in label order.
+        segments: pose and fit of each segment, in label order.
         mesh: the segments in the scan's frame and unit.
-        limit: points farther from the surface than this do not count, in the scan's unit.
+        limit: distance from the surface beyond which points do not count, in the scan's unit.
         explained: share of the scan's points within the limit.
     """
 
@@ -95,12 +98,12 @@ class Placement:
 
 
 def scale_of(pose: Float[np.ndarray, "4 4"]) -> float:
-    """Scan units per scene unit."""
+    """Scale of a similarity: scan units per scene unit; negative for a reflection."""
     return float(np.cbrt(np.linalg.det(pose[:3, :3])))
 
 
 def viewpoint_of(points: Float[np.ndarray, "n 3"], frame: CloudAxes, size: float) -> Float[np.ndarray, "3"]:
-    """Where the scanner stood: the origin of a camera frame, far off along z of a scanner's."""
+    """Place where the scanner stood: the origin of a camera frame, far off along z of a scanner's."""
     return np.zeros(3) if frame == "camera" else points.mean(axis=0) + np.array([0.0, 0.0, FAR * size])
 
 
@@ -117,10 +120,10 @@ def place(
 
     Args:
         rest: the object at rest, scene units.
-        points: the scan, any unit.
+        points: points of the scan, any unit.
         start: rough poses; the object's segments may be off by 20 degrees and a tenth of its size.
         frame: axes of the scan, as in ``mereo reconstruct``.
-        as_one: the object is rigid: only the first stage.
+        as_one: whether the object is rigid; then only the first stage is done.
         hold: names of segments that are placed as if the scan did not show them.
 
     Raises ``ValueError`` when the result cannot be right: most of the scan lies elsewhere, or a segment ran away.
@@ -192,7 +195,7 @@ def _with_neighbours(rest: SegmentedMesh, start: Start, found: Registration) -> 
 
 
 def neighbour(rest: SegmentedMesh, index: int, seen: Bool[np.ndarray, " s"], counts: Int[np.ndarray, " s"]) -> int:
-    """The seen segment nearest to segment ``index`` at rest; of several in contact the one with the most points."""
+    """Index of the seen segment nearest to another one at rest; of several in contact that with the most points."""
     solids, vertices = Solids(rest), rest.segments[index].vertices
     gaps = {int(other): float(solids.segment_distance(int(other), vertices).min()) for other in np.flatnonzero(seen)}
     reach = min(gaps.values()) + CONTACT * diagonal(rest)
@@ -209,8 +212,7 @@ def _measured(
     placed_by: Sequence[str],
 ) -> Placement:
     """Residuals at the scan's own points, not at the thinned ones."""
-    if len(points) > MEASURED:
-        points = points[np.random.default_rng(0).choice(len(points), MEASURED, replace=False)]
+    points = random_subset(points, MEASURED)
     matches = match(points, facing(moved(shown, found.poses), scan.viewpoint), found.matches.limit)
     segments = []
     for index, segment in enumerate(rest.segments):

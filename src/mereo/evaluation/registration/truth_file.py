@@ -20,17 +20,20 @@ from mereo.io.readers import read_point_cloud
 from mereo.scenes.registry import SCENES, load_scene
 
 TRUTH = "truth.json"
+"""Name of the file."""
+
 FORMAT = 1
+"""Version of the file's format; others are not read."""
 
 
 @dataclass(frozen=True)
 class ScanFile:
-    """The scan that a truth belongs to.
+    """File of the scan that a truth belongs to, and how to read it.
 
     Attributes:
-        path: the point cloud.
-        unit: of its coordinates.
-        frame: of its axes, as in ``mereo reconstruct``.
+        path: file of the point cloud.
+        unit: unit of its coordinates.
+        frame: its axes, as in ``mereo reconstruct``.
         drop_invalid: whether points without a measurement are left out on reading.
     """
 
@@ -76,13 +79,13 @@ def _relative(path: Path, place: Path) -> str:
 
 
 def sha256_of(path: Path) -> str:
-    """Hash of a file, in hexadecimal."""
+    """SHA-256 of a file's content, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_truth(path: str | Path) -> PosedScan:
-    """The scan and its placed segments, from truth.json or the folder that holds it.
+    """Scan with its placed segments, from truth.json or the folder that holds it.
 
     Raises ``FileNotFoundError`` where the file, its scan or its scene is missing, and ``ValueError`` where one of them
     is not what it was.

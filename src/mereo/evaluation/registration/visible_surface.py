@@ -17,31 +17,31 @@ Poses = Float[np.ndarray, "s 4 4"]
 """``T_scan_segment`` of each segment, in label order."""
 
 CONTACT = 0.005
-"""Faces nearer than this to another segment at rest are in contact, in diagonals of the object."""
+"""Distance from another segment at rest below which faces are in contact with it, in diagonals of the object."""
 
 FACING = -0.1
 """Least cosine between a face's normal and the way to the scanner; below 0, as the pose is not right yet."""
 
 CLUSTER = 6
-"""Points of a sample of the surface; five are the least from which the library estimates a normal."""
+"""Number of points of one sample of the surface; five are the least from which the library estimates a normal."""
 
 RING = 1e-3
 """Radius of a sample, in distances between samples."""
 
 
 def diagonal(mesh: SegmentedMesh) -> float:
-    """Of the joint box of all segments."""
+    """Length of the diagonal of the joint box of all segments."""
     low, high = mesh.bounds
     return float(np.linalg.norm(high - low))
 
 
 def thinned(points: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, "p 3"]:
-    """One of the points in each cell of a grid: their mean would lie off a curved surface."""
+    """One of the points in each cell of a grid; not their mean, which would lie off a curved surface."""
     return points[first_in_cell(points - points.min(axis=0), spacing)]
 
 
 def exposed(rest: SegmentedMesh) -> SegmentedMesh:
-    """The faces that can be seen from outside: not inside another segment and not within ``CONTACT`` of one."""
+    """Faces that can be seen from outside: not inside another segment and not within ``CONTACT`` of one."""
     solids, reach = Solids(rest), CONTACT * diagonal(rest)
     inner = {index for index, _ in rest.nesting}
     shown = []
@@ -55,13 +55,13 @@ def exposed(rest: SegmentedMesh) -> SegmentedMesh:
 
 
 def moved(mesh: SegmentedMesh, poses: Poses) -> SegmentedMesh:
-    """Each segment by its own transform."""
+    """Mesh whose segments are moved, each by its own transform."""
     pairs = zip(poses, mesh.segments, strict=True)
     return mesh.with_vertices([transform_points(pose, segment.vertices) for pose, segment in pairs])
 
 
 def facing(placed: SegmentedMesh, viewpoint: Float[np.ndarray, "3"]) -> SegmentedMesh:
-    """The faces that are turned towards ``viewpoint``."""
+    """Faces that are turned towards ``viewpoint``, or nearly."""
     return replace(placed, segments=tuple(_facing(segment, viewpoint) for segment in placed.segments))
 
 
@@ -74,7 +74,7 @@ def _facing(segment: Segment, viewpoint: Float[np.ndarray, "3"]) -> Segment:
 
 
 def face_areas(mesh: SegmentedMesh) -> Float[np.ndarray, " f"]:
-    """Of all faces of all segments."""
+    """Areas of all faces, segment by segment."""
     vertices, faces, _ = mesh.merged()
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
@@ -83,7 +83,7 @@ def face_areas(mesh: SegmentedMesh) -> Float[np.ndarray, " f"]:
 def sample_surface(
     mesh: SegmentedMesh, area: float, least: int = 1000, most: int = 20_000
 ) -> Float[np.ndarray, "n c 3"]:
-    """Places on the faces, uniformly, one for each ``area``; at each a tiny ring of ``CLUSTER`` points in the face.
+    """Samples spread evenly over the faces, one for each ``area``: tiny rings of ``CLUSTER`` points in the face.
 
     The library takes no normals but estimates them from neighbours. Rings make the estimate the face's own normal; from
     single points it is so rough that a ball seems to resist turning. The same places in every call.

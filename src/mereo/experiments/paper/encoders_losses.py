@@ -5,17 +5,19 @@ from dataclasses import replace
 from mereo.experiments.paper.result import Claim, Result, Row, better, published
 from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
-from mereo.models.config import Encoder
+from mereo.models.config import Encoder, Loss
 from mereo.synthesis.config import GenerateConfig
-from mereo.training.config import PRESETS, Loss, TrainConfig
+from mereo.training.config import PRESETS, TrainConfig
 
 OBJECTS = ("rope", "shapes", "robot", "lizard", "human")
+"""Scenes of the paper's comparison."""
+
 ENCODERS: tuple[Encoder, ...] = ("pointnet2", "point-transformer", "autodecoder")
 LOSSES: tuple[Loss, ...] = ("ce", "l1", "ce+l1", "ce+l1+cd")
 
 
 def recipe(base: TrainConfig, encoder: Encoder, loss: Loss) -> TrainConfig | None:
-    """The recipe with another encoder and loss; None where the two do not go together.
+    """Recipe with another encoder and loss; None where the two do not go together.
 
     The autodecoder searches its code by distances: a loss without them leaves nothing to search by. It has a recipe of
     its own in the paper (batch, rates, dropout; its passes are 1000 / 300 times as many), and no local features.
@@ -25,10 +27,9 @@ def recipe(base: TrainConfig, encoder: Encoder, loss: Loss) -> TrainConfig | Non
     if loss == "ce":
         return None
     own = PRESETS["paper-autodecoder"]
-    network = replace(
-        base.network,
+    network = base.network.changed(
         encoder=encoder,
-        dropout=own.network.dropout,
+        dropout=own.network.decoder.dropout,
         local_neighbors=0,
         sight_neighbors=0,
         align_points=0,
@@ -45,7 +46,7 @@ def recipe(base: TrainConfig, encoder: Encoder, loss: Loss) -> TrainConfig | Non
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
-    """One training for each object, encoder and loss; by default one object, because there are eleven of them."""
+    """Result of one training for each object, encoder and loss; of small scales for one object, as these are eleven."""
     rows: list[Row] = []
     scores: dict[tuple[str, str, str], Score] = {}
     objects = scale.choose(OBJECTS)[: 1 if scale.objects else None]

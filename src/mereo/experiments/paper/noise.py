@@ -8,14 +8,14 @@ from mereo.experiments.paper.store import Score, Store
 from mereo.synthesis.config import GenerateConfig
 
 OBJECTS = ("robot", "rope")
-"""The paper's, and one more."""
+"""Scenes: the paper's, and one more."""
 
 LEVELS = (0.1, 0.5, 2.0)
-"""Standard deviations in scene units."""
+"""Standard deviations of the depth noise in scene units."""
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
-    """Three trainings and nine evaluations per object."""
+    """Result of three trainings and nine evaluations per object."""
     rows, claims = [], []
     scores: dict[tuple[str, float, float], Score] = {}
     objects = scale.choose(OBJECTS)

@@ -11,14 +11,14 @@ OBJECTS = ("rope", "shapes", "lizard", "robot", "human")
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
-    """Two trainings per object that differ in nothing else."""
+    """Result of two trainings per object, with and without the encoding, that differ in nothing else."""
     rows, holds = [], {}
     for scene in scale.choose(OBJECTS):
         paper = published()["positional-encoding"].get(scene, {})
         dataset = store.dataset(scene, GenerateConfig(), scale.examples)
         scores = {}
         for variant, encode in (("on", True), ("off", False)):
-            recipe = replace(scale.recipe, network=replace(scale.recipe.network, encode_positions=encode))
+            recipe = replace(scale.recipe, network=scale.recipe.network.changed(encode_positions=encode))
             weights = store.run(dataset, recipe)
             scores[variant] = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
             rows.append(Row(scene, variant, scores[variant], paper.get(variant)))

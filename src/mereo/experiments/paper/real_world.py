@@ -1,4 +1,4 @@
-"""Trained on synthetic views alone, tested on real scans (paper, section 4.3).
+"""Test on real scans of a network that was trained on synthetic views alone (paper, section 4.3).
 
 The paper scans a printed lizard; its scans are not public. Ours are four range scans of the Stanford bunny with known
 poses.
@@ -15,7 +15,7 @@ NOTES = ("The paper's figures are those of its printed lizard (15 scans), ours o
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
-    """One training; the synthetic score beside the real one."""
+    """Result of one training: the synthetic score beside the real one."""
     weights = store.run(store.dataset("bunny", GenerateConfig(), scale.examples), scale.recipe)
     synthetic = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
     evaluation = evaluate_scans(load_model(weights), cells=scale.cells)
@@ -28,4 +28,4 @@ def run(store: Store, scale: ExperimentScale) -> Result:
         "Scores on real scans are considerably lower than on synthetic views (IoU by more than 0.1).",
         {"bunny": real.iou < synthetic.iou - 0.1},
     )
-    return Result("real-world", "Real scans", scale.name, rows, (claim,), NOTES, evaluation.cases)
+    return Result("real-world", "Real scans", scale.name, rows, (claim,), NOTES, evaluation.views)

@@ -1,18 +1,18 @@
-"""Every object, reconstructed and segmented (paper, section 4.2 and appendix A)."""
+"""Reconstruction and segmentation of every object (paper, section 4.2 and appendix A)."""
 
 from mereo.evaluation.scoring import EvaluatedView
 from mereo.experiments.paper.result import Claim, Result, Row, published
 from mereo.experiments.paper.scales import ExperimentScale
-from mereo.experiments.paper.store import Score, Store, example_case
+from mereo.experiments.paper.store import Score, Store, example_view
 from mereo.synthesis.config import GenerateConfig
 
 OBJECTS = ("rope", "shapes", "robot", "lizard", "sheet", "bunny", "human", "skull", "liver", "engine")
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
-    """One training per object and recipe; with a rival recipe both are reported on the same data."""
+    """Result of one training per object and recipe; with a rival recipe both are reported on the same data."""
     rows: list[Row] = []
-    cases: list[EvaluatedView] = []
+    views: list[EvaluatedView] = []
     ours: dict[str, Score] = {}
     recipes = {"recipe": scale.recipe} if scale.rival is None else {"paper": scale.recipe, "large": scale.rival}
     for scene in OBJECTS if scale.decides else scale.choose(OBJECTS):
@@ -21,7 +21,7 @@ def run(store: Store, scale: ExperimentScale) -> Result:
             weights = store.run(dataset, recipe)
             ours[scene] = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
             rows.append(Row(scene, variant, ours[scene], published()["reconstruction"].get(scene)))
-        cases.append(example_case(weights, GenerateConfig(), scale.cells))
+        views.append(example_view(weights, GenerateConfig(), scale.cells))
     paper = published()["reconstruction"]
     claims = (
         Claim("mIoU is at least the paper's.", {name: s.miou >= paper[name]["miou"] for name, s in ours.items()}),
@@ -33,5 +33,5 @@ def run(store: Store, scale: ExperimentScale) -> Result:
     )
     notes = ("Our meshes are not the paper's, so the figures are neighbours, not the same measurement.",)
     return Result(
-        "reconstruction", "Reconstruction of every object", scale.name, tuple(rows), claims, notes, tuple(cases)
+        "reconstruction", "Reconstruction of every object", scale.name, tuple(rows), claims, notes, tuple(views)
     )

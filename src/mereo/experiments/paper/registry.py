@@ -1,4 +1,4 @@
-"""Experiments by name."""
+"""Experiments by name, and how one is run."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What an experiment found, beside what the paper says: as Markdown, JSON and a bar chart."""
+"""Result of an experiment, beside what the paper says: as Markdown, JSON and a bar chart."""
 
 import json
 from collections.abc import Mapping
@@ -13,18 +13,19 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from mereo.evaluation.metrics import format_score
 from mereo.evaluation.scoring import EvaluatedView
 from mereo.experiments.paper.store import Score
 from mereo.io.atomic_files import atomic_file, new_directory, write_json
 from mereo.visualization.error_maps import error_picture
 
 Figures = dict[str, float]
-"""``iou`` and ``miou``, or only one of them."""
+"""Scores published in the paper: ``iou`` and ``miou``, or only one of them."""
 
 
 @cache
 def published() -> dict[str, Any]:
-    """The paper's figures by experiment, and then as each experiment's table is built."""
+    """Scores published in the paper, by experiment, and then as each experiment's table is built."""
     text = resources.files("mereo.experiments.paper").joinpath("published.json").read_text("utf-8")
     figures: dict[str, Any] = json.loads(text)
     return figures
@@ -32,13 +33,13 @@ def published() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Row:
-    """One measured variant.
+    """Score of one variant, a row of an experiment's table.
 
     Attributes:
-        object: the scene.
-        variant: what was varied.
-        score: ours.
-        paper: the paper's figures for it, where it has any.
+        object: name of the scene.
+        variant: what was varied, in words.
+        score: what was measured here.
+        paper: what the paper says of it, where it does.
     """
 
     object: str
@@ -49,11 +50,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of the paper and whether our figures bear it out.
+    """Claim of the paper, and whether what was measured here bears it out.
 
     Attributes:
-        text: a sentence.
-        holds: by object; objects on which it could not be tried are left out.
+        text: the claim in a sentence.
+        holds: whether it holds, by object; objects on which it could not be tried are left out.
     """
 
     text: str
@@ -61,7 +62,7 @@ class Claim:
 
     @property
     def verdict(self) -> str:
-        """Agreement in a sentence."""
+        """Sentence that says for which objects the claim holds."""
         yes = [name for name, held in self.holds.items() if held]
         no = [name for name, held in self.holds.items() if not held]
         if not self.holds:
@@ -75,15 +76,16 @@ class Claim:
 
 @dataclass(frozen=True)
 class Result:
-    """A table, what to make of it, and how it was made.
+    """Result of an experiment: a table, what to make of it, and how it was made.
 
     Attributes:
-        name, title: of the experiment.
-        scale: the budget's name.
-        rows: in the table's order.
-        claims: of the paper.
+        name: name of the experiment.
+        title: heading of the table.
+        scale: name of the budget.
+        rows: variants in the table's order.
+        claims: claims of the paper.
         notes: sentences on what differs from the paper's experiment.
-        cases: rows of the paper's figure of reconstructions.
+        views: rows of the paper's figure of reconstructions.
         figures: further pictures by the names of their files.
     """
 
@@ -93,32 +95,32 @@ class Result:
     rows: tuple[Row, ...]
     claims: tuple[Claim, ...]
     notes: tuple[str, ...] = ()
-    cases: tuple[EvaluatedView, ...] = ()
+    views: tuple[EvaluatedView, ...] = ()
     figures: Mapping[str, Figure] = field(default_factory=dict)
 
 
 def better(score: Score, other: Score) -> bool:
-    """By mIoU, or by IoU where one of the two knows no segments."""
+    """Whether a score is better than another: by mIoU, or by IoU where one of the two knows no segments."""
     if isnan(score.miou) or isnan(other.miou):
         return score.iou > other.iou
     return score.miou > other.miou
 
 
 def write_result(result: Result, directory: Path, force: bool = True) -> None:
-    """table.md, results.json, figure.png and what other pictures there are in a new directory, whole or not at all."""
+    """Write table.md, results.json, figure.png and further pictures into a new directory, whole or not at all."""
     with new_directory(directory, force=force) as partial:
         with atomic_file(partial / "table.md") as path:
             path.write_text(markdown(result), encoding="utf-8")
         write_json(partial / "results.json", _plain(result))
         draw_bars(result, partial / "figure.png")
-        if result.cases:
-            error_picture(partial / "reconstructions.png", result.cases)
+        if result.views:
+            error_picture(partial / "reconstructions.png", result.views)
         for name, figure in result.figures.items():
             _save(figure, partial / name)
 
 
 def markdown(result: Result) -> str:
-    """The table with the paper's figures beside ours, and each claim with its verdict."""
+    """Markdown table with the paper's scores beside ours, and each claim with its verdict."""
     lines = [f"# {result.title}", "", f"Scale `{result.scale}`. {' '.join(result.notes)}".rstrip(), ""]
     lines += [
         "| object | variant | IoU | mIoU | mean IoU | mean mIoU | paper IoU | paper mIoU |",
@@ -128,14 +130,10 @@ def markdown(result: Result) -> str:
         score, paper = row.score, row.paper or {}
         ours = (score.iou, score.miou, score.example_iou, score.example_miou)
         figures = [*ours, paper.get("iou", float("nan")), paper.get("miou", float("nan"))]
-        lines.append(f"| {row.object} | {row.variant} | {' | '.join(_cell(value) for value in figures)} |")
+        lines.append(f"| {row.object} | {row.variant} | {' | '.join(format_score(value, '') for value in figures)} |")
     lines += ["", "IoU and mIoU are over the whole test set, the means over its examples.", ""]
     lines += [f"- {claim.text} {claim.verdict}" for claim in result.claims]
     return "\n".join(lines) + "\n"
-
-
-def _cell(value: float) -> str:
-    return "" if isnan(value) else f"{value:.3f}"
 
 
 def _plain(result: Result) -> dict[str, Any]:
@@ -147,7 +145,7 @@ def _plain(result: Result) -> dict[str, Any]:
 
 
 def draw_bars(result: Result, path: Path) -> None:
-    """One group of bars per object: IoU (pale) and mIoU (full) of each variant; the paper's figure as a black line."""
+    """Draw a group of bars per object: IoU (pale) and mIoU (full) of each variant, and the paper's as black lines."""
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
     from matplotlib.patches import Patch

@@ -1,4 +1,4 @@
-"""Where training queries are drawn (paper, table 1): Volume Uniform, Label Uniform, SortSample; and two more."""
+"""Samplers of training queries (paper, table 1): Volume Uniform, Label Uniform, SortSample; and two more."""
 
 from dataclasses import replace
 
@@ -19,11 +19,11 @@ SETTINGS: dict[str, SamplingConfig] = {
     "sort-sample, n = 2k": SamplingConfig(sampler="sort-sample", oversample=2),
     "nested-sort-sample": SamplingConfig(sampler="nested-sort-sample"),
 }
-"""The paper's three at n = k, what it describes besides, and its authors' later sampler."""
+"""Samplers compared: the paper's three at n = k, what it describes besides, and its authors' later one."""
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
-    """One training per object and sampler, with one recipe and one seed."""
+    """Result of one training per object and sampler, with one recipe and one seed."""
     rows = []
     for scene in scale.choose(OBJECTS):
         paper = published()["sampling"].get(scene, {})

@@ -1,4 +1,4 @@
-"""The paper's sampling figure: where each sampler puts its points on three toy shapes in two dimensions.
+"""Figure of the paper's samplers: where each sampler puts its points on three toy shapes in two dimensions.
 
 The samplers of ``mereo.synthesis.query_sampling`` ask an object five things (``Shape``); ``Polygons2D`` shows how
 little it takes to make one. The outlines are in ``toy2d.json``, with the square from which the paper draws candidates.
@@ -20,13 +20,13 @@ from matplotlib.figure import Figure
 from mereo.synthesis.query_sampling import Samples, label_uniform, sort_sample, volume_uniform
 
 KEEP = 256
-"""Points per side, the k of the paper's figure."""
+"""Number of points on each side of the surface, the k of the paper's figure."""
 
 Polygon = Float[np.ndarray, "v 2"]
 
 
 class Polygons2D:
-    """Segments as simple polygons, corners in order, either way round. Satisfies ``ownership.Shape``."""
+    """Object whose segments are simple polygons, corners in order, either way round: a ``label_rules.Shape``."""
 
     nesting: tuple[tuple[int, int], ...] = ()
 
@@ -35,10 +35,11 @@ class Polygons2D:
         self.count = len(outlines)
 
     def boxes(self) -> Float[np.ndarray, "s 2 2"]:
+        """Lower and upper corner of each segment's box."""
         return np.stack([[outline.min(axis=0), outline.max(axis=0)] for outline in self.outlines])
 
     def inside(self, index: int, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-        """Even-odd rule: a ray to the right crosses the outline an odd number of times."""
+        """Whether points lie in a segment: a ray to the right crosses its outline an odd number of times."""
         start, edge = _edges(self.outlines[index])
         x, y = points[:, :1], points[:, 1:]
         spans = (start[:, 1] > y) != (start[:, 1] + edge[:, 1] > y)
@@ -47,13 +48,14 @@ class Polygons2D:
         return (spans & right).sum(axis=1) % 2 == 1
 
     def label(self, points: Float[np.ndarray, "n 2"]) -> UInt8[np.ndarray, " n"]:
+        """Label of each point: 0 in empty space, else index + 1 of the first segment that holds it."""
         labels = np.zeros(len(points), dtype=np.uint8)
         for index in reversed(range(self.count)):
             labels[self.inside(index, points)] = index + 1
         return labels
 
     def segment_distance(self, index: int, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """To the nearest point of the nearest edge."""
+        """Distance of each point to the outline of a segment."""
         start, edge = _edges(self.outlines[index])
         offset = points[:, None] - start
         along = np.clip((offset * edge).sum(axis=2) / (edge**2).sum(axis=1), 0, 1)
@@ -65,7 +67,7 @@ def _edges(outline: Polygon) -> tuple[Polygon, Polygon]:
 
 
 def read_outlines() -> tuple[dict[str, Polygon], Float[np.ndarray, "2 2"]]:
-    """The toy shapes by name, and the square from which the figure's candidates are drawn."""
+    """Outlines of the toy shapes by name, and the square from which the figure's candidates are drawn."""
     data = json.loads(resources.files("mereo.experiments.paper").joinpath("toy2d.json").read_text("utf-8"))
     return {name: np.array(corners) for name, corners in data["shapes"].items()}, np.array(data["candidates_box"])
 
@@ -77,7 +79,7 @@ SAMPLERS: dict[str, Callable[[Polygons2D, np.random.Generator, Boxes], Samples]]
     "SortSample, n = k": lambda shape, rng, boxes: sort_sample(shape, KEEP, KEEP, rng, boxes),
     "SortSample, n = 2k": lambda shape, rng, boxes: sort_sample(shape, KEEP, 2 * KEEP, rng, boxes),
 }
-"""The figure's rows."""
+"""Samplers of the figure's rows by their titles."""
 
 
 def _gradient(name: str) -> Colormap:
@@ -90,7 +92,7 @@ DISTANCE = Normalize(0.0, 0.6, clip=True)
 
 
 def draw_panel(axes: Axes, shape: Polygons2D, samples: Samples) -> None:
-    """Points coloured by side and by distance to the surface, over the outline; their numbers below."""
+    """Draw points coloured by side and by distance to the surface, over the outline, and their numbers below."""
     for outline in shape.outlines:
         axes.fill(*outline.T, facecolor="0.955", edgecolor="0.25", linewidth=0.9, zorder=1)
     inside = samples.labels > 0
@@ -102,7 +104,7 @@ def draw_panel(axes: Axes, shape: Polygons2D, samples: Samples) -> None:
 
 
 def draw_bar(axes: Axes, colors: Colormap, side: str) -> None:
-    """What the gradient of one side means."""
+    """Draw what the gradient of one side means."""
     mappable = ScalarMappable(DISTANCE, colors)
     bar = Colorbar(axes, mappable, orientation="horizontal", extend="max" if side == "outside" else "neither")
     bar.set_label(f"{side}, distance to the outline", fontsize=8)
@@ -110,7 +112,7 @@ def draw_bar(axes: Axes, colors: Colormap, side: str) -> None:
 
 
 def draw_figure(rng: np.random.Generator) -> Figure:
-    """One row per sampler, one column per shape, as in the paper; a legend of both gradients below."""
+    """Figure with a row per sampler and a column per shape, as in the paper, and both gradients explained below."""
     outlines, box = read_outlines()
     figure = Figure(figsize=(6.6, 9.6))
     rows = figure.add_gridspec(2, 1, height_ratios=(60, 1), hspace=0.1, left=0.05, right=0.98, bottom=0.05, top=0.97)

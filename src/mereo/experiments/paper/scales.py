@@ -1,4 +1,4 @@
-"""How large an experiment is: in minutes to prove that it runs, in hours on two cores, or as published."""
+"""Budgets of experiments: minutes to prove that they run, hours on two cores, or as published."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -9,20 +9,21 @@ ExperimentName = Literal["reconstruction", "encoders-losses", "sampling", "posit
 ScaleName = Literal["smoke", "cpu", "paper"]
 
 TRAINING_SEED = 1
-"""Of all datasets; test views come from ``config.TEST_SEED_START``."""
+"""Seed of all datasets; test views come from ``TEST_SEED_START``."""
 
 
 @dataclass(frozen=True)
 class ExperimentScale:
-    """A budget.
+    """Budget of an experiment: how much is made, trained and tested.
 
     Attributes:
-        name: its own.
+        name: name of the budget.
         recipe: training settings, from which an experiment changes what it compares.
         rival: a second recipe to report beside it where an experiment compares whole recipes; None for one only.
-        examples, test_examples: of each dataset, and of each evaluation.
-        cells: of the evaluation's grid along each axis; the paper's is 100.
-        objects: the most objects on which variants are compared, in an experiment's own order; None means all.
+        examples: number of examples of each dataset.
+        test_examples: number of test views of each evaluation.
+        cells: cells of the evaluation's grid along each axis; the paper's is 100.
+        objects: most objects on which variants are compared, in an experiment's own order; None means all.
         downloads: whether objects are taken whose meshes are downloaded.
         decides: whether networks learn enough for claims to be judged.
     """
@@ -38,12 +39,13 @@ class ExperimentScale:
     decides: bool = True
 
     def choose(self, objects: tuple[str, ...]) -> tuple[str, ...]:
-        """Those of an experiment's objects that fit the budget."""
+        """Objects of an experiment that fit the budget, in its order."""
         known = objects if self.downloads else tuple(name for name in objects if name not in DOWNLOADED)
         return known[: self.objects]
 
 
 DOWNLOADED = ("human", "bunny", "skull", "liver", "tumor", "liver-simulated")
+"""Scenes whose meshes are downloaded."""
 
 _TINY, _PAPER = PRESETS["tiny"], PRESETS["paper"]
 
@@ -52,7 +54,7 @@ _TINY, _PAPER = PRESETS["tiny"], PRESETS["paper"]
 # each variant of the paper can be switched on its own in it, and it learns in minutes what the paper's network does not
 # learn in hours (docs/design/0002-learning.md).
 _SHORT = replace(
-    _TINY, network=replace(_TINY.network, points=512, align_points=0, rest_template=False), epochs=8, holdout=32
+    _TINY, network=_TINY.network.changed(points=512, align_points=0, rest_template=False), epochs=8, holdout=32
 )
 
 _ALL = (
@@ -62,3 +64,4 @@ _ALL = (
 )
 
 SCALES = {str(scale.name): scale for scale in _ALL}
+"""Budgets by name."""

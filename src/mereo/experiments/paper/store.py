@@ -24,14 +24,19 @@ from mereo.training.trainer import train
 from mereo.visualization.result_files import evaluate_weights
 
 FINISHED = "finished.json"
-"""Written into a run's folder after its last step."""
+"""Name of a file that is written into a run's folder after its last step."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """IoU and mIoU over a whole test set (paper, appendix B), and the means over its examples.
+    """Score of a model: IoU and mIoU over a whole test set (paper, appendix B), and the means over its examples.
 
-    ``miou`` is NaN for a model that knows no segments.
+    Attributes:
+        iou: of all segments as one, over the whole set.
+        miou: mean over the segments, over the whole set; NaN for a model that knows no segments.
+        example_iou: mean of the examples' IoU.
+        example_miou: mean of the examples' mIoU; NaN for a model that knows no segments.
+        per_segment: IoU of each segment over the whole set, by name; NaN where it occurs nowhere.
     """
 
     iou: float
@@ -43,13 +48,18 @@ class Score:
 
 @dataclass(frozen=True)
 class Store:
-    """A folder of results; ``workers`` processes make datasets, which does not change them."""
+    """Folder in which datasets, runs and scores are made once and found again.
+
+    Attributes:
+        root: the folder.
+        workers: number of processes that make datasets, which does not change them.
+    """
 
     root: Path
     workers: int = 1
 
     def dataset(self, scene: str, settings: GenerateConfig, examples: int) -> Path:
-        """A training set, made or found."""
+        """Folder of a training set, made or found."""
         manifest = make_manifest(load_scene(scene), settings, examples, TRAINING_SEED)
         decisive = {key: value for key, value in manifest.items() if key not in NOT_COMPARED}
         path = self.root / "datasets" / f"{scene}-{content_key(decisive)}"
@@ -59,8 +69,8 @@ class Store:
         return path
 
     def run(self, dataset: Path, config: TrainConfig) -> Path:
-        """The weights of a training run, made, continued or found."""
-        path = self.root / "runs" / f"{_scene_of(dataset)}-{content_key([dataset.name, asdict(config)])}"
+        """Weights' file of a training run, made, continued or found."""
+        path = self.root / "runs" / f"{_scene_of(dataset)}-{content_key([dataset.name, config.to_dict()])}"
         weights = path / "weights.safetensors"
         _say("run", path)
         if not (path / FINISHED).exists():
@@ -69,7 +79,7 @@ class Store:
         return weights
 
     def score(self, weights: Path, settings: GenerateConfig, examples: int, cells: int) -> Score:
-        """A run's score on test views that are seen as ``settings`` say."""
+        """Score of a run's weights on test views that are seen as ``settings`` say."""
         scene = _scene_of(weights.parent)
         key = content_key([weights.parent.name, asdict(settings), examples, cells, TEST_SEED_START])
         path = self.root / "scores" / f"{scene}-{key}"
@@ -79,24 +89,21 @@ class Store:
         return read_score(path / "metrics.json")
 
 
-def example_case(weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
-    """The first test view with its labels, for pictures."""
+def example_view(weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
+    """First test view of a run's weights with its labels, for pictures."""
     evaluation = evaluate(load_model(weights), examples=1, cells=cells, settings=settings)
-    return evaluation.cases[0]
+    return evaluation.views[0]
 
 
 def read_score(path: Path) -> Score:
-    """From the ``metrics.json`` of an evaluation, in which null stands for NaN."""
-    metrics = json.loads(path.read_text("utf-8"))
+    """Score from the ``metrics.json`` of an evaluation, in which null stands for NaN."""
+    metrics = json.loads(path.read_text("utf-8"), object_hook=_with_nan)
     mean = metrics["example_mean"]
-    per_segment = {name: _number(value) for name, value in metrics["per_segment"].items()}
-    values = (_number(value) for value in (metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]))
-    iou, miou, example_iou, example_miou = values
-    return Score(iou, miou, example_iou, example_miou, per_segment)
+    return Score(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"], metrics["per_segment"])
 
 
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
+def _with_nan(read: dict[str, Any]) -> dict[str, Any]:
+    return {key: float("nan") if value is None else value for key, value in read.items()}
 
 
 def content_key(value: Any) -> str:

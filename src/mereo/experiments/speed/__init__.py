@@ -1,1 +1,1 @@
-"""How fast, stage by stage: against the machine's floor, and against the straightforward implementation."""
+"""Speed, stage by stage: against the machine's floor (roofline), and against the straightforward implementation."""

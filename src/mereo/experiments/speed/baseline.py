@@ -1,4 +1,4 @@
-"""The straightforward implementation of the same network, to compare with: what one writes first.
+"""Baseline of speed: the straightforward implementation of the same network, which is what one writes first.
 
 Float32, eager; the code is concatenated to every query instead of being multiplied once per cloud; normalization is a
 layer of its own; farthest-point sampling inside the network, and the encoder run again for every chunk of queries. It
@@ -17,11 +17,18 @@ from mereo.models.model import Model
 from mereo.models.network import Network
 
 CHUNK = 50_000
-"""Queries at once."""
+"""Number of queries that are answered at once."""
 
 
 class Rival:
-    """A model's answers about one cloud. ``cloud`` and ``viewpoint`` are normalized, one cloud, any order."""
+    """Straightforward implementation of a model's answers about one cloud.
+
+    Attributes:
+        model: the model whose weights are taken.
+        cloud: normalized points of the cloud, in any order.
+        normalizer: the way from the user's frame to normalized coordinates.
+        viewpoint: the normalized place of the camera.
+    """
 
     def __init__(self, model: Model, cloud: Float[Tensor, "1 n 3"], normalizer: Normalizer) -> None:
         self.model, self.cloud, self.normalizer = model, cloud, normalizer
@@ -39,7 +46,7 @@ class Rival:
         return torch.cat(chunks).numpy()
 
     def _predict(self, network: Network, queries: Float[Tensor, "1 q 3"]) -> Prediction:
-        count = int(self.cloud.shape[1] * network.config.ratio1)
+        count = int(self.cloud.shape[1] * network.config.pointnet2.ratio1)
         first = farthest_points(self.cloud[0], count)
         rest = torch.ones(self.cloud.shape[1], dtype=torch.bool, device=first.device)
         rest[first] = False
@@ -51,7 +58,7 @@ class Rival:
 
 
 def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, " m"]:
-    """Greedy farthest-point sampling from the first point on, one point after the other; repeated points last."""
+    """Rows of points by greedy farthest-point sampling from the first one on; repeated points come last."""
     distance = torch.full((len(points),), torch.inf, device=points.device)
     chosen = [torch.zeros((), dtype=torch.long, device=points.device)]
     while len(chosen) < count:
@@ -62,21 +69,21 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, " m
 
 
 def decode(decoder: Decoder, code: Code, latent: Float[Tensor, "1 z"], queries: Float[Tensor, "1 q 3"]) -> Prediction:
-    """As ``Decoder.forward``, with the latent vector at every query; the layers are the decoder's own."""
-    config = decoder.config
+    """Prediction as of ``Decoder.forward``, with the latent vector at every query; the layers are the decoder's own."""
+    layers, added = decoder.config.decoder, decoder.config.additions
     everywhere = latent[:, None].expand(-1, queries.shape[1], -1)
     placed = queries if code.alignment is None else code.alignment.apply(queries)
-    encoded = decoder.encode(placed) if config.encode_positions else placed
+    encoded = decoder.encode(placed) if layers.encode_positions else placed
     rows = [everywhere, encoded]
-    if config.local_neighbors:
+    if added.local_neighbors:
         rows += [layer(level, placed) for layer, level in zip(decoder.local, code.levels, strict=True)]
-    if config.sight_neighbors:
-        rows.append(line_of_sight(queries, code.cloud, code.viewpoint, config.sight_neighbors))
+    if added.sight_neighbors:
+        rows.append(line_of_sight(queries, code.cloud, code.viewpoint, added.sight_neighbors))
     hidden = encoded
     for number, norm in enumerate(decoder.norms):
         if number > 0:
             rows = [hidden]
-        if number == config.skip_after:
+        if number == layers.skip_after:
             rows += [everywhere, encoded]
             if decoder.lookup is not None:
                 rows.append(decoder.lookup(hidden, placed)[1])

@@ -1,4 +1,4 @@
-"""A network of any preset that knows one view: as costly to ask as a trained one, and with surfaces to extract."""
+"""Model of any preset that knows one view: as costly to ask as a trained one, and with surfaces to extract."""
 
 from dataclasses import replace
 
@@ -16,18 +16,19 @@ from mereo.models.network import Network
 from mereo.training.config import PRESETS
 
 STEPS, QUERIES = 200, 2048
+"""Number of training steps, and of queries in each."""
 
 
-def fitted_model(preset: str, frame: SampleView) -> Model:
-    """The preset's network, fitted to the labels of one frame in ``STEPS`` steps (seconds to a minute on a CPU).
+def fitted_model(preset: str, view: SampleView) -> Model:
+    """Model with a preset's network, fitted to the labels of one view (in seconds to a minute on a CPU).
 
     It knows nothing else: how long it takes can be measured with it, not how good it is.
     """
-    grid, kept = frame.truth.grid, frame.truth.kept
+    grid, kept = view.truth.grid, view.truth.kept
     torch.manual_seed(0)
-    network = Network(replace(PRESETS[preset].network, dropout=0.0), len(grid.names))
+    network = Network(PRESETS[preset].network.changed(dropout=0.0), len(grid.names))
     model = Model(network, grid.names, tuple(PALETTE[i % len(PALETTE)] for i in range(len(grid.names))))
-    cloud, normalizer = model.normalized_cloud(frame.depth.to_points())
+    cloud, normalizer = model.normalized_cloud(view.depth.to_points())
     model = replace(model, domain=_domain(grid, normalizer))
     viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32))
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
@@ -41,10 +42,10 @@ def fitted_model(preset: str, frame: SampleView) -> Model:
 
     network.train()
     if network.aligner is not None:
-        network.aligner.eval()  # one frame teaches no alignment: any that stays the same will do
+        network.aligner.eval()  # one view teaches no alignment: any that stays the same will do
     for _ in range(STEPS):
         queries, labels = draw()
-        loss = nn.functional.cross_entropy(network(cloud, viewpoint, queries)[0][0], labels)
+        loss = nn.functional.cross_entropy(network(cloud, viewpoint, queries).prediction.logits[0], labels)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -61,7 +62,7 @@ def fitted_model(preset: str, frame: SampleView) -> Model:
 
 
 def _domain(grid: LabelGrid, normalizer: Normalizer) -> Box:
-    """The box that the frame teaches, normalized; as from a trained network nothing is answered beyond it."""
+    """The box that the view teaches, normalized; as from a trained network nothing is answered beyond it."""
     corners = normalizer.apply(np.stack([grid.origin, grid.origin + grid.spacing * grid.labels.shape]))
     (x0, y0, z0), (x1, y1, z1) = corners.tolist()
     return (x0, y0, z0), (x1, y1, z1)

@@ -1,4 +1,4 @@
-"""What ``mereo bench`` prints and writes."""
+"""Report of ``mereo bench``: what it prints and writes."""
 
 import os
 import platform
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mereo.evaluation.sample_views import SampleView, load_frame, shipped_frames
+from mereo.evaluation.sample_views import SampleView, load_view, shipped_views
 from mereo.experiments.speed.fitted_model import fitted_model
 from mereo.experiments.speed.roofline import Machine, measure_machine
 from mereo.experiments.speed.stages import Bench, Stage, random_points
@@ -22,7 +22,7 @@ from mereo.models.weights import load_model
 
 @dataclass(frozen=True)
 class Cost:
-    """What a lower precision changes at 40,000 points of the object's box.
+    """Change of a model's answers by a lower precision, at 40,000 points of the object's box.
 
     Attributes:
         labels: share of points with another label.
@@ -44,16 +44,24 @@ def benchmark(
 ) -> list[Stage]:
     """Time all stages, print the table, and write it as JSON where ``output`` says so.
 
-    Weights are a shipped name or a file with a shipped frame of its object; without, the preset's network is fitted to
-    a frame first. Raises ``ValueError`` for weights of an object without a shipped frame.
+    Args:
+        weights: a shipped name or a file, with a shipped view of its object; None fits the preset's network first.
+        preset: name of the architecture to fit.
+        device: where the network runs.
+        precision: precision of the network's products.
+        repeats: repetitions of each stage.
+        rival: whether to time the straightforward implementation too.
+        output: a JSON file, or None.
+
+    Raises ``ValueError`` for weights of an object without a shipped view.
     """
-    model, frame = _subject(weights, preset)
+    model, view = _subject(weights, preset)
     model.network.to(device)
     fast = replace(model, precision=precision)
     machine = measure_machine(device, fast.working_dtype)
-    stages = Bench(fast, frame, machine, repeats, rival).run()
+    stages = Bench(fast, view, machine, repeats, rival).run()
     facts = _facts(weights or f"preset {preset}, fitted to one frame", fast, machine)
-    cost = _cost(model, fast, frame) if fast.working_dtype is not torch.float32 else None
+    cost = _cost(model, fast, view) if fast.working_dtype is not torch.float32 else None
     print(table(stages, facts, cost))
     if output is not None:
         rows = [{**asdict(stage), "ratio": stage.ratio} for stage in stages]
@@ -64,16 +72,16 @@ def benchmark(
 
 def _subject(weights: str | None, preset: str) -> tuple[Model, SampleView]:
     if weights is None:
-        frame = load_frame(shipped_frames()[0])
-        return fitted_model(preset, frame), frame
+        view = load_view(shipped_views()[0])
+        return fitted_model(preset, view), view
     model = load_model(weights)
     scene = str(model.provenance.get("scene"))
-    if scene not in shipped_frames():
+    if scene not in shipped_views():
         raise ValueError(
             f"the weights know {scene!r}, of which no frame is shipped; there are frames of "
-            f"{', '.join(shipped_frames())}: time the architecture instead, with --preset"
+            f"{', '.join(shipped_views())}: time the architecture instead, with --preset"
         )
-    return model, load_frame(scene)
+    return model, load_view(scene)
 
 
 def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:
@@ -91,9 +99,9 @@ def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:
     }
 
 
-def _cost(exact: Model, fast: Model, frame: SampleView) -> Cost:
-    cloud = frame.depth.to_points()
-    points = random_points(frame, 40_000, seed=1)
+def _cost(exact: Model, fast: Model, view: SampleView) -> Cost:
+    cloud = view.depth.to_points()
+    points = random_points(view, 40_000, seed=1)
     code = exact.encode(cloud)
     one, two = exact.query(code, points), fast.query(fast.encode(cloud), points)
     change = np.abs(one.distance - two.distance).mean() * code.normalizer.scale
@@ -101,7 +109,7 @@ def _cost(exact: Model, fast: Model, frame: SampleView) -> Cost:
 
 
 def table(stages: list[Stage], facts: dict[str, Any], cost: Cost | None = None) -> str:
-    """Markdown; times in milliseconds."""
+    """Markdown table of the stages, times in milliseconds, under a line of facts about model and machine."""
     lines = [
         f"{facts['model']}; {facts['device']}, {facts['threads']} threads of {facts['cores']} cores, AMX "
         f"{'yes' if facts['amx'] else 'no'}, {facts['precision']}; products {facts['gigaflops']:.0f} GFLOP/s, "

@@ -1,4 +1,4 @@
-"""The least time a stage can take on this machine: its products at the measured rate of large ones, or its bytes."""
+"""Roofline: the least time that a stage can take here, by the measured rates of large products and of copies."""
 
 import statistics
 import time
@@ -11,7 +11,12 @@ from torch.utils.flop_counter import FlopCounterMode
 
 @dataclass(frozen=True)
 class Machine:
-    """Measured rates: floating-point operations and bytes per second."""
+    """Measured rates of a machine.
+
+    Attributes:
+        operations: floating-point operations per second.
+        bandwidth: bytes per second.
+    """
 
     operations: float
     bandwidth: float
@@ -19,23 +24,23 @@ class Machine:
 
 @dataclass(frozen=True)
 class Work:
-    """What a stage must do at least.
+    """Work that a stage must do at least.
 
     Attributes:
-        operations: floating-point, two for a multiplication with addition; of matrix products only.
-        bytes: read and written at least once.
+        operations: floating-point operations of matrix products, two for a multiplication with addition.
+        bytes: bytes that are read and written at least once.
     """
 
     operations: float
     bytes: float
 
     def seconds(self, machine: Machine) -> float:
-        """The longer of both on a machine that does them at the same time."""
+        """Least time on a machine that does both at once: the longer of the two."""
         return max(self.operations / machine.operations, self.bytes / machine.bandwidth)
 
 
 def seconds(work: Callable[[], object], device: torch.device) -> float:
-    """How long ``work`` takes, until the device has done what it was asked."""
+    """Seconds that ``work`` takes, until the device has done what it was asked."""
     start = time.perf_counter()
     work()
     if device.type == "cuda":
@@ -44,7 +49,7 @@ def seconds(work: Callable[[], object], device: torch.device) -> float:
 
 
 def measure_machine(device: torch.device, dtype: torch.dtype = torch.float32) -> Machine:
-    """Rates of a product of 4096 x 512 by 512 x 512 and of copying 256 MB, medians of 15."""
+    """Rates of a machine: of a product of 4096 x 512 by 512 x 512 and of copying 256 MB, each the median of 15."""
     left, right = torch.ones(4096, 512, device=device, dtype=dtype), torch.ones(512, 512, device=device, dtype=dtype)
     source = torch.ones(64 * 2**20, device=device)
     target = torch.empty_like(source)
@@ -58,7 +63,7 @@ def _median(work: Callable[[], object], device: torch.device, repeats: int = 15)
 
 
 def count_operations(work: Callable[[], object]) -> int:
-    """Floating-point operations of the matrix products that ``work`` asks torch for."""
+    """Number of floating-point operations in the matrix products that ``work`` asks torch for."""
     with FlopCounterMode(display=False) as counter:
         work()
     return counter.get_total_flops()

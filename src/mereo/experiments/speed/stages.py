@@ -1,4 +1,4 @@
-"""The stages of an answer, each timed against its floor and, where there is one, the rival."""
+"""Stages of an answer, each timed against its floor and, where there is one, the straightforward implementation."""
 
 import statistics
 from collections.abc import Callable
@@ -22,11 +22,12 @@ from mereo.reconstruction.pipeline import SEARCH_BOX
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage's times in seconds.
+    """Times of one stage in seconds.
 
     Attributes:
         name: what is done.
-        median, slowest: of our repetitions; the 99th percentile stands for the slowest where there are a hundred.
+        median: median of our repetitions.
+        slowest: their 99th percentile.
         floor: the least that this machine could take.
         rival: the straightforward implementation's median; None where it was not run.
     """
@@ -39,48 +40,51 @@ class Stage:
 
     @property
     def ratio(self) -> float | None:
-        """How many times faster than the rival."""
+        """Ratio of the rival's time to ours: how many times faster we are; None where it was not run."""
         return None if self.rival is None else self.rival / self.median
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Everything that is timed about one model and frame.
+    """Timing of all stages of one model's answer about one view.
 
     Attributes:
-        repeats: of each stage; the rival's grids run once.
-        rival: time the straightforward implementation too, and compare its labels.
+        model: the model.
+        view: what it is asked about.
+        machine: measured rates, from which floors follow.
+        repeats: repetitions of each stage; the rival's grids run once.
+        rival: whether to time the straightforward implementation too, and to compare its labels.
     """
 
     model: Model
-    frame: SampleView
+    view: SampleView
     machine: Machine
     repeats: int = 7
     rival: bool = False
 
     def run(self) -> list[Stage]:
-        """All stages, in the order of an answer. Raises ``RuntimeError`` where the rival's labels differ."""
+        """Times of all stages, in the order of an answer. Raises ``RuntimeError`` where the rival's labels differ."""
         self._warm_up()
         return [self.prepare(), self.encode(), self.queries(40_000), self.whole_frame(), self.labels(), self.surfaces()]
 
     def prepare(self) -> Stage:
-        """Depth image to normalized points in farthest-point order."""
-        cloud = self.frame.depth.to_points()
+        """Times from depth image to normalized points in farthest-point order."""
+        cloud = self.view.depth.to_points()
         points, kept = len(cloud), self.model.network.config.points
         # each chosen point is compared with all: differences, squares, sums and the smaller distance
-        work = Work(operations=9.0 * points * min(points, kept), bytes=float(self.frame.depth.depth.nbytes))
-        return self._stage("preprocessing", work, lambda: self.model.normalized_cloud(self.frame.depth.to_points()))
+        work = Work(operations=9.0 * points * min(points, kept), bytes=float(self.view.depth.depth.nbytes))
+        return self._stage("preprocessing", work, lambda: self.model.normalized_cloud(self.view.depth.to_points()))
 
     def encode(self) -> Stage:
-        """The network's encoder; preprocessing is not in it."""
+        """Times of the network's encoder, without preprocessing."""
         cloud, normalizer = self._input()
         viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32)).to(self.model.device)
         with torch.inference_mode():
             return self._network_stage("encoder", lambda: self.model.inference.encode(cloud, viewpoint))
 
     def queries(self, count: int) -> Stage:
-        """Class logits at random points of the object's box."""
-        points = random_points(self.frame, count)
+        """Times of class logits at random points of the object's box."""
+        points = random_points(self.view, count)
         ours = partial(self.model.logits, self._code, points)
         rival = partial(self._rival().logits, points) if self.rival else None
         if rival is not None:
@@ -88,14 +92,14 @@ class Bench:
         return self._network_stage(f"{count // 1000}k queries", ours, rival)
 
     def whole_frame(self) -> Stage:
-        """Depth image to labels of 10,000 and then 40,000 points, as in the authors' follow-up.
+        """Times from depth image to labels of 10,000 and then 40,000 points, as in the authors' follow-up.
 
         On CUDA by graphs of fixed shapes, which an autodecoder does not have.
         """
-        coarse, fine = random_points(self.frame, 10_000), random_points(self.frame, 40_000)
+        coarse, fine = random_points(self.view, 10_000), random_points(self.view, 40_000)
 
         def plain() -> None:
-            code = self.model.encode(self.frame.depth.to_points())
+            code = self.model.encode(self.view.depth.to_points())
             self.model.logits(code, coarse)
             self.model.logits(code, fine)
 
@@ -110,8 +114,8 @@ class Bench:
         return self._network_stage(name, ours, straightforward if self.rival else None, counted=plain)
 
     def labels(self) -> Stage:
-        """The labels of the evaluation's grid, 100^3 cells."""
-        grid = self.frame.truth.grid
+        """Times of the labels of the evaluation's grid, 100^3 cells."""
+        grid = self.view.truth.grid
         x, y, z = grid.labels.shape
         field = partial(self.model.logits, self._code)
 
@@ -125,7 +129,7 @@ class Bench:
         return self._stage(f"labels, {x} x {y} x {z}", work, ours, rival, once=True)
 
     def surfaces(self) -> Stage:
-        """Closed meshes of all segments, 128 cells along the longest side; finding the object's box is in it."""
+        """Times of closed meshes of all segments, 128 cells along the longest side, the search for the box included."""
         model = self.model
         field, search = partial(model.logits, self._code), self._code.normalizer.invert(SEARCH_BOX)
 
@@ -142,15 +146,15 @@ class Bench:
 
     @cached_property
     def _code(self) -> EncodedCloud:
-        return self.model.encode(self.frame.depth.to_points())
+        return self.model.encode(self.view.depth.to_points())
 
     def _by_graphs(
         self, coarse: Float[np.ndarray, "n 3"], fine: Float[np.ndarray, "m 3"]
     ) -> Callable[[], UInt8[np.ndarray, " m"]]:
-        frames = StaticFrames(self.model, self.frame.depth.camera, (len(coarse), len(fine)))
+        frames = StaticFrames(self.model, self.view.depth.camera, (len(coarse), len(fine)))
 
         def answer() -> UInt8[np.ndarray, " m"]:
-            frames.see(self.frame.depth.depth)
+            frames.see(self.view.depth.depth)
             frames.ask(coarse)
             return frames.ask(fine)[0]
 
@@ -158,10 +162,10 @@ class Bench:
         return answer
 
     def _warm_up(self) -> None:
-        self.model.logits(self._code, random_points(self.frame, 8192))
+        self.model.logits(self._code, random_points(self.view, 8192))
 
     def _input(self) -> tuple[torch.Tensor, Normalizer]:
-        cloud, normalizer = self.model.normalized_cloud(self.frame.depth.to_points())
+        cloud, normalizer = self.model.normalized_cloud(self.view.depth.to_points())
         return cloud.to(self.model.device), normalizer
 
     def _rival(self) -> Rival:
@@ -169,7 +173,7 @@ class Bench:
 
     def _grid_work(self, labels: UInt8[np.ndarray, "x y z"]) -> Work:
         """Asking the corners of every cell that holds a change of label, and nothing else."""
-        points = random_points(self.frame, 4096)
+        points = random_points(self.view, 4096)
         each = count_operations(lambda: self.model.logits(self._code, points)) / len(points)
         return Work(each * int(needed_nodes(labels).sum()), float(labels.nbytes))
 
@@ -217,14 +221,14 @@ class Bench:
             raise RuntimeError(f"{wrong} of {len(ours)} labels differ between the model and the rival; they must agree")
 
 
-def random_points(frame: SampleView, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
-    """Places in the box of the frame's object."""
-    grid = frame.truth.grid
+def random_points(view: SampleView, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+    """Random points in the box of the object in a view."""
+    grid = view.truth.grid
     return grid.origin + np.random.default_rng(seed).random((count, 3)) * grid.spacing * grid.labels.shape
 
 
 def needed_nodes(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
-    """Corners of the cells whose corners do not all have one label."""
+    """Whether each node is a corner of a cell whose corners do not all have one label."""
     around = np.pad(changing_cells(labels), 1)  # cells beyond the grid change nothing
     needed: np.ndarray = over_corners(around, np.logical_or)
     return needed

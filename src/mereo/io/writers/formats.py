@@ -1,4 +1,4 @@
-"""The table of formats: what ``--formats`` writes, and with which function."""
+"""Table of formats: what ``--formats`` writes, and with which function."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ from mereo.io.writers.volumes import write_labels_npz, write_labels_vti
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """What there is to write, in the input's frame and unit.
+    """Reconstruction to be written, in the input's frame and unit.
 
     Attributes:
         surfaces, labels: of a reconstruction.
@@ -52,21 +52,24 @@ class Results:
         files: FilesConfig,
         unit_m: float = 1.0,
     ) -> "Results":
+        """Results in the unit that ``files`` asks for; the arguments are the attributes of the same names."""
         factor = MM_PER_M * unit_m if files.millimetres else 1.0
         return cls(surfaces, labels, observed, frame_rotation, unit_m, factor)
 
     @property
     def scaled_surfaces(self) -> SegmentedMesh:
+        """Surfaces for files that have no unit of their own."""
         return self.surfaces.transformed(np.diag([self.factor] * 3 + [1.0]))
 
     @property
     def scaled_labels(self) -> LabelGrid:
+        """Label grid for files that have no unit of their own."""
         return replace(self.labels, origin=self.labels.origin * self.factor, spacing=self.labels.spacing * self.factor)
 
 
 @dataclass(frozen=True)
 class Writer:
-    """One format.
+    """Writer of one format.
 
     Attributes:
         file: name of the file or folder; of the main one where there are two.
@@ -112,10 +115,11 @@ WRITERS: dict[Format, Writer] = {
     "points": Writer("points.ply", _points),
     "json": Writer("summary.json", lambda path, r: write_json(path, dict(r.summary))),
 }
+"""Writer of each format, in the order in which they are written."""
 
 
 def chosen_formats(names: Iterable[str]) -> tuple[Format, ...]:
-    """The formats that these names mean, in the table's order; "all" means every one.
+    """Formats that these names mean, in the table's order; "all" means every one.
 
     Raises ``ValueError`` for an unknown name and ``ImportError`` for a format whose extra is not installed, so that
     nobody waits for a reconstruction that cannot be written.
@@ -131,6 +135,6 @@ def chosen_formats(names: Iterable[str]) -> tuple[Format, ...]:
 
 
 def write_formats(directory: Path, formats: Iterable[Format], results: Results) -> None:
-    """Each of the formats into an existing directory."""
+    """Write each of the formats into an existing directory."""
     for name in formats:
         WRITERS[name].write(directory / WRITERS[name].file, results)

@@ -15,14 +15,14 @@ from mereo.io.mesh_formats import VIEWER_ROOT
 from mereo.io.writers.segment_table import with_faces
 
 OUTER_OPACITY = 0.35
-"""Of segments with others nested in them, which viewers draw see-through."""
+"""Opacity of segments with others nested in them, which viewers draw see-through."""
 
 GLTF_CAMERA_ROTATION = np.diag([1.0, -1.0, -1.0])
-"""Half a turn about x: from the camera frame (y down, z forward) to glTF (y up, z toward the viewer)."""
+"""Rotation by half a turn about x: from the camera frame (y down, z forward) to glTF (y up, z toward the viewer)."""
 
 
 def viewer_rotation(frame: CloudAxes) -> Float[np.ndarray, "3 3"]:
-    """From the input's axes to glTF's, which a scanner's already are."""
+    """Rotation from the input's axes to glTF's, which a scanner's already are."""
     return GLTF_CAMERA_ROTATION if frame == "camera" else np.eye(3)
 
 
@@ -32,7 +32,7 @@ def write_segments_glb(
     frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
     unit_m: float = 1.0,
 ) -> None:
-    """One named, coloured, double-sided node per segment, below one root node that turns the frame for viewers.
+    """Write a GLB file: one named, coloured node per segment, below a root node that turns the frame for viewers.
 
     Vertices stay as they are (rounded to float32, all that glTF holds). Segments without faces are left out; those
     around a nested segment that was found are translucent.
@@ -82,13 +82,13 @@ def _gltf_skeleton(
 
 
 def _gltf_mesh(index: int, label: int, segment: Segment) -> dict[str, Any]:
-    """``extras`` keep the label and the exact colour, which the material's linear factors only approximate."""
+    """Mesh of a segment; ``extras`` keep the label and the exact colour, which a material's factors approximate."""
     primitive = {"attributes": {"POSITION": 2 * index}, "indices": 2 * index + 1, "material": index}
     return {"name": segment.name, "primitives": [primitive], "extras": {"label": label, "color": list(segment.color)}}
 
 
 def _gltf_material(segment: Segment, opaque: bool) -> dict[str, Any]:
-    """glTF colour factors are linear light, ours are sRGB (glTF 2.0, section 3.9.2)."""
+    """Material of a segment's colour; glTF's factors are linear light, ours are sRGB (glTF 2.0, section 3.9.2)."""
     srgb = np.asarray(segment.color) / 255.0
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     color = [*linear.round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]

@@ -24,7 +24,7 @@ from mereo.io.writers.segment_table import segment_table
 MM_PER_M = 1000.0
 
 COMMENT = 6
-"""NIfTI's code of header extensions that hold plain text."""
+"""Code of NIfTI's header extensions that hold plain text."""
 
 SLICER_HEADER = """NRRD0004
 # written by mereo; format: http://teem.sourceforge.net/nrrd/format.html
@@ -44,7 +44,7 @@ Segmentation_ReferenceImageExtentOffset:=0 0 0
 
 
 def write_labels_nifti(path: str | Path, grid: LabelGrid, colors: Sequence[Color], unit_m: float = 1.0) -> None:
-    """NIfTI-1 (``.nii`` or ``.nii.gz``): ``RAS = diag(-1, -1, 1) * position * 1000 * unit_m``.
+    """Write NIfTI-1 (``.nii`` or ``.nii.gz``): ``RAS = diag(-1, -1, 1) * position * 1000 * unit_m``.
 
     NIfTI has no place for the names of labels. They stand as JSON in a comment of the header:
     ``{"segments": [{"label", "name", "color"}, ...]}``.
@@ -72,7 +72,7 @@ def write_labels_nifti(path: str | Path, grid: LabelGrid, colors: Sequence[Color
 
 
 def nibabel() -> Any:
-    """The library, or one sentence on how to get it."""
+    """Library that writes NIfTI; ``ImportError`` says how to get it."""
     try:
         return import_module("nibabel")
     except ImportError:
@@ -80,7 +80,7 @@ def nibabel() -> Any:
 
 
 def T_ras_index(grid: LabelGrid, unit_m: float) -> Float[np.ndarray, "4 4"]:
-    """From voxel indices to RAS coordinates in millimetres."""
+    """Transform from voxel indices to RAS coordinates in millimetres; ``unit_m`` is metres per unit of the grid."""
     transform = np.eye(4)
     transform[:3, :3] = np.diag(grid.spacing)
     transform[:3, 3] = grid.origin
@@ -90,7 +90,7 @@ def T_ras_index(grid: LabelGrid, unit_m: float) -> Float[np.ndarray, "4 4"]:
 
 
 def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Color], unit_m: float = 1.0) -> None:
-    """A segmentation of 3D Slicer: ``LPS = position * 1000 * unit_m``, with names, colours and labels.
+    """Write a segmentation of 3D Slicer: ``LPS = position * 1000 * unit_m``, with names, colours and labels.
 
     One layer: a voxel has one label, and inside a nested segment it is the inner one's. Written here and not by pynrrd,
     which takes ASCII only (names may have any letters) and writes the time of day.
@@ -114,7 +114,7 @@ def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Co
 
 
 def _segment_fields(grid: LabelGrid, index: int, color: Color) -> str:
-    """Of one segment. Slicer cuts the whole layer to the extent of its first segment, so all state the whole grid."""
+    """Header lines of a segment. Slicer cuts layers to the extent of their first segment, so all state the grid's."""
     name = " ".join(grid.names[index].split()).replace("\\", "\\\\")  # a backslash begins an escape in NRRD values
     values = {
         "Color": " ".join(f"{value / 255:.6g}" for value in color),

@@ -9,7 +9,7 @@ from mereo.io.writers.segment_table import with_faces
 
 
 def write_segments_obj(path: str | Path, surfaces: SegmentedMesh) -> None:
-    """One object (``o``) per segment with a material of its colour; the materials go beside it, as ``STEM.mtl``.
+    """Write one object (``o``) per segment with a material of its colour; the materials go beside it, as ``STEM.mtl``.
 
     Materials are called ``label_1``, ``label_2``, ...; objects have the segments' names. Positions are in the mesh's
     frame and unit. Segments without faces are left out. Raises ``ValueError`` where no segment has faces.
@@ -35,7 +35,7 @@ def _object(label: int, segment: Segment, first: int) -> str:
 
 
 def _materials(found: list[tuple[int, Segment]], opaque: tuple[bool, ...]) -> str:
-    """``Kd`` is the diffuse colour, ``d`` the opacity; programs take ``Kd`` as the colour on the screen (sRGB)."""
+    """Material library: ``Kd`` is the diffuse colour, taken as that on the screen (sRGB), ``d`` the opacity."""
     blocks = []
     for label, segment in found:
         color = " ".join(f"{value / 255:.6f}" for value in segment.color)

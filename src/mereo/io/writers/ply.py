@@ -3,22 +3,22 @@
 PLY has no unit. Labels are a property called ``label``; their names are in the header, as comments that hold JSON.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Integer, UInt8
 
 from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.segment_table import comment_lines, with_faces
 
-COLOR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 TYPES = {"u1": "uchar", "i4": "int", "f4": "float"}
+"""Name that PLY has for each type of numpy."""
 
 
 def write_segments_ply(path: str | Path, surfaces: SegmentedMesh) -> None:
-    """All surfaces in one mesh; vertices and faces have ``label``, ``red``, ``green``, ``blue`` (uchar).
+    """Write all surfaces as one mesh whose vertices and faces have ``label``, ``red``, ``green``, ``blue`` (uchar).
 
     Segments share no vertices, so each vertex has one label; positions are float32, in the mesh's frame and unit.
     Raises ``ValueError`` where no segment has faces.
@@ -27,38 +27,47 @@ def write_segments_ply(path: str | Path, surfaces: SegmentedMesh) -> None:
     positions, faces, owner = surfaces.merged()
     colors = np.array(surfaces.colors, dtype=np.uint8)
     vertex_owner = np.repeat(np.arange(len(colors)), [len(segment.vertices) for segment in surfaces.segments])
-    vertices = _records(len(positions), [("x", "f4"), ("y", "f4"), ("z", "f4"), *COLOR, ("label", "u1")])
-    triangles = _records(len(faces), [("count", "u1"), ("vertex_indices", "i4", 3), *COLOR, ("label", "u1")])
-    for records, index in ((vertices, vertex_owner), (triangles, owner)):
-        _set_columns(records, ("red", "green", "blue"), colors[index])
-        records["label"] = index + 1
-    _set_columns(vertices, "xyz", positions)
-    triangles["count"], triangles["vertex_indices"] = 3, faces
+    corners = {"count": ("u1", np.full(len(faces), 3)), "vertex_indices": ("i4", faces)}
+    vertices = _records(_positions(positions) | _colors(colors[vertex_owner]) | _label(vertex_owner + 1))
+    triangles = _records(corners | _colors(colors[owner]) | _label(owner + 1))
     header = comment_lines(surfaces.names, surfaces.colors)
     _write(path, header, {"vertex": vertices, "face": triangles})
 
 
 def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
-    """The observed points with ``label``, its colour, ``confidence`` and ``occupancy``, see ``SegmentedCloud``.
+    """Write the observed points with ``label``, its colour, ``confidence`` and ``occupancy``, see ``SegmentedCloud``.
 
     Positions are float32, in the cloud's frame and unit.
     """
-    fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), *COLOR, ("label", "u1"), ("confidence", "f4"), ("occupancy", "f4")]
-    vertices = _records(len(cloud.points), fields)
-    _set_columns(vertices, "xyz", cloud.points)
-    _set_columns(vertices, ("red", "green", "blue"), np.array(cloud.colors, dtype=np.uint8)[cloud.labels - 1])
-    vertices["label"], vertices["confidence"], vertices["occupancy"] = cloud.labels, cloud.confidence, cloud.occupancy
+    colors = np.array(cloud.colors, dtype=np.uint8)[cloud.labels - 1]
+    sure = {"confidence": ("f4", cloud.confidence), "occupancy": ("f4", cloud.occupancy)}
+    vertices = _records(_positions(cloud.points) | _colors(colors) | _label(cloud.labels) | sure)
     _write(path, comment_lines(cloud.names, cloud.colors), {"vertex": vertices})
 
 
-def _records(count: int, fields: Sequence[tuple[str, str] | tuple[str, str, int]]) -> np.ndarray:
-    """Little-endian records without padding: the bytes of the file."""
-    return np.zeros(count, np.dtype([(field[0], "<" + field[1], *field[2:]) for field in fields]))
+Columns = dict[str, tuple[str, np.ndarray]]
+"""Type and values of each property, in the order of the file."""
 
 
-def _set_columns(records: np.ndarray, names: Sequence[str], values: np.ndarray) -> None:
-    for column, name in enumerate(names):
-        records[name] = values[:, column]
+def _positions(points: Float[np.ndarray, "n 3"]) -> Columns:
+    return {axis: ("f4", points[:, k]) for k, axis in enumerate("xyz")}
+
+
+def _colors(colors: UInt8[np.ndarray, "n 3"]) -> Columns:
+    return {channel: ("u1", colors[:, k]) for k, channel in enumerate(("red", "green", "blue"))}
+
+
+def _label(labels: Integer[np.ndarray, " n"]) -> Columns:
+    return {"label": ("u1", labels)}
+
+
+def _records(columns: Columns) -> np.ndarray:
+    """Bytes of an element: little-endian records without padding."""
+    fields = [(name, f"<{kind}", values.shape[1:]) for name, (kind, values) in columns.items()]
+    records = np.zeros(len(next(iter(columns.values()))[1]), np.dtype(fields))
+    for name, (_, values) in columns.items():
+        records[name] = values
+    return records
 
 
 def _write(path: str | Path, comments: list[str], elements: dict[str, np.ndarray]) -> None:
@@ -72,7 +81,7 @@ def _write(path: str | Path, comments: list[str], elements: dict[str, np.ndarray
 
 
 def _properties(dtype: np.dtype) -> list[str]:
-    """``count`` and ``vertex_indices`` together are what PLY calls a list."""
+    """Header lines of an element; ``count`` and ``vertex_indices`` together are what PLY calls a list."""
     lines = []
     for name in dtype.names or ():
         if name == "vertex_indices":

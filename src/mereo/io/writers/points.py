@@ -1,4 +1,4 @@
-"""The observed points with what the model says they are, for numpy; the PLY form is in ``ply``."""
+"""Observed points with what the model says they are, for numpy; ``mereo.io.writers.ply`` has the PLY form."""
 
 from pathlib import Path
 
@@ -9,9 +9,10 @@ from mereo.io.atomic_files import atomic_file
 
 
 def write_points_npz(path: str | Path, cloud: SegmentedCloud) -> None:
-    """Arrays ``points``, ``labels``, ``confidence``, ``occupancy``, ``names`` and ``colors``, see ``SegmentedCloud``.
+    """Write an NPZ file with the arrays of a ``SegmentedCloud``.
 
-    ``names[k]`` and ``colors[k]`` are of label k + 1. Positions are in the cloud's frame and unit.
+    They are ``points``, ``labels``, ``confidence``, ``occupancy``, ``names`` and ``colors``; ``names[k]`` and
+    ``colors[k]`` are of label k + 1. Positions are in the cloud's frame and unit.
     """
     with atomic_file(path) as partial:
         np.savez_compressed(

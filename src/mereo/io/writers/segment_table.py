@@ -1,4 +1,4 @@
-"""What the writers say about segments: which have a surface, and the table of labels, names and colours."""
+"""Table of labels, names and colours that the writers put into files, and which segments have a surface."""
 
 import json
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ def with_faces(surfaces: SegmentedMesh) -> list[tuple[int, Segment]]:
 
 
 def segment_table(names: Sequence[str], colors: Sequence[Color]) -> list[dict[str, Any]]:
-    """One row for each segment, in label order."""
+    """Label, name and colour of each segment, in label order."""
     rows = enumerate(zip(names, colors, strict=True), start=1)
     return [{"label": label, "name": name, "color": list(color)} for label, (name, color) in rows]
 
 
 def comment_lines(names: Sequence[str], colors: Sequence[Color]) -> list[str]:
-    """The table as lines of ASCII for file headers: ``segment`` and a JSON object, so that any name survives."""
+    """Table of segments as ASCII lines for file headers: ``segment`` and a JSON object, so that any name survives."""
     return [f"segment {json.dumps(row)}" for row in segment_table(names, colors)]

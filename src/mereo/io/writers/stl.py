@@ -10,11 +10,11 @@ from mereo.io.atomic_files import new_directory
 from mereo.io.writers.segment_table import with_faces
 
 RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-"""50 bytes a triangle, without padding."""
+"""Record of a triangle: 50 bytes, without padding."""
 
 
 def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bool = False) -> None:
-    """A new directory with ``1-head.stl``, ``2-left-ear.stl``, ...: label and name of each segment that has faces.
+    """Write a new directory of ``1-head.stl``, ``2-left-ear.stl``, ...: label and name of each segment with faces.
 
     Positions are float32, in the mesh's frame and unit. Raises ``ValueError`` where no segment has faces, and
     ``FileExistsError`` for a directory with content unless ``force``.
@@ -26,7 +26,7 @@ def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bo
 
 
 def stl_name(label: int, name: str) -> str:
-    """A file name that every system takes: letters and digits of the segment's name; its label keeps it unique."""
+    """File name of a segment that every system takes: letters and digits of its name; the label keeps it unique."""
     words = re.sub(r"[^\w]+", "-", name).strip("-")
     return f"{label}-{words}.stl" if words else f"{label}.stl"
 

@@ -43,9 +43,10 @@ def write_labels_npz(
     spacing: Float[np.ndarray, "3"],
     names: Sequence[str],
 ) -> None:
-    """A label grid: voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units.
+    """Write a label grid for numpy: the arrays ``labels``, ``origin``, ``spacing`` and ``names``.
 
-    ``names[k]`` is the segment of label k + 1; label 0 is empty space.
+    Voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units. ``names[k]`` is the
+    segment of label k + 1; label 0 is empty space. Raises ``ValueError`` for a label without a name.
     """
     if labels.size and int(labels.max()) > len(names):
         raise ValueError(f"label {int(labels.max())} has no name among {len(names)}; name every segment")
@@ -60,7 +61,7 @@ def write_labels_npz(
 
 
 def write_labels_vti(path: str | Path, grid: LabelGrid, colors: Sequence[Color]) -> None:
-    """VTK image data: the point array ``label`` at voxel centres; field data ``segment_names``, ``segment_colors``.
+    """Write VTK image data: the array ``label`` at voxel centres; field data ``segment_names``, ``segment_colors``.
 
     ``segment_names[k]`` is the segment of label k + 1; label 0 is empty space. Coordinates are in the grid's frame and
     unit.
@@ -84,7 +85,7 @@ def _numbers(values: Float[np.ndarray, "3"]) -> str:
 
 
 def _compressed(labels: UInt8[np.ndarray, "x y z"]) -> str:
-    """One zlib block, x running fastest. The head says: blocks, bytes of each, bytes of a partial one, packed bytes."""
+    """Labels as one zlib block, x running fastest; the head: blocks, bytes of each, of a partial one, packed bytes."""
     packed = zlib.compress(labels.tobytes(order="F"))
     head = struct.pack("<4Q", 1, labels.size, 0, len(packed))
     return base64.b64encode(head).decode() + base64.b64encode(packed).decode()

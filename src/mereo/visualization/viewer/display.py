@@ -1,4 +1,4 @@
-"""What both pages share: the server, its looks, and the layer that shows segments.
+"""Parts that both pages share: the server, its looks, and the layer that shows segments.
 
 Everything is shown in stage coordinates: the object's middle is the origin and half its longest side is 1, whatever
 the input's unit, so that sizes of points, gizmos and clipping distances fit.
@@ -33,7 +33,7 @@ FEW = 6
 
 
 def import_viser() -> Any:
-    """The library, or one sentence on how to get it."""
+    """Module of viser; raises ``ImportError`` with a sentence on how to get it."""
     try:
         import viser
     except ImportError:
@@ -42,7 +42,7 @@ def import_viser() -> Any:
 
 
 def start_server(port: int, title: str) -> Any:
-    """A viser server on 127.0.0.1; port 0 means any. Raises ``OSError`` where the port is taken."""
+    """Server of viser on 127.0.0.1; port 0 means any. Raises ``OSError`` where the port is taken."""
     viser = import_viser()
     with socket.socket() as probe:  # viser would silently take another port
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -75,19 +75,23 @@ def stop_server(server: Any) -> None:
 
 @runtime_checkable
 class Shown(Protocol):
-    """Which segments are shown, and how opaque each is."""
+    """Choice of the segments that are shown, and how opaque each is."""
 
-    def visible(self) -> list[bool]: ...
+    def visible(self) -> list[bool]:
+        """Whether each segment is shown."""
 
-    def opacity(self) -> list[float]: ...
+    def opacity(self) -> list[float]:
+        """Opacity of each segment, 0 to 1."""
 
 
 class Display:
-    """Places things of the input's frame on the stage.
+    """Stage of a page, on which things of the input's frame are placed.
 
     Attributes:
-        server: of viser.
-        center, scale: ``stage = (input - center) * scale``.
+        server: server of viser.
+        center: middle of the object in the input's frame.
+        scale: stage units per unit of the input: ``stage = (input - center) * scale``.
+        up: unit vector that is upwards on the page.
     """
 
     def __init__(self, server: Any, bounds: Float[np.ndarray, "2 3"], up: Float[np.ndarray, "3"]) -> None:
@@ -98,9 +102,11 @@ class Display:
         server.scene.set_up_direction(tuple(self.up))
 
     def place(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of the input's frame in stage coordinates."""
         return (points - self.center) * self.scale
 
     def back(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of the stage in the input's frame."""
         return points / self.scale + self.center
 
     def look_from(
@@ -126,7 +132,7 @@ class Display:
 
 
 class SegmentLayer:
-    """The surfaces of an object, in the segments' colours or coloured vertex by vertex."""
+    """Surfaces of an object on the stage, in the segments' colours or coloured vertex by vertex."""
 
     def __init__(self, stage: Display, name: str) -> None:
         self.stage, self.name = stage, name
@@ -139,7 +145,10 @@ class SegmentLayer:
         colors: Sequence[UInt8[np.ndarray, "_ 3"]] | None = None,
         shift: Float[np.ndarray, "3"] | None = None,
     ) -> None:
-        """Replace what is shown. ``colors`` holds one colour per vertex for each segment; ``shift`` is on the stage."""
+        """Replace the surfaces that are shown.
+
+        ``colors`` holds one colour per vertex for each segment; ``shift`` is on the stage.
+        """
         visible, opacity = shown.visible(), shown.opacity()
         offset = np.zeros(3) if shift is None else shift
         self.clear_from(len(mesh.segments))
@@ -186,7 +195,7 @@ def _painted(
 
 
 class SegmentControls:
-    """A check box and an opacity slider for each segment."""
+    """Controls with a check box and an opacity slider for each segment."""
 
     def __init__(self, gui: Any, mesh: SegmentedMesh, changed: Any) -> None:
         with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= FEW):
@@ -203,7 +212,9 @@ class SegmentControls:
             handle.on_update(lambda _: changed())
 
     def visible(self) -> list[bool]:
+        """Whether each segment is shown: its box is checked, and it is not wholly transparent."""
         return [bool(box.value) and value > 0 for box, value in zip(self._boxes, self.opacity(), strict=True)]
 
     def opacity(self) -> list[float]:
+        """Opacity of each segment, 0 to 1: its own slider's times that of all."""
         return [float(self._all.value * slider.value) for slider in self._sliders]

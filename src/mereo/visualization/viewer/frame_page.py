@@ -1,4 +1,4 @@
-"""The page of one frame: what was observed, its reconstruction, and a probe."""
+"""Page of one frame: what was observed, its reconstruction, and a probe."""
 
 import threading
 from typing import Any
@@ -17,13 +17,13 @@ EMPTY_COLOR = (150, 156, 168)
 
 
 class FramePage:
-    """Shows an ``Inspection`` on a server; answers clicks, check boxes and sliders until the server stops."""
+    """Page that shows an ``Inspection`` and answers clicks, check boxes and sliders until its server stops."""
 
     def __init__(self, server: Any, inspection: Inspection, title: str, facts: str, unit: str = "") -> None:
         self.server, self.inspection, self.unit = server, inspection, f" {unit}" if unit else ""
         self.mesh = inspection.result.surfaces
         self._drawing = threading.Lock()
-        scanner = not np.allclose(inspection.T_camera_input, np.eye(4))
+        scanner = not np.allclose(inspection.result.T_camera_input, np.eye(4))
         y, self.toward = (1.0, np.array([0.0, 0.0, 1.0])) if scanner else (-1.0, np.array([0.0, 0.0, -1.0]))
         self.stage = Display(server, self._bounds(), np.array([0.0, y, 0.0]))
         self.layer = SegmentLayer(self.stage, "/segments")
@@ -93,7 +93,7 @@ class FramePage:
             else:
                 values = observed_distance(self.mesh, self.inspection.cloud.points)
                 scale = distance_scale(values, self.unit)
-            self._painted[mode] = [scale.colors(value) for value in values], html.legend(scale)
+            self._painted[mode] = [scale.colors(value) for value in values], html.color_bar(scale)
         return self._painted[mode]
 
     def _turn(self, name: str) -> None:

@@ -5,21 +5,22 @@ from html import escape
 
 import numpy as np
 
-from mereo.evaluation.metrics import Scores
+from mereo.evaluation.metrics import Scores, format_score
 from mereo.geometry.mesh import Color
 from mereo.models.model import Answer
-from mereo.visualization.vertex_colors import Scale
+from mereo.visualization.vertex_colors import ColorScale
 
 SOFT = "opacity:.62"
 BOX = "padding:2px 0.9em 6px;font-size:0.82em;line-height:1.5"
 
 
 def css(color: Color) -> str:
+    """Colour as CSS writes it."""
     return "rgb({},{},{})".format(*color)
 
 
 def heading(title: str, text: str) -> str:
-    """What the page is about."""
+    """Heading of a panel: what the page is about."""
     return (
         f'<div style="padding:6px 0.75em 4px"><div style="font-weight:650;font-size:1.05em">{escape(title)}</div>'
         f'<div style="font-size:0.8em;{SOFT}">{escape(text)}</div></div>'
@@ -27,13 +28,13 @@ def heading(title: str, text: str) -> str:
 
 
 def message(text: str, bad: bool = False) -> str:
-    """One line on what is going on; "" is an empty line, so that nothing jumps."""
+    """Line on what is going on; "" is an empty line, so that nothing jumps."""
     color = "color:#e5484d" if bad else SOFT
     return f'<div style="{BOX};min-height:1.9em;{color}">{escape(text) or "&nbsp;"}</div>'
 
 
 def chips(names: Sequence[str], colors: Sequence[Color]) -> str:
-    """The segments' colours by name."""
+    """Chips that name the segments' colours."""
     each = "".join(
         f'<span style="white-space:nowrap;margin-right:11px"><span style="display:inline-block;width:10px;height:10px;'
         f'border-radius:3px;background:{css(color)};margin-right:5px"></span>{escape(name)}</span> '
@@ -42,8 +43,8 @@ def chips(names: Sequence[str], colors: Sequence[Color]) -> str:
     return f'<div style="{BOX}">{each}</div>'
 
 
-def legend(scale: Scale) -> str:
-    """A bar with all colours of a scale, and what its ends mean."""
+def color_bar(scale: ColorScale) -> str:
+    """Bar with all colours of a scale, and what its ends mean."""
     stops = ",".join(css(color) for color in scale.stops)
     return (
         f'<div style="{BOX}"><div>{escape(scale.title)}</div><div style="height:9px;border-radius:5px;margin:3px 0;'
@@ -53,7 +54,7 @@ def legend(scale: Scale) -> str:
 
 
 def bars(rows: Sequence[tuple[str, Color, float]]) -> str:
-    """Numbers from 0 to 1 as named bars; NaN is a dash."""
+    """Bars that show named numbers from 0 to 1; NaN is a dash."""
     cells = "".join(
         f"<div>{escape(name)}</div>"
         f'<div style="background:rgba(128,128,128,.22);border-radius:4px;height:7px;align-self:center"><div style="'
@@ -67,9 +68,9 @@ def bars(rows: Sequence[tuple[str, Color, float]]) -> str:
 
 
 def scores(found: Scores, names: Sequence[str], colors: Sequence[Color]) -> str:
-    """IoU and mIoU large, each segment below."""
+    """Scores: IoU and mIoU large, each segment below."""
     big = "".join(
-        f'<div><div style="font-size:2.1em;font-weight:650;line-height:1.15">{_score(value)}</div>'
+        f'<div><div style="font-size:2.1em;font-weight:650;line-height:1.15">{format_score(value, "–")}</div>'
         f'<div style="{SOFT}">{label}</div></div>'
         for label, value in (("IoU, whole object", found.iou), ("mIoU, segments", found.miou))
     )
@@ -78,12 +79,8 @@ def scores(found: Scores, names: Sequence[str], colors: Sequence[Color]) -> str:
     return head + bars(rows)
 
 
-def _score(value: float) -> str:
-    return "–" if np.isnan(value) else f"{value:.3f}"
-
-
 def answer(found: Answer, names: Sequence[str], colors: Sequence[Color], place: Sequence[float], unit: str) -> str:
-    """What the model says at one place: the likeliest classes, distance and direction."""
+    """Answer of the model at one place: the likeliest classes, distance and direction."""
     label, probability = int(found.label[0]), found.probability[0]
     order = np.argsort(-probability, kind="stable")[:4]
     rows = [(names[k], colors[k], float(probability[k])) for k in order]

@@ -1,4 +1,4 @@
-"""The laboratory's page: sliders for a scene and its camera, what the camera sees, what is made of it, and how good.
+"""Page of the laboratory: sliders for a scene and its camera, what the camera sees, what is made of it, and how good.
 
 Hands only leave wishes; one thread (``LatestWins``) fulfils them, so that the page never waits and never lags behind.
 """
@@ -19,7 +19,7 @@ from mereo.scenes.parameters import Parameter, Played, Refused, parameters, rand
 from mereo.synthesis.examples import View
 from mereo.visualization.vertex_colors import (
     CONFIDENCE,
-    Scale,
+    ColorScale,
     confidence,
     distance_scale,
     error_scale,
@@ -43,14 +43,14 @@ HISTORY = 60
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What the page shows: a state as it is seen, and what has been made of that so far."""
+    """Moment that the page shows: a state as it is seen, and what has been made of that so far."""
 
     view: View
     trial: Trial | None = None
 
 
 class LabPage:
-    """Shows a ``Laboratory`` on a server until ``close``."""
+    """Page that shows a ``Laboratory`` on a server until ``close``."""
 
     def __init__(self, server: Any, laboratory: Laboratory, title: str, facts: str, seed: int = 0) -> None:
         self.server, self.laboratory = server, laboratory
@@ -71,6 +71,7 @@ class LabPage:
         self.worker.submit(None)
 
     def close(self) -> None:
+        """Stop the page's thread; what it is doing is finished."""
         self.worker.stop()
 
     # --- panels -------------------------------------------------------------------------------------------------------
@@ -262,14 +263,14 @@ class LabPage:
         mode, surfaces = self._coloring.value, trial.result.surfaces
         if mode == "segment":
             return None
-        scale: Scale
+        scale: ColorScale
         if mode == "error":
             values, scale = surface_error(surfaces, Solids(view.mesh)), error_scale(view.mesh, "")
         elif mode == "confidence":
             assert self.laboratory.model is not None
-            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.code)), CONFIDENCE
+            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.result.code)), CONFIDENCE
         else:
             values = observed_distance(surfaces, view.depth.to_points().points)
             scale = distance_scale(values, "")
-        self._legend.content, self._legend.visible = html.legend(scale), True
+        self._legend.content, self._legend.visible = html.color_bar(scale), True
         return [scale.colors(value) for value in values]

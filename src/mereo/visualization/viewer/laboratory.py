@@ -1,4 +1,4 @@
-"""A scene under the hands: any state, seen by any camera of its workspace, reconstructed and compared with the truth.
+"""Laboratory of a scene: any state, seen by any camera of its workspace, reconstructed and compared with the truth.
 
     Played (see ``mereo.scenes.parameters``), CameraPlace -look-> View -rebuild-> Trial (reconstruction, scores)
 
@@ -17,7 +17,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.model import Model
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.scenes.parameters import Played
 from mereo.scenes.scene import Scene
@@ -33,7 +33,7 @@ NOTHING: tuple[int, int, int] = (16, 19, 26)
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """Where the camera stands, in the terms of the scene's ``Workspace``.
+    """Place of the camera in the terms of the scene's ``Workspace``.
 
     Attributes:
         tilt_rad: away from the workspace's axis, 0 to half its aperture.
@@ -50,18 +50,16 @@ class CameraPlace:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One reconstruction and how good it is.
+    """Reconstruction of a view, and how good it is.
 
     Attributes:
         result: in the camera frame.
-        code: to ask the model for more.
         scores: against the truth, on ``cells`` ** 3 cells.
         cells: the paper takes 100; fewer are faster and a little off.
         seconds: of the reconstruction.
     """
 
     result: Reconstruction
-    code: EncodedCloud
     scores: Scores
     cells: int
     seconds: float
@@ -69,7 +67,7 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Laboratory:
-    """A scene, and the model that is to reconstruct it; without one there is only the view.
+    """Scene, and the model that is to reconstruct it; without one there is only the view.
 
     Raises ``ValueError`` for a model of another object.
     """
@@ -84,27 +82,28 @@ class Laboratory:
 
     @property
     def camera(self) -> Camera:
-        """The virtual depth camera."""
+        """Virtual depth camera of the scene's workspace."""
         size = self.settings.image_size
         return Camera.from_fov(size, size, self.scene.workspace.fov_rad)
 
     def first_place(self) -> CameraPlace:
-        """Oblique, in the middle of the allowed distances."""
+        """First place of the camera: oblique, in the middle of the allowed distances."""
         near, far = self.scene.workspace.distance
         tilt = min(np.deg2rad(35.0), self.most_tilt_rad)
         return CameraPlace(float(tilt), float(np.deg2rad(40.0)), (near + far) / 2)
 
     @property
     def most_tilt_rad(self) -> float:
+        """Largest angle between the camera's direction and the workspace's axis."""
         return float(min(self.scene.workspace.aperture_rad / 2, np.pi))
 
     def pose(self, target: Float[np.ndarray, "3"], place: CameraPlace) -> Float[np.ndarray, "4 4"]:
-        """``T_world_camera`` of a camera there, aimed at ``target``."""
+        """Pose ``T_world_camera`` of a camera at a place, aimed at ``target``."""
         cosine = float(np.cos(place.tilt_rad))
         return self.scene.workspace.pose(target, cosine, place.azimuth_rad, place.distance, place.roll_rad)
 
     def look(self, played: Played, place: CameraPlace) -> View:
-        """The state as the camera sees it; its noise is the same every time, so that pictures do not flicker.
+        """State as the camera sees it; its noise is the same every time, so that pictures do not flicker.
 
         Raises ``ValueError`` where fewer than ``MIN_POINTS`` points of the object are seen.
         """
@@ -131,12 +130,11 @@ class Laboratory:
         start = time.perf_counter()
         result = reconstruct(cloud, self.model, resolution)
         seconds = time.perf_counter() - start
-        scores = grid_scores(self.model, cloud, view.mesh, cells)
-        return Trial(result, self.model.encode(cloud), scores, cells, seconds)
+        return Trial(result, grid_scores(self.model, result.code, view.mesh, cells), cells, seconds)
 
 
 def depth_picture(depth: DepthImage, factor: int = 1) -> UInt8[np.ndarray, "h w 3"]:
-    """A depth image for the eye: near is light, far is dark, each pixel ``factor`` pixels wide."""
+    """Picture of a depth image for the eye: near is light, far is dark, each pixel ``factor`` pixels wide."""
     valid, values = depth.valid, depth.depth
     shares = np.zeros_like(values)
     if valid.any():

@@ -4,13 +4,14 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from mereo.evaluation.sample_views import load_frame, shipped_frames
+from mereo.evaluation.sample_views import load_view, shipped_views
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
+from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for, shipped_names
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import read_observation
+from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
 from mereo.visualization.viewer.display import import_viser, start_server, stop_server
 from mereo.visualization.viewer.frame_page import FramePage
@@ -19,6 +20,7 @@ from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.probe import Inspection
 
 PORT = 8080
+"""Port of the page where none is chosen."""
 
 
 def view_frame(
@@ -35,13 +37,13 @@ def view_frame(
     import_viser()
     frame: CloudAxes
     if input is None:
-        name = weights or shipped_frames()[0]
-        if name not in shipped_frames():
+        name = weights or shipped_views()[0]
+        if name not in shipped_views():
             raise ValueError(
                 f"there is no frame to show and none is shipped for {name!r}; name a depth image or a point cloud, or "
-                f"take the weights of a shipped frame: {', '.join(shipped_frames())}"
+                f"take the weights of a shipped frame: {', '.join(shipped_views())}"
             )
-        cloud, title, weights = load_frame(name).depth.to_points(), f"{name}, shipped frame", name
+        cloud, title, weights = load_view(name).depth.to_points(), f"{name}, shipped frame", name
         frame, unit = "camera", ""
     elif weights is None:
         raise ValueError(
@@ -49,8 +51,9 @@ def view_frame(
             f"{', '.join(shipped_names())}"
         )
     else:
-        seen = read_observation(input, reading or InputConfig(), isolation or IsolationConfig())
-        cloud, title, frame, unit = seen.cloud, seen.source, seen.frame, "m" if seen.unit_m == 1.0 else ""
+        read = read_frame(input, reading or InputConfig())
+        cloud = find_object(read, isolation or IsolationConfig()).cloud
+        title, frame, unit = read.source, read.axes, "m" if read.unit_m == 1.0 else ""
     inspection = Inspection.of(cloud, load_for(weights, inference or InferenceConfig()), resolution, frame)
     server = start_server(port, "mereo")
     FramePage(server, inspection, title, f"{len(cloud):,} points · weights {weights}", unit)
@@ -58,7 +61,7 @@ def view_frame(
 
 
 def view_scene(name: str, weights: str | None, *, port: int = PORT, inference: InferenceConfig | None = None) -> None:
-    """The laboratory of a scene; without ``weights`` the shipped ones, where there are any."""
+    """Show the laboratory of a scene; without ``weights`` the shipped ones, where there are any."""
     import_viser()
     scene = load_scene(name)
     known = weights or (scene.name if scene.name in shipped_names() else None)

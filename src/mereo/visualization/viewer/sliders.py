@@ -13,7 +13,7 @@ Moved = Callable[[Parameter, float], None]
 
 
 class ParameterSliders:
-    """One slider for each degree of freedom, in a folder for each group, all in ``folder``.
+    """Sliders for the degrees of freedom, one for each, in a folder for each group, all in ``folder``.
 
     Sliders that a new state still has stay as they are, also while they are being dragged; others come and go.
     """
@@ -88,7 +88,7 @@ def _on_range(parameter: Parameter) -> float:
 
 
 class CameraSliders:
-    """Where the virtual camera is, within the scene's workspace."""
+    """Sliders for the place of the virtual camera, within the scene's workspace."""
 
     def __init__(self, gui: Any, laboratory: Laboratory, moved: Callable[[], None]) -> None:
         place, workspace = laboratory.first_place(), laboratory.scene.workspace
@@ -102,6 +102,7 @@ class CameraSliders:
             handle.on_update(lambda event: moved() if event.client is not None else None)
 
     def place(self) -> CameraPlace:
+        """Place of the camera that the sliders say."""
         return CameraPlace(
             float(np.deg2rad(self._tilt.value)),
             float(np.deg2rad(self._azimuth.value)),

@@ -1,0 +1,241 @@
+"""The commands for one tool each: ``align``, ``view``, ``stream``, ``bench``, ``experiment``, ``release``.
+
+See ``mereo.cli.commands`` for how commands are written.
+"""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from mereo.experiments.paper.scales import ExperimentName, ScaleName
+from mereo.io.config import InputConfig
+from mereo.models.config import InferenceConfig, Precision
+from mereo.reconstruction.config import IsolationConfig
+from mereo.training.config import PresetName
+
+
+@dataclass(frozen=True)
+class Align:
+    """Place every segment of a model on a full-resolution scan, from a rough start: ground truth for `mereo evaluate`.
+
+    Attributes:
+        scan: point cloud (PLY, PCD, XYZ, NPY, NPZ) that shows this object alone, from one side.
+        scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
+        output: folder to create: truth.json, overlay.png, segments.glb.
+        start: JSON file with poses or picked point pairs, of the object or of single segments.
+        weights: instead of --start, a shipped name or a file: the network's guess. The truth is then not independent.
+        unit: of the scan.
+        scene_unit_mm: millimetres per scene unit, where the scene does not say.
+        frame: axes of the scan: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
+        as_one: the object is rigid: place it as a whole.
+        hold: segments to leave at their start or at their neighbour, whatever the scan shows.
+        drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
+        force: replace an existing output folder.
+    """
+
+    scan: Positional[Path]
+    scene: str
+    output: Path
+    start: Path | None = None
+    weights: str | None = None
+    unit: Literal["m", "cm", "mm", "in"] = "m"
+    scene_unit_mm: float | None = None
+    frame: Literal["camera", "scanner"] = "camera"
+    as_one: bool = False
+    hold: tuple[str, ...] = ()
+    drop_invalid: bool = False
+    force: bool = False
+
+    def run(self) -> None:
+        """Write the folder of the truth and print the residuals."""
+        from mereo.cli.align import align_file
+        from mereo.evaluation.registration.truth_file import ScanFile
+
+        align_file(
+            ScanFile(self.scan, self.unit, self.frame, self.drop_invalid),
+            self.scene,
+            self.output,
+            start=self.start,
+            weights=self.weights,
+            scene_unit_mm=self.scene_unit_mm,
+            as_one=self.as_one,
+            hold=self.hold,
+            force=self.force,
+        )
+
+
+@dataclass(frozen=True)
+class ViewCommand:
+    """Look at a frame and its reconstruction in a browser, or move a scene by hand (--scene): needs the extra `view`.
+
+    Attributes:
+        input: a point cloud or depth image, as for `mereo reconstruct`; without it (and --scene) a shipped frame.
+        weights: a shipped name or a file; by default those that are shipped for the frame or the scene.
+        scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
+        port: where the page is, on this machine only (127.0.0.1); 0 takes any that is free.
+        resolution: grid cells along the longest side.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
+    """
+
+    input: Positional[Path | None] = None
+    weights: str | None = None
+    scene: str | None = None
+    port: int = 8080
+    resolution: int = 128
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+
+    def run(self) -> None:
+        """Open the page of a frame or of a scene, and keep it until Ctrl-C."""
+        from mereo.visualization.viewer.serve import view_frame, view_scene
+
+        if self.scene is not None:
+            if self.input is not None:
+                raise ValueError(f"both {self.input} and --scene {self.scene} are given; one can be shown: drop one")
+            view_scene(self.scene, self.weights, port=self.port, inference=self.inference)
+            return
+        view_frame(
+            self.input,
+            self.weights,
+            port=self.port,
+            resolution=self.resolution,
+            reading=self.reading,
+            isolation=self.isolation,
+            inference=self.inference,
+        )
+
+
+@dataclass(frozen=True)
+class StreamCommand:
+    """Reconstruct frames as they come: the latest one wins, a bad one is reported and passed over.
+
+    Each answer is one line of JSON on standard output, in the input's frame and units; rate and latency come at the
+    end, on standard error.
+
+    Attributes:
+        source: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
+        weights: a shipped name or a file.
+        resolution: grid cells along the longest side: fewer are faster.
+        rate: frames per second at which a folder was recorded.
+        every_frame: answer all frames, however long it takes, instead of the latest.
+        surfaces: folder for the surfaces of each answered frame, one GLB file each.
+        reading: how a frame is read.
+        isolation: what is left out of it.
+        inference: where and how exactly the network computes.
+    """
+
+    source: Positional[str]
+    weights: str
+    resolution: int = 48
+    rate: float = 30.0
+    every_frame: bool = False
+    surfaces: Path | None = None
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+
+    def run(self) -> None:
+        """Print a line of JSON for each frame, and the summary at the end."""
+        from mereo.cli.stream import stream_reconstructions
+
+        stream_reconstructions(
+            self.source,
+            self.weights,
+            resolution=self.resolution,
+            rate_hz=self.rate,
+            every_frame=self.every_frame,
+            surfaces=self.surfaces,
+            reading=self.reading,
+            isolation=self.isolation,
+            inference=self.inference,
+        )
+
+
+@dataclass(frozen=True)
+class BenchCommand:
+    """Time every stage of an answer against this machine's floor, and against the straightforward implementation.
+
+    Attributes:
+        weights: a shipped name or a file; without it the preset's network is fitted to one shipped frame first.
+        preset: the architecture to fit.
+        device: where the network runs; preprocessing is always on the CPU.
+        precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
+        repeats: of each stage.
+        rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
+        output: a JSON file for the figures.
+    """
+
+    weights: str | None = None
+    preset: PresetName = "paper"
+    device: Literal["cpu", "cuda"] = "cpu"
+    precision: Precision = "float32"
+    repeats: int = 7
+    rival: bool = False
+    output: Path | None = None
+
+    def run(self) -> None:
+        """Print the times of all stages of an answer."""
+        from mereo.experiments.speed.report import benchmark
+        from mereo.models.device import find_device
+
+        if self.repeats < 1:
+            raise ValueError(f"{self.repeats} repeats are asked for; at least 1 is needed: 7 are usual")
+        device = find_device(self.device)
+        benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.output)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Repeat one of the paper's experiments; the same command again continues a stopped one.
+
+    Attributes:
+        name: which one.
+        scale: smoke shows in minutes that it runs, cpu takes hours on two cores, paper is the full recipe for a GPU.
+        output: folder for datasets, runs, scores and results, shared by all experiments.
+        workers: processes that make datasets; 0 means one per core.
+    """
+
+    name: Positional[ExperimentName]
+    scale: ScaleName = "smoke"
+    output: Path = Path("out/experiments")
+    workers: int = 0
+
+    def run(self) -> None:
+        """Run the experiment and print its table."""
+        from mereo.experiments.paper.registry import run_experiment
+
+        workers = self.workers or os.cpu_count() or 1
+        directory = run_experiment(self.name, self.scale, self.output, workers)
+        print((directory / "table.md").read_text("utf-8"))
+        print(f"wrote {directory}")
+
+
+@dataclass(frozen=True)
+class Release:
+    """Write weights to hand on: in float16, with a model card of what they know, how they were trained and tested.
+
+    Attributes:
+        weights: a shipped name or a file.
+        name: of the files: lower case letters, digits, - and _.
+        output: folder to create.
+        tests: folders that `mereo evaluate` has written for these weights; their scores go into the card.
+        force: replace an existing output folder.
+    """
+
+    weights: Positional[str]
+    name: str
+    output: Path
+    tests: tuple[Path, ...] = ()
+    force: bool = False
+
+    def run(self) -> None:
+        """Write the weights to hand on, and their model card."""
+        from mereo.training.model_card import release
+
+        release(self.weights, self.name, self.output, self.tests, self.force)

@@ -1,0 +1,143 @@
+"""One frame of a sensor from whatever file holds it: a depth image, a point cloud or a ROS recording.
+
+    path, InputConfig -read_frame-> SensorFrame (points, metres per unit, axes, source, depth image where there is one)
+
+Which kind a file is, its name says. Options that do not belong to its kind are refused, because ignored ones are wrong
+results that nobody notices.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.io.config import InputConfig
+from mereo.io.depth_formats import is_depth_image, metres, read_raw_depth
+from mereo.io.intrinsics import read_intrinsics
+from mereo.io.readers import read_point_cloud, usable_depth, valid_points
+from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frame, recorded_frames
+
+FORMAT_UNITS_M = {".zdf": 0.001}
+"""Metres per unit of point clouds whose format says it."""
+
+Kind = Literal["recording", "depth image", "point cloud"]
+"""Kinds of files that hold frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFrame:
+    """Everything that a sensor measured at one moment, before the object is looked for.
+
+    Attributes:
+        path: the file, as it was named.
+        cloud: the measured points, in the file's axes and unit.
+        unit_m: metres per unit.
+        axes: the cloud's.
+        depth: the depth image in metres that the points come from, without what a mask leaves out; None for clouds.
+        message: the recording's message, by topic and time; empty for other files.
+    """
+
+    path: Path
+    cloud: PointCloud
+    unit_m: float
+    axes: CloudAxes
+    depth: DepthImage | None = None
+    message: str = ""
+
+    @property
+    def source(self) -> str:
+        """Name of the file, and which of its messages."""
+        return f"{self.path.name}, {self.message}" if self.message else self.path.name
+
+    @property
+    def depth_m(self) -> tuple[float, float, float]:
+        """Nearest, middle and farthest z of the points, in metres."""
+        return depths_m(self.cloud, self.unit_m)
+
+
+def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> SensorFrame:  # noqa: B008 (frozen)
+    """Frame that a depth image, point cloud or ROS recording holds, or that ``reading`` picks from it.
+
+    Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes.
+
+    Raises ``FileNotFoundError``, ``ImportError`` for a missing extra, and ``ValueError`` for a damaged file and for
+    options that do not belong to this kind of file.
+    """
+    path = Path(path)
+    kind = _kind(path)
+    _check_options(path, kind, reading)
+    if kind == "recording":
+        index = reading.frame_index or 0
+        return _recorded(recorded_frame(path, index, *_recording_options(reading)), path, reading)
+    if kind == "depth image":
+        return _depth_image(path, reading)
+    unit_m = FORMAT_UNITS_M.get(path.suffix.lower(), 1.0) if reading.unit_m is None else reading.unit_m
+    return SensorFrame(path, read_point_cloud(path, reading.drop_invalid), unit_m, reading.frame)
+
+
+def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFrame, Callable[[], SensorFrame]]]:
+    """Messages of a ROS recording's topic in their order, each with what decodes it; raises as ``read_frame``."""
+    for message in recorded_frames(path, *_recording_options(reading)):
+        yield message, partial(_recorded, message, path, reading)
+
+
+def depths_m(cloud: PointCloud, unit_m: float) -> tuple[float, float, float]:
+    """Nearest, middle and farthest z of a cloud in metres; ``unit_m`` is metres per unit."""
+    near, middle, far = (np.quantile(cloud.points[:, 2], [0.0, 0.5, 1.0]) * unit_m).tolist()
+    return near, middle, far
+
+
+# --- kinds of files --------------------------------------------------------------------------------------------------
+
+
+def _kind(path: Path) -> Kind:
+    if is_recording(path):
+        return "recording"
+    return "depth image" if is_depth_image(path) else "point cloud"
+
+
+def _check_options(path: Path, kind: Kind, reading: InputConfig) -> None:
+    if reading.topic is not None and kind != "recording":
+        raise ValueError(f"{path} is no ROS recording and has no topics: leave out --topic")
+    if kind == "point cloud":
+        if reading.intrinsics is not None or reading.mask is not None or reading.depth_scale is not None:
+            raise ValueError(f"{path} is read as a point cloud; leave out intrinsics, mask and depth scale")
+        return
+    if reading.frame != "camera":
+        raise ValueError(f"the frame is {reading.frame!r} but {path} is a {kind}; those are always in the camera frame")
+    if reading.unit_m is not None:
+        raise ValueError(f"{path} comes in metres: leave out --unit-m, and give --depth-scale if its scale is wrong")
+
+
+def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
+    if reading.intrinsics is None:
+        raise ValueError(f"{path} is a depth image without intrinsics; they are needed: give --intrinsics FILE")
+    raw = read_raw_depth(path)
+    found = read_intrinsics(reading.intrinsics, (raw.shape[1], raw.shape[0]), path, reading.frame_index)
+    stated = None if raw.dtype.kind == "f" else found.depth_scale
+    scale = stated if reading.depth_scale is None else reading.depth_scale
+    image = usable_depth(DepthImage(metres(raw, scale), found.camera), path, reading.mask)
+    return SensorFrame(path, image.to_points(), 1.0, "camera", image)
+
+
+def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
+    """Topic, camera and depth scale, as ``recorded_frames`` takes them."""
+    own = None if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
+    scale = own.depth_scale if own is not None and reading.depth_scale is None else reading.depth_scale
+    return reading.topic, own.camera if own else None, scale
+
+
+def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
+    content = message.read()
+    if isinstance(content, DepthImage):
+        image = usable_depth(content, path, reading.mask)
+        return SensorFrame(path, image.to_points(), 1.0, reading.frame, image, message.name)
+    if reading.mask is not None:
+        raise ValueError(f"{message.topic} in {path} has point clouds; leave out the mask, or name an image's --topic")
+    cloud = PointCloud(valid_points(content, path, reading.drop_invalid))
+    return SensorFrame(path, cloud, 1.0, reading.frame, message=message.name)

@@ -1,0 +1,143 @@
+"""Beside other work, threads that wait must sleep: OMP_WAIT_POLICY is set early, for all, but not over a user's own."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mereo.cli import doctor
+
+ROOT = Path(__file__).parents[1]
+VARIABLE = "OMP_WAIT_POLICY"
+
+WORKERS = f"""
+import os
+from mereo.synthesis.workers import in_processes
+
+def policy(item, cancelled):
+    return os.environ.get({VARIABLE!r}), os.getpid()
+
+if __name__ == "__main__":
+    results = [result for _, result in in_processes(policy, [0, 1, 2], 2)]
+    assert all(worker != os.getpid() for _, worker in results)
+    print(*(value for value, _ in results))
+"""
+
+FAKE_PYTHON = f"""#!/bin/sh
+# up to date whatever is asked (no installation), then tells what each of the script's commands would be run with
+if [ "$1" = -c ]; then cat >/dev/null; echo same; else echo "$2 ${VARIABLE}"; fi
+"""
+
+own_value = pytest.mark.parametrize("own, expected", [(None, "passive"), ("active", "active")])
+
+
+def run(command: list[str], own: str | None, **options: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run a command as a user who has set the variable to ``own``, or not at all."""
+    variables = {name: value for name, value in os.environ.items() if name != VARIABLE}
+    variables |= {} if own is None else {VARIABLE: own}
+    folder = options.pop("cwd", None)
+    variables |= {name: str(value) for name, value in options.items()}
+    return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, check=True, timeout=120)
+
+
+@own_value
+def test_importing_mereo_sets_it_and_keeps_a_users_own(own: str | None, expected: str) -> None:
+    code = f"import mereo, os, sys; print(os.environ[{VARIABLE!r}], 'torch' in sys.modules)"
+    assert run([sys.executable, "-c", code], own).stdout.split() == [expected, "False"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only GNU's OpenMP tells how long it spins")
+@pytest.mark.parametrize("order, spins", [("mereo, torch", False), ("torch, mereo", True)])
+def test_openmp_hears_of_it_unless_torch_was_imported_before(order: str, spins: bool) -> None:
+    told = run([sys.executable, "-c", f"import {order}"], None, OMP_DISPLAY_ENV="VERBOSE").stderr
+    counts = [line.split("'")[1] for line in told.splitlines() if "GOMP_SPINCOUNT" in line]
+    if not counts:
+        pytest.skip("this torch was not built with GNU's OpenMP")
+    assert [int(count) > 0 for count in counts] == [spins] * len(counts)
+
+
+@own_value
+def test_worker_processes_inherit_it(own: str | None, expected: str, tmp_path: Path) -> None:
+    script = tmp_path / "workers.py"
+    script.write_text(WORKERS)
+    assert run([sys.executable, str(script)], own).stdout.split() == [expected] * 3
+
+
+@own_value
+@pytest.mark.parametrize(
+    "script, commands",
+    [("./demo", ["mereo"]), ("./check", ["ruff", "ruff", "mypy", "pytest"]), (".ci/run", ["mereo", "ruff", "mypy"])],
+)
+def test_scripts_run_their_commands_with_it(
+    script: str, commands: list[str], own: str | None, expected: str, tmp_path: Path
+) -> None:
+    checkout = tmp_path / "checkout"
+    shutil.copytree(ROOT / ".ci", checkout / ".ci")
+    for name in ("demo", "check", "pyproject.toml", "constraints.txt"):
+        shutil.copy(ROOT / name, checkout)
+    python = checkout / ".venv/bin/python"
+    python.parent.mkdir(parents=True)
+    python.write_text(FAKE_PYTHON)
+    python.chmod(0o755)
+    (checkout / ".venv/installed").write_text("same " + extras_of_check(checkout))
+    told = [line.split() for line in run([script], own, cwd=checkout).stdout.splitlines()]
+    assert set(commands) <= {command for command, _ in told}
+    assert {value for _, value in told} == {expected}
+
+
+def extras_of_check(checkout: Path) -> str:
+    """What ./check asks .ci/setup to install."""
+    line = next(line for line in (checkout / "check").read_text().splitlines() if line.startswith("source .ci/setup"))
+    return line.split("'")[1]
+
+
+def test_doctor_shows_policy_and_load(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv(VARIABLE, "passive")
+    monkeypatch.setattr(os, "getloadavg", lambda: (3.25, 0.0, 0.0), raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    monkeypatch.setattr(doctor.torch, "get_num_threads", lambda: 4)
+    doctor.diagnose()
+    report = capsys.readouterr().out.splitlines()
+    assert "wait policy    passive" in report
+    (load,) = (line for line in report if line.startswith("load "))
+    assert load.endswith(
+        " 3.2 on 4 cores, which is busy: "
+        + "OMP_NUM_THREADS=1 would help, "
+        + "as all threads wait for the one that shares a core"
+    )
+
+
+def test_doctor_knows_no_load_where_the_system_has_none(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delattr(os, "getloadavg", raising=False)
+    doctor.diagnose()
+    report = capsys.readouterr().out.splitlines()
+    assert "wait policy    not set" in report
+    assert not any(line.startswith("load ") for line in report)
+
+
+@pytest.mark.parametrize(
+    "load, cores, threads, advised",
+    [
+        (0.9, 2, 2, None),  # more than half of the machine is free
+        (1.0, 2, 2, 1),
+        (2.9, 2, 2, 1),
+        (2.9, 2, 1, None),  # that many already
+        (3.0, 2, 2, None),  # so crowded that fewer threads gain nothing
+        (7.9, 16, 16, None),
+        (12.0, 16, 16, 4),
+        (12.0, 16, 4, None),
+    ],
+)
+def test_advice_is_as_many_threads_as_cores_are_free(
+    load: float, cores: int, threads: int, advised: int | None
+) -> None:
+    said = doctor.describe_load(load, cores, threads)
+    assert said.startswith(f"{load:.1f} on {cores} cores")
+    assert ("OMP_NUM_THREADS" in said) == (advised is not None)
+    assert advised is None or f"OMP_NUM_THREADS={advised} would help" in said

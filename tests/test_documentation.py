@@ -1,0 +1,167 @@
+"""The documentation: every link and anchor leads somewhere, every command and import it shows exists."""
+
+import ast
+import importlib
+import importlib.util
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mereo.__main__ import parse
+
+ROOT = Path(__file__).parent.parent
+EXPERIMENTS = ROOT / "docs" / "experiments.md"
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/mereo/**/weights/*.md")])
+FENCE = re.compile(r"^ *```(\w*)[^\n]*\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+RELEASED = [page for page in PAGES if page != EXPERIMENTS]
+"""Pages about the code as it is; an experiment is about the code of its commit."""
+ROOMS = "|".join(init.parent.name for init in sorted(ROOT.glob("src/mereo/*/__init__.py")))
+
+
+def prose(page: Path) -> str:
+    """A page without its code blocks and code spans, where brackets mean something else."""
+    return re.sub(r"``?[^`\n]+``?", "``", FENCE.sub("", page.read_text()))
+
+
+def anchors(page: Path) -> set[str]:
+    """Places in a page that a link may name: explicit ones, and headings that GitHub and MkDocs call the same."""
+    text = FENCE.sub("", page.read_text())
+    explicit = set(re.findall(r'<a id="([^"]+)"></a>', text))
+    headings = [re.sub(r"<[^>]+>|`", "", title).strip() for title in re.findall(r"^#+ (.+)$", text, re.MULTILINE)]
+    words = [re.sub(r"[^\w\s-]", "", heading).lower() for heading in headings]
+    return explicit | {slug for word in words if (slug := word.replace(" ", "-")) == re.sub(r"[-\s]+", "-", word)}
+
+
+def broken(page: Path) -> list[str]:
+    """The links of a page that lead nowhere."""
+    found = []
+    for target in LINK.findall(prose(page)):
+        if re.match(r"https?://|mailto:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (page.parent / name) if name else page
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            found.append(target)
+    return found
+
+
+def blocks(page: Path, *languages: str) -> Iterator[str]:
+    return (code for language, code in FENCE.findall(page.read_text()) if language in languages)
+
+
+def commands(page: Path) -> Iterator[str]:
+    """The calls of ``mereo`` in a page's shell blocks, each as one line."""
+    for code in blocks(page, "sh", "bash"):
+        for line in re.sub(r"\\\n\s*", " ", code).splitlines():
+            if line.startswith("mereo ") and "..." not in line:
+                yield line
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_leads_somewhere(page: Path) -> None:
+    assert broken(page) == []
+
+
+def test_a_broken_link_is_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text('# A -- b\n\n## <a id="x"></a>C `d`\n\n[](#x) [](#c-d) [](#a----b) [](no.md) [](#y) `[](z)`\n')
+    assert broken(page) == ["#a----b", "no.md", "#y"]  # the first: MkDocs would write a-b
+
+
+def test_every_experiment_has_the_anchor_of_its_number() -> None:
+    headings = re.findall(r"^## (.+)$", EXPERIMENTS.read_text(), re.MULTILINE)
+    assert headings
+    for heading in headings:
+        assert re.match(r'<a id="entry-(\d+[a-z]?)"></a>\1\. ', heading), heading
+
+
+def test_every_entry_that_is_mentioned_exists() -> None:
+    entries = {anchor.removeprefix("entry-") for anchor in anchors(EXPERIMENTS)}
+    for page in (*PAGES, *ROOT.glob("src/**/*.py"), *ROOT.glob("benchmarks/*.py")):
+        mentioned = re.findall(r"\b[Ee]ntr(?:y|ies) (\d+[a-z]?)\b", page.read_text())
+        assert set(mentioned) <= entries, page
+
+
+def test_links_to_experiments_name_the_entry() -> None:
+    for page in PAGES:
+        loose = re.findall(r"\[[Ee]ntry[^\]]*\]\([^)#]*\)", page.read_text())
+        assert loose == [], page
+
+
+def test_readme_is_one_screen() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 100
+
+
+@pytest.mark.parametrize("page", [p for p in RELEASED if any(commands(p))], ids=lambda page: page.name)
+def test_commands_parse(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for line in commands(page):
+        try:
+            parse(shlex.split(line, comments=True)[1:])
+        except SystemExit:
+            pytest.fail(f"{line}\n{capsys.readouterr().err}")
+
+
+def test_imports_in_python_blocks_exist() -> None:
+    for page in RELEASED:
+        for code in blocks(page, "python"):
+            for node in ast.walk(ast.parse(code)):
+                if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mereo"):
+                    module = importlib.import_module(node.module)
+                    assert all(hasattr(module, alias.name) for alias in node.names), f"{page}: {ast.unparse(node)}"
+
+
+def exists(name: str) -> bool:
+    """Whether this is a module of mereo or a definition in one, as ``models.decoder.LocalAttention`` is."""
+    parts = name.split(".")
+    depth = next(n for n in range(len(parts), 0, -1) if is_module(ROOT.joinpath("src", "mereo", *parts[:n])))
+    if depth == len(parts):
+        return True  # not imported: Triton's kernels cannot be everywhere
+    found: object = importlib.import_module(".".join(["mereo", *parts[:depth]]))
+    for part in parts[depth:]:
+        if not hasattr(found, part) and part not in getattr(found, "__annotations__", {}):
+            return False
+        found = getattr(found, part, None)
+    return True
+
+
+def is_module(path: Path) -> bool:
+    return path.is_dir() or path.with_suffix(".py").is_file()
+
+
+def test_modules_and_definitions_that_pages_name_exist() -> None:
+    assert exists("synthesis.examples.LabelledPoints.rest")  # a field without a default
+    assert not exists("synthesis.examples.LabelledPoints.nothing")
+    assert not exists("synthesis.nothing")
+    for page in RELEASED:
+        named = re.findall(rf"`(?:mereo\.)?((?:{ROOMS})(?:\.\w+)+)[(`]", page.read_text())
+        assert [name for name in named if not exists(name)] == [], page
+
+
+def test_citation_is_of_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (citation["title"], citation["version"], citation["license"]) == (
+        project["name"],
+        project["version"],
+        project["license"],
+    )
+    assert citation["authors"] == project["authors"]
+
+
+def test_every_library_has_a_lowest_version() -> None:
+    spec = importlib.util.spec_from_file_location("lowest", ROOT / ".ci" / "lowest.py")
+    assert spec is not None
+    assert spec.loader is not None
+    lowest = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(lowest)
+    constraints = lowest.constraints((ROOT / "pyproject.toml").read_text(), (ROOT / "constraints.txt").read_text())
+    assert {"torch==2.6", "numpy==2"} <= set(constraints)
+    assert any(line.startswith("ruff==") for line in constraints)  # the tools are pinned as ever
+    with pytest.raises(ValueError, match="'ray<3' has no lower bound; write the oldest version that works as >="):
+        lowest.lowest("ray<3")

@@ -1,0 +1,74 @@
+"""No cloud is encoded twice: the code that a reconstruction comes with answers everything that is asked after it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mereo.cli import demo
+from mereo.evaluation.sample_views import load_view
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.scanner_axes import into_camera
+from mereo.geometry.transforms import transform_points
+from mereo.models.model import EncodedCloud, Model
+from mereo.models.weights import load_model
+from mereo.reconstruction.pipeline import reconstruct
+from mereo.scenes.parameters import random_state
+from mereo.scenes.registry import load_scene
+from mereo.visualization.result_files import write_reconstruction
+from mereo.visualization.vertex_colors import confidence
+from mereo.visualization.viewer.laboratory import Laboratory
+from mereo.visualization.viewer.probe import Inspection
+
+
+@pytest.fixture
+def encoded(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """The points of every cloud that a model encodes."""
+    clouds: list[np.ndarray] = []
+    encode = Model.encode
+
+    def counted(model: Model, cloud: PointCloud) -> EncodedCloud:
+        clouds.append(np.asarray(cloud.points))
+        return encode(model, cloud)
+
+    monkeypatch.setattr(Model, "encode", counted)
+    return clouds
+
+
+def test_a_trial_of_the_laboratory(encoded: list[np.ndarray]) -> None:
+    laboratory = Laboratory(load_scene("rope"), load_model("rope"))
+    view = laboratory.look(random_state(laboratory.scene, 3), laboratory.first_place())
+    laboratory.rebuild(view, 16, 12)
+    assert len(encoded) == 1
+
+
+def test_a_page_of_a_frame(encoded: list[np.ndarray], tmp_path: Path) -> None:
+    cloud = load_view("rope").depth.to_points()
+    inspection = Inspection.of(cloud, load_model("rope"), 16)
+    inspection.ask(cloud.points[:5])
+    confidence(inspection.result.surfaces, inspection.ask)
+    write_reconstruction(inspection.result, cloud, tmp_path / "result")
+    assert len(encoded) == 1
+
+
+def test_a_case_of_the_demo(
+    encoded: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = load_view("rope")
+    case = demo.Case("rope", "a rope", "rope", frame.depth.to_points(), "camera", frame.truth)
+    monkeypatch.setattr(demo, "_inputs", lambda: iter([lambda: case]))
+    monkeypatch.setattr(demo, "RESOLUTION", 16)
+    demo.main(tmp_path)
+    assert len(encoded) == 1
+    assert "IoU" in capsys.readouterr().out
+
+
+def test_the_code_answers_in_the_camera_frame() -> None:
+    """Of a scan too, whose result is in the scanner's."""
+    model, seen = load_model("rope"), load_view("rope").depth.to_points().points
+    scan = seen * [1.0, -1.0, -1.0]
+    result = reconstruct(scan, model, 16, "scanner")
+    np.testing.assert_array_equal(result.T_camera_input, into_camera(scan, "scanner"))
+    in_camera = transform_points(result.T_camera_input, scan)
+    alone = model.encode(PointCloud(in_camera))
+    np.testing.assert_array_equal(model.logits(result.code, in_camera[:9]), model.logits(alone, in_camera[:9]))
