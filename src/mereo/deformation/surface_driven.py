@@ -32,7 +32,7 @@ REACH = 3.0
 
 
 class Surface:
-    """A closed surface at rest with its search tree and the spline's system, which all of its states share."""
+    """Closed surface at rest with its search tree and the spline's system, which all of its states share."""
 
     def __init__(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
         self.vertices = read_only_view(np.ascontiguousarray(vertices, dtype=np.float64))
@@ -43,7 +43,7 @@ class Surface:
         self.reach = REACH * float(np.median(np.sort(cdist(knots, knots), axis=1)[:, 1]))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the search tree, which cannot be pickled; it is built again on first use."""
+        """State without the search tree, which cannot be pickled; it is built again on first use."""
         return {key: value for key, value in self.__dict__.items() if key != "_tree"}
 
     @cached_property
@@ -64,7 +64,7 @@ class Surface:
 
     @cached_property
     def vertex_basis(self) -> Float[np.ndarray, "v k"]:
-        """The basis at all vertices at rest."""
+        """Basis of the spline at all vertices at rest."""
         return read_only(self._basis(self.vertices))
 
     def _basis(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p k"]:
@@ -73,11 +73,11 @@ class Surface:
         return np.concatenate([radial, np.ones((len(points), 1)), local], axis=1)
 
     def coefficients(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "k 3"]:
-        """The spline that takes the controls to where they are in ``vertices``."""
+        """Coefficients of the spline that takes the controls to where they are in ``vertices``."""
         return self._solver @ vertices[self.controls]
 
     def spline(self, coefficients: Float[np.ndarray, "k 3"], points: Float[np.ndarray, "p 3"]) -> np.ndarray:
-        """Values [p, 3] of a spline."""
+        """Values [p, 3] of a spline at points."""
         return self._basis(points) @ coefficients
 
     def carry(self, values: Float[np.ndarray, "v 3"], points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
@@ -93,7 +93,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMap:
-    """One state of a surface as a map of space; satisfies ``Deformation``.
+    """Map of space that one state of a surface gives; satisfies ``Deformation``.
 
     Attributes:
         rest: the surface at rest.
@@ -112,4 +112,5 @@ class SurfaceMap:
         return self.vertices - self.rest.vertex_basis @ self._coefficients
 
     def __call__(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+        """Images of points: exact on the surface, estimated inside."""
         return self.rest.spline(self._coefficients, points) + self.rest.carry(self._error, points)

@@ -8,11 +8,11 @@ Array = TypeVar("Array", bound=np.ndarray)
 
 
 def read_only(array: Array) -> Array:
-    """The array itself, which raises ``ValueError`` from here on where somebody writes into it."""
+    """Array itself, which raises ``ValueError`` from here on where somebody writes into it."""
     array.setflags(write=False)
     return array
 
 
 def read_only_view(array: Array) -> Array:
-    """A view of the array through which nobody can write; whoever made the array still may."""
+    """View of the array through which nobody can write; whoever made the array still may."""
     return read_only(array.view())

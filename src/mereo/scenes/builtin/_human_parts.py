@@ -39,16 +39,16 @@ EYE, EYE_RADIUS = (0.308, 7.284, 1.245), 0.146
 
 @dataclass(frozen=True)
 class Wedge:
-    """What is on the positive side of every plane (a point, a normal); model coordinates."""
+    """Part of space on the positive side of every plane (a point, a normal); model coordinates."""
 
     planes: tuple[tuple[Vector, Vector], ...]
 
     def mirrored(self) -> "Wedge":
-        """The same on the other side of the body."""
+        """Wedge on the other side of the body."""
         return Wedge(tuple(((-p[0], p[1], p[2]), (-n[0], n[1], n[2])) for p, n in self.planes))
 
     def solid(self) -> manifold3d.Manifold:
-        """As much of it as holds any part of the body, in scene coordinates."""
+        """Solid of the wedge, as much of it as holds any part of the body, in scene coordinates."""
         solid = manifold3d.Manifold.cube((200.0, 200.0, 200.0), True)
         for point, normal in self.planes:
             origin = to_scene(np.array([point]))[0]
@@ -81,7 +81,7 @@ class Base:
 
 @cache
 def base() -> Base:
-    """The asset `human/makehuman_base.obj`."""
+    """Base mesh of the asset `human/makehuman_base.obj`."""
     rows: list[list[float]] = []
     quads: list[list[int]] = []
     group = ""
@@ -107,7 +107,7 @@ def _model_center() -> Float[np.ndarray, "3"]:
 
 
 def to_scene(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Model to scene coordinates."""
+    """Points from model to scene coordinates."""
     return (points - _model_center()) * SCALE
 
 
@@ -122,7 +122,7 @@ def joints() -> Mapping[str, Float[np.ndarray, "3"]]:
 
 @cache
 def skin_weights() -> Mapping[str, tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]]:
-    """For each bone the base vertices it moves, and its share in each."""
+    """Base vertices that each bone moves, and its share in each."""
     stored: dict[str, list[Any]] = json.loads(assets.get("human/makehuman_default_weights.mhw").read_text())["weights"]
     weights = {}
     for bone, pairs in stored.items():
@@ -133,7 +133,7 @@ def skin_weights() -> Mapping[str, tuple[Int[np.ndarray, " k"], Float[np.ndarray
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The body as MakeHuman stores it: standing, arms away from the body, in ten segments."""
+    """Body as MakeHuman stores it: standing, arms away from the body, in ten segments."""
     head, torso = _body().split(HEAD.solid())
     limbs: dict[str, manifold3d.Manifold] = {}
     for side in ("left", "right"):

@@ -53,7 +53,7 @@ def _detail_centers(column: int, row: int) -> Float[np.ndarray, "k 2"]:
 
 
 def _centers(remainder: int) -> Float[np.ndarray, "k 2"]:
-    """Of the details in every second patch, like the fields of a chessboard."""
+    """Centres of the details in every second patch, like the fields of a chessboard."""
     fields = [(c, r) for c in range(COLUMNS) for r in range(ROWS) if (c + r) % 2 == remainder]
     return np.concatenate([_detail_centers(column, row) for column, row in fields])
 

@@ -58,7 +58,7 @@ EXHAUST_PEAK_RAD = np.deg2rad(360.0 - 110.0)
 
 @dataclass(frozen=True, eq=False)
 class StepwiseShift:
-    """Shifts space along z by an amount that depends on x alone; its Jacobian is 1.
+    """Shift of space along z by an amount that depends on x alone; its Jacobian is 1.
 
     Attributes:
         borders: ascending x between neighbouring steps.
@@ -71,6 +71,7 @@ class StepwiseShift:
     width: float
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Shifted points."""
         past = smooth_step((points[:, :1] - self.borders) / self.width + 0.5)
         moved = points.copy()
         moved[:, 2] += self.shifts[0] + past @ np.diff(self.shifts)
@@ -79,7 +80,7 @@ class StepwiseShift:
 
 @cache
 def valve_places() -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
-    """Of the eight valves from front to rear: x, radius, and the crank angle at which they are open most."""
+    """Places of the eight valves from front to rear: x, radius, and the crank angle at which they are open most."""
     rows = [
         (x + at, radius, firing + peak)
         for x, firing in zip(parts.CYLINDERS, FIRING_RAD, strict=True)
@@ -93,13 +94,13 @@ def valve_places() -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"], Fl
 
 
 def valve_lifts(crank_rad: float) -> Float[np.ndarray, " v"]:
-    """How far each valve is open, in units."""
+    """Lift of each valve, in units."""
     return parts.cam_lift((crank_rad - valve_places()[2]) / 2)
 
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The engine at crank angle 0."""
+    """Engine at crank angle 0."""
     x, radius, peak = valve_places()
     valves = [
         parts.valve(r, drop).translate((at, 0, 0)) for at, r, drop in zip(x, radius, valve_lifts(0.0), strict=True)
@@ -131,7 +132,7 @@ def rod_and_piston(crank_rad: float, throw: float) -> tuple[Deformation, Deforma
 
 
 def deformations_at(crank_rad: float) -> tuple[Deformation, ...]:
-    """Every segment's motion from angle 0 to ``crank_rad``; any angle, the cycle is 4 pi long."""
+    """Motions of all segments from angle 0 to ``crank_rad``; any angle, the cycle is 4 pi long."""
     x, radius, _ = valve_places()
     crank = Rigid(np.array([crank_rad, 0.0, 0.0]), np.zeros(3), np.zeros(3))
     cam = Rigid(np.array([crank_rad / 2, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, parts.CAM_HEIGHT]))
@@ -146,12 +147,12 @@ def deformations_at(crank_rad: float) -> tuple[Deformation, ...]:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """A crank angle uniform over the cycle."""
+    """Motions at a crank angle uniform over the cycle."""
     return deformations_at(named(rng, "crank angle", "rad").uniform(0.0, CYCLE_RAD))
 
 
 def scene() -> Scene:
-    """The engine; cameras stand before the open side, rather above than below."""
+    """Scene of the engine; cameras stand before the open side, rather above than below."""
     return Scene(
         name="engine",
         rest=rest_mesh(),

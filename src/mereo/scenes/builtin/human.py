@@ -105,7 +105,7 @@ def is_clear(posed: Deformation) -> bool:
 
 @cache
 def critical_points() -> Float[np.ndarray, "n 3"]:
-    """The vertices at which the joints can press space most: largest angle, slope of the share and lever multiply."""
+    """Vertices at which the joints can press space most: largest angle, slope of the share and lever multiply."""
     vertices = np.concatenate([segment.vertices for segment in rest_mesh().segments])
     field, step = share_field(), 0.05 * np.eye(3)
     slope = np.stack([field(vertices + along) - field(vertices - along) for along in step], axis=2) / 0.1
@@ -116,7 +116,7 @@ def critical_points() -> Float[np.ndarray, "n 3"]:
 
 
 def sample_body(rng: np.random.Generator) -> PosedBody:
-    """A random shape in a random pose within the limits of each joint."""
+    """Random shape in a random pose within the limits of each joint."""
     girth = np.zeros(len(JOINTS))
     with part(rng, "shape"):
         common = named(rng, "girth").uniform(-0.1, 0.14)
@@ -130,7 +130,7 @@ def sample_body(rng: np.random.Generator) -> PosedBody:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """One map moves all segments."""
+    """Random shape, pose and waves, one map for all segments."""
     for _ in range(ATTEMPTS):
         body = sample_body(rng)
         if is_clear(body) and jacobian_determinant(body, critical_points()).min() > LEAST_DETERMINANT:
@@ -141,7 +141,7 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 
 def scene() -> Scene:
-    """The human body; needs the three assets `human/makehuman_*`."""
+    """Scene of the human body; needs the three assets `human/makehuman_*`."""
     return Scene(
         name="human",
         rest=rest_mesh(),

@@ -68,7 +68,7 @@ GAP = 0.2
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The straight lizard, symmetrical, its belly on z = 0."""
+    """Straight lizard, symmetrical, its belly on z = 0."""
     links = spine_links()
     parts = {name: union(*links[first:last]) for name, (first, last) in SPINE_SEGMENTS.items()}
     for name, (plan, side, _) in LEGS.items():
@@ -90,7 +90,7 @@ def sample_spine(rng: np.random.Generator) -> Float[np.ndarray, "h 3"]:
 
 
 def spine_motions(vectors: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "k 4 4"]:
-    """Of every link from rest, the middle one staying."""
+    """Motions of all links from rest, the middle one staying."""
     motions = [np.eye(4)]
     for knuckle, vector in zip(SPINE, vectors, strict=True):
         motions.append(follow(motions[-1], knuckle, vector))
@@ -147,7 +147,7 @@ def is_clear(spine: Float[np.ndarray, "k 4 4"], legs: dict[str, Float[np.ndarray
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """One map for each segment: its inner knuckles turn, then it follows the link that carries it."""
+    """Random maps, one for each segment: its inner knuckles turn, then it follows the link that carries it."""
     while True:
         with part(rng, "spine"):
             vectors = sample_spine(rng)
@@ -178,14 +178,14 @@ def _leg_vectors(rng: np.random.Generator, name: str) -> Float[np.ndarray, "2 3"
 def _leg_motions(
     name: str, spine: Float[np.ndarray, "k 4 4"], vectors: Float[np.ndarray, "2 3"]
 ) -> Float[np.ndarray, "2 4 4"]:
-    """Of the upper leg and of the foot, from rest."""
+    """Motions of the upper leg and of the foot, from rest."""
     plan, side, carrier = LEGS[name]
     upper = follow(spine[carrier], leg(plan, side).root, vectors[0])
     return np.stack([upper, follow(upper, leg(plan, side).ankle, vectors[1])])
 
 
 def scene() -> Scene:
-    """The lizard on its belly; the paper's camera workspace above it."""
+    """Scene of the lizard on its belly; the paper's camera workspace above it."""
     return Scene(
         name="lizard",
         rest=rest_mesh(),
