@@ -1,15 +1,13 @@
 """The statistical model of a scene's states, and the motion of any point with its material points."""
 
-import json
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from toy_scene import sample_deformations, toy_scene
 
 from mereo.deformation.moving_least_squares import Anchors
-from mereo.geometry.procrustes import fit_rigid, robust_rigid
-from mereo.scenes.model_arrays import byte_count, from_arrays, to_arrays
+from mereo.geometry.procrustes import robust_rigid
+from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.random_states import interior_nodes, sample_states, scene_model, state_points
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel, build_model
@@ -97,28 +95,3 @@ def test_a_mirror_image_is_not_a_pose() -> None:
 
 
 # --- as arrays --------------------------------------------------------------------------------------------------------
-
-
-def test_arrays_hold_the_whole_model(model: StatisticalModel) -> None:
-    arrays, header = to_arrays(model)
-    again = from_arrays(arrays, json.loads(json.dumps(header)))
-    assert again.rest.names == model.rest.names and again.rest.colors == model.rest.colors
-    np.testing.assert_array_equal(again.faces, model.faces)
-    np.testing.assert_allclose(again.library, model.library, atol=0.021)
-    for z in model.library[:20].astype(np.float64):
-        np.testing.assert_allclose(again.material(z), model.material(z), atol=2e-3 * model.half)
-
-
-def test_a_limit_leaves_out_the_smallest_modes(model: StatisticalModel) -> None:
-    whole, _ = to_arrays(model)
-    limit = byte_count(whole) - 5000
-    arrays, header = to_arrays(model, limit)
-    assert byte_count(arrays) <= limit
-    fewer = from_arrays(arrays, header)
-    assert 0 < fewer.count < model.count
-    np.testing.assert_allclose(fewer.modes, model.modes[:, :, : fewer.count], atol=1e-3 * model.half)
-
-
-def test_too_small_a_limit_is_refused(model: StatisticalModel) -> None:
-    with pytest.raises(ValueError, match="does not fit into 1000 bytes with a single mode; it needs more"):
-        to_arrays(model, 1000)

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from mereo.fitting.config import FitChoice
 from mereo.io.config import FilesConfig, InputConfig
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -211,6 +212,9 @@ class Reconstruct:
         isolation: what of the frame is left out.
         inference: where and how exactly the network computes.
         files: which files, and in which unit.
+        fit: register the object's own deformation model to the frame: off leaves the network's answer; auto takes the
+            registered model where it explains the frame; modes and full take it in any case, full by fitting the draws
+            of the scene as well.
         force: replace an existing output folder.
     """
 
@@ -218,6 +222,7 @@ class Reconstruct:
     weights: str
     output: Path
     resolution: int = 128
+    fit: FitChoice = "off"
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
@@ -237,6 +242,7 @@ class Reconstruct:
             isolation=self.isolation,
             inference=self.inference,
             files=self.files,
+            choice=self.fit,
             force=self.force,
         )
 

@@ -6,11 +6,16 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from mereo.fitting.config import FitChoice
+from mereo.fitting.register import describe, register, registered
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
 from mereo.io.atomic_files import new_directory
 from mereo.io.config import DEFAULT_FILES, FilesConfig, InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
+from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import STRAY_SHARE, stray_share
@@ -29,6 +34,7 @@ def reconstruct_file(
     isolation: IsolationConfig = IsolationConfig(),  # noqa: B008
     inference: InferenceConfig = InferenceConfig(),  # noqa: B008
     files: FilesConfig = DEFAULT_FILES,
+    choice: FitChoice = "off",
     force: bool = False,
 ) -> Reconstruction:
     """Read one frame of a sensor, reconstruct it, write a new directory, print what was found: ``mereo reconstruct``.
@@ -42,6 +48,7 @@ def reconstruct_file(
         isolation: what of the frame is left out.
         inference: where and how exactly the network computes.
         files: which files are written, and in which unit.
+        choice: whether the network answers, or the registered model.
         force: replace an existing folder.
 
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``read_frame``, ``find_object`` and
@@ -60,12 +67,33 @@ def reconstruct_file(
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
         result = reconstruct(seen.cloud, model, resolution, frame.axes, label_points="points" in formats)
-        facts = {"title": frame.source, "weights": str(weights), "resolution": resolution, "points": len(seen.cloud)}
+        facts: dict[str, object] = {
+            "title": frame.source,
+            "weights": str(weights),
+            "resolution": resolution,
+            "points": len(seen.cloud),
+        }
+        if choice != "off":
+            result, facts["registration"] = _registered(result, seen.cloud, model, choice, frame.axes)
         facts |= {"device": model.device.type, "precision": model.working_precision}
         write_files(directory, result, seen.cloud, frame.axes, files, frame.unit_m, {**facts, **seen.facts()})
     print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result
+
+
+def _registered(
+    result: Reconstruction, cloud: PointCloud, model: Model, choice: FitChoice, axes: CloudAxes
+) -> tuple[Reconstruction, dict[str, object]]:
+    """The registered model, or the network's answer where "auto" does not believe it; says which, and the facts."""
+    registration = register(result, cloud, model, choice)
+    taken = registration.accepted or choice != "auto"
+    explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
+    print(explained if taken else f"{explained}: too little, the network's answer is kept")
+    if taken and not registration.accepted:
+        print("that is too little to believe it: --fit auto keeps the network's answer")
+    facts = {"answer": "registration" if taken else "network", **describe(registration)}
+    return (registered(result, registration, model, axes) if taken else result), facts
 
 
 def print_segments(result: Reconstruction, title: str) -> None:

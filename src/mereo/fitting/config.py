@@ -1,6 +1,11 @@
-"""Constants of the fit. Imports neither numpy nor torch."""
+"""Settings and constants of the fit; light, so that the command line may import them."""
 
 from dataclasses import dataclass
+from typing import Literal
+
+FitChoice = Literal["off", "auto", "modes", "full"]
+"""What answers a frame: the network alone; the registered model where that explains the frame, else the network; the
+registered model in any case, by its modes or by the draws of its scene as well."""
 
 
 @dataclass(frozen=True)

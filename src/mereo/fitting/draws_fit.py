@@ -16,7 +16,7 @@ from mereo.fitting.hypotheses import ALIKE, robust_poses
 from mereo.fitting.modes_fit import fit_network
 from mereo.fitting.playback import Drawn, material_moved
 from mereo.fitting.residuals import NetworkTerm, robust_square
-from mereo.geometry.procrustes import fit_rigid
+from mereo.geometry.transforms import fit_rigid
 
 MOST_DRAWS = 120
 """Scenes with more free numbers are left to the modes."""

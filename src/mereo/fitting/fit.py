@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences, find_correspondences
@@ -74,6 +75,18 @@ def fit_correspondences(
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
 ) -> Registration:
     """``fit`` from given correspondences; ``points`` are the observed cloud, seen from the origin."""
+    with threadpool_limits(1, "blas"):  # products this small are slower on two threads, and 20 times on busy cores
+        return _fit(points, found, model, scene_unit, states, config)
+
+
+def _fit(
+    points: Float[np.ndarray, "n 3"],
+    found: Correspondences,
+    model: StatisticalModel,
+    scene_unit: float | None,
+    states: DrawnStates | None,
+    config: FitConfig,
+) -> Registration:
     started = time.perf_counter()
     unit = estimate_unit(found) if scene_unit is None else scene_unit
     scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD

@@ -6,7 +6,7 @@ A motion is ``y = R x + t``. Notation: n points, s sets of points; ``T_a_b`` map
 import numpy as np
 from jaxtyping import Float
 
-from mereo.geometry.transforms import rigid
+from mereo.geometry.transforms import fit_rigid
 
 ROUNDS = 20
 """Of reweighting in ``robust_rigid``; it has converged by then."""
@@ -19,16 +19,6 @@ def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray,
     left = left.copy()
     left[..., 2] *= np.where(proper == 0, 1.0, proper)[..., None]
     return np.swapaxes(left @ right, -1, -2)
-
-
-def fit_rigid(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"] | None = None
-) -> Float[np.ndarray, "4 4"]:
-    """``T_target_source`` of least weighted squared distance."""
-    share = np.full(len(source), 1.0 / len(source)) if weight is None else weight / weight.sum()
-    center, goal = share @ source, share @ target
-    rotation = best_rotations((source - center).T @ (share[:, None] * (target - goal)))
-    return rigid(rotation, goal - rotation @ center)
 
 
 def robust_rigid(

@@ -107,7 +107,7 @@ def reconstruct(
         T_camera_input=T_camera_input,
         observed=observed,
     )
-    return result if frame == "camera" else _turned_back(result)
+    return result if frame == "camera" else turned_back(result)
 
 
 @contextmanager
@@ -122,7 +122,7 @@ def segment_names(model: Model) -> tuple[tuple[str, ...], tuple[Color, ...]]:
     return (model.names, model.colors) if model.segmented else (("object",), PALETTE[:1])
 
 
-def _turned_back(result: Reconstruction) -> Reconstruction:
+def turned_back(result: Reconstruction) -> Reconstruction:
     """Result in the scanner's frame from that in the camera's: half a turn about x reverses the grid along y and z."""
     T_scanner_camera, grid = inverse_rigid(result.T_camera_input), result.labels
     last = np.asarray(grid.labels.shape) - 1

@@ -6,6 +6,7 @@ from jaxtyping import Float, Float32, UInt8
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
+from mereo.scenes.registry import SCENES, load_scene
 from mereo.scenes.scene import Scene, State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel, build_model, material_points
@@ -57,6 +58,12 @@ def sample_states(
     return np.stack(
         [state_points(scene.sample_state(example_rng(seed, i)), nodes, labels).astype(np.float32) for i in range(count)]
     )
+
+
+def built_in_model(name: str, segments: tuple[str, ...]) -> StatisticalModel | None:
+    """Statistical model of a built-in scene, where it has these segments; None for other objects."""
+    scene = load_scene(name) if name in SCENES else None
+    return scene_model(scene) if scene is not None and scene.rest.names == segments else None
 
 
 def states_for(examples: int) -> int:

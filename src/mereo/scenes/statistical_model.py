@@ -15,7 +15,8 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.procrustes import align_all, fit_rigid
+from mereo.geometry.procrustes import align_all
+from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.pair_distances import PairDistances, kept_distances
 
 PROCRUSTES_ROUNDS = 100
