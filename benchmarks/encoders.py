@@ -27,7 +27,9 @@ ENCODERS: tuple[Encoder, ...] = ("pointnet2", "point-transformer", "autodecoder"
 def measure(encoder: Encoder) -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    network = Network(NetworkConfig(encoder=encoder, dropout=0.2 if encoder == "autodecoder" else 0.0), SEGMENTS)
+    network = Network(
+        NetworkConfig().changed(encoder=encoder, dropout=0.2 if encoder == "autodecoder" else 0.0), SEGMENTS
+    )
     parts = [sum(p.numel() for p in part.parameters()) / 1e6 for part in (network.encoder, network.decoder)]
     if isinstance(network.encoder, Autodecoder):
         network.encoder.add_codes(BATCH)
@@ -36,8 +38,8 @@ def measure(encoder: Encoder) -> None:
     queries, index = torch.randn(BATCH, QUERIES, 3), torch.arange(BATCH)
 
     def step() -> None:
-        outputs = network(cloud, viewpoint.expand(BATCH, 3), queries, index)
-        torch.stack([output.square().mean() for output in outputs if output is not None]).sum().backward()
+        prediction, coarse = network(cloud, viewpoint.expand(BATCH, 3), queries, index)
+        torch.stack([output.square().mean() for output in (*prediction, coarse) if output is not None]).sum().backward()
 
     before = peak()
     training = seconds(step, 3) / BATCH

@@ -1,7 +1,5 @@
 """Models to export: random, but every part of the network says something, and differently at every place."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 
@@ -16,16 +14,16 @@ NAMES = ("head", "left ear", "tail")
 
 TINY = PRESETS["tiny"].network
 
-SMALL = NetworkConfig(
+SMALL = NetworkConfig().changed(
     points=96, neighbors=16, mlp1=(16, 16), mlp2=(16, 24), mlp_global=(24, 32), width=32, depth=3, skip_after=2
 )
 """The paper's structure in small: no alignment, no local features, no template."""
 
 CASES: dict[str, tuple[NetworkConfig, str]] = {
-    "plain": (replace(SMALL, sight_neighbors=4), "l1"),
+    "plain": (SMALL.changed(sight_neighbors=4), "l1"),
     "everything": (TINY, "ce+l1+cd"),
     "transformer": (
-        replace(TINY, encoder="point-transformer", points=320, transformer_widths=(8, 16, 24, 32, 40)),
+        TINY.changed(encoder="point-transformer", points=320, transformer_widths=(8, 16, 24, 32, 40)),
         "ce+l1+cd",
     ),
 }
@@ -35,7 +33,7 @@ def model_of(config: NetworkConfig, loss: str) -> Model:
     """With the statistics of two batches, and a template that is a ball for each segment."""
     torch.manual_seed(3)
     network = Network(config, len(NAMES))
-    if config.rest_template:
+    if config.additions.rest_template:
         lookup = network.decoder.lookup
         assert lookup is not None
         axis = torch.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)

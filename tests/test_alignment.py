@@ -80,7 +80,7 @@ def test_directions_turn_back() -> None:
 def test_a_moved_object_gets_the_same_answers_turned_along(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the right alignment, the network cannot tell how the object was turned."""
     torch.manual_seed(0)
-    network = Network(replace(TINY, sight_neighbors=0), segments=3).train()
+    network = Network(TINY.changed(sight_neighbors=0), segments=3).train()
     cloud, queries, viewpoint = cloud_of(), cloud_of(points=30), torch.tensor([[0.0, 0.0, -8.0]] * 2)
     network(cloud, viewpoint, queries)
     network.eval()
@@ -118,7 +118,7 @@ def test_aligner_learns_a_turned_object() -> None:
     torch.manual_seed(0)
     shape = cloud_of(1, 128) * torch.tensor([1.0, 0.6, 0.3])
     shape = shape + torch.tensor([0.0, 0.4, 0.0]) * (shape[..., :1] > 0.2) + 0.3 * shape[..., :1].square()
-    aligner = AlignmentNet(replace(TINY, align_points=128))
+    aligner = AlignmentNet(TINY.changed(align_points=128))
     optimizer = torch.optim.Adam(aligner.parameters(), lr=3e-3)
 
     def batch(seed: int) -> tuple[Tensor, Tensor]:

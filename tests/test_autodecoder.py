@@ -16,7 +16,7 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.scoring import TestCase, score_cases
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.models.config import NetworkConfig
+from mereo.models.config import AutodecoderConfig, NetworkConfig
 from mereo.models.decoder import Code
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.encoders.encoding import Encoding
@@ -30,7 +30,7 @@ from mereo.training.dataset import Dataset
 from mereo.training.run_directory import start_network
 
 SMALL = TrainConfig(
-    network=NetworkConfig(
+    network=NetworkConfig().changed(
         encoder="autodecoder",
         points=64,
         mlp_global=(32,),
@@ -152,7 +152,7 @@ def test_the_search_is_deterministic_and_by_cloud(model: Model, data: Dataset) -
 
 
 def test_the_search_works_beside_alignment_sight_and_template() -> None:
-    config = replace(PRESETS["tiny"].network, encoder="autodecoder", local_neighbors=0, search_steps=2)
+    config = PRESETS["tiny"].network.changed(encoder="autodecoder", local_neighbors=0, search_steps=2)
     torch.manual_seed(0)
     network = Network(config, 2).eval().requires_grad_(False)
     unmoved = network.encoder.mean.clone()
@@ -186,15 +186,15 @@ def test_only_the_codes_of_a_batch_move_and_at_their_own_rate(dataset: Path, dat
 def test_gradient_reaches_every_parameter(data: Dataset) -> None:
     network = start_network(SMALL, data).train()
     index = torch.arange(12)
-    outputs = network(data.cloud, data.viewpoint, data.positions, index)
-    sum(output.square().sum() for output in outputs if output is not None).backward()
+    prediction, coarse = network(data.cloud, data.viewpoint, data.positions, index)
+    sum(output.square().sum() for output in (*prediction, coarse) if output is not None).backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 1e-7, name
     assert (network.encoder.codes.grad.abs().amax(dim=1) > 1e-7).all()
 
 
 def test_the_prior_is_the_codes_squared_length() -> None:
-    encoder = Autodecoder(NetworkConfig(encoder="autodecoder", mlp_global=(4,), code_penalty=0.5))
+    encoder = Autodecoder(AutodecoderConfig(code_penalty=0.5), latent=4)
     assert torch.equal(
         encoder.length_penalty(torch.tensor([[1.0, 2.0, 0.0, 2.0], [0.0, 0, 0, 0]])), torch.tensor([4.5, 0])
     )
@@ -206,7 +206,7 @@ def test_the_prior_is_the_codes_squared_length() -> None:
 def test_killed_and_resumed_equals_uninterrupted(dataset: Path, tmp_path: Path) -> None:
     """Codes, their momentum, the dropout masks and the averaged codes included."""
     config = replace(SMALL, batch=5, epochs=1.2, ema_decay=0.9, holdout=1)
-    config = replace(config, network=replace(config.network, dropout=0.2, search_steps=3))
+    config = replace(config, network=config.network.changed(dropout=0.2, search_steps=3))
     assert_resumes_exactly(dataset, tmp_path, config, steps=2)
 
 
@@ -231,8 +231,8 @@ def test_the_curve_shows_a_few_held_out_examples(data: Dataset, monkeypatch: pyt
 def test_the_papers_recipe() -> None:
     recipe, paper = PRESETS["paper-autodecoder"], PRESETS["paper"]
     assert (recipe.batch, recipe.learning_rate, recipe.code_rate, recipe.epochs) == (64, 5e-4, 1e-3, 1000)
-    assert (recipe.network.dropout, recipe.network.search_steps, recipe.network.search_rate) == (0.2, 75, 1e-3)
-    network = replace(recipe.network, encoder="pointnet2", dropout=0.0)
+    assert recipe.network.decoder.dropout == 0.2 and recipe.network.autodecoder == AutodecoderConfig(75, 1e-3)
+    network = recipe.network.changed(encoder="pointnet2", dropout=0.0)
     assert replace(recipe, batch=40, epochs=300.0, network=network) == paper
 
 
@@ -242,7 +242,7 @@ def test_what_cannot_train_an_autodecoder_is_refused(data: Dataset, dataset: Pat
     with pytest.raises(ValueError, match="one code per training example, and augmentation .* train without"):
         trainer.train(dataset, tmp_path / "run", replace(SMALL, augment=AugmentConfig(roll=True)))
     with pytest.raises(ValueError, match="local_neighbors is 6, but an autodecoder has no features .*-neighbors 0"):
-        trainer.train(dataset, tmp_path / "run", replace(SMALL, network=replace(SMALL.network, local_neighbors=6)))
+        trainer.train(dataset, tmp_path / "run", replace(SMALL, network=SMALL.network.changed(local_neighbors=6)))
     assert not (tmp_path / "run").exists()
 
 

@@ -74,7 +74,7 @@ def test_a_fitted_network_knows_its_frame(monkeypatch: pytest.MonkeyPatch) -> No
     cells = np.argwhere(kept & (grid.labels > 0))[::50]
     labels = model.query(model.encode(view.depth.to_points()), grid.positions(cells)).label
     assert (labels > 0).mean() > 0.5
-    assert model.network.config == replace(PRESETS["tiny"].network, dropout=0.0)
+    assert model.network.config == PRESETS["tiny"].network.changed(dropout=0.0)
 
 
 def test_a_frame_by_fixed_shapes_is_what_the_model_answers() -> None:

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from mereo import doctor
+from mereo.cli import doctor
 
 ROOT = Path(__file__).parents[1]
 VARIABLE = "OMP_WAIT_POLICY"
 
 WORKERS = f"""
 import os
-from mereo.parallel import in_processes
+from mereo.synthesis.workers import in_processes
 
 def policy(item, cancelled):
     return os.environ.get({VARIABLE!r}), os.getpid()

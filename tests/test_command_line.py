@@ -134,8 +134,8 @@ def test_train_options_override_the_preset() -> None:
     )
     command = command_line.parse(text.split())
     assert isinstance(command, commands.Train)
-    assert (command.config.epochs, command.config.loss, command.config.network.width) == (2, "ce", 64)
-    assert not command.config.network.encode_positions
+    assert (command.config.epochs, command.config.loss, command.config.network.decoder.width) == (2, "ce", 64)
+    assert not command.config.network.decoder.encode_positions
     assert command.config.learning_rate == PRESETS["paper"].learning_rate
     assert command_line.parse(["train", "data", "--output", "run"]).config == PRESETS["base"]  # type: ignore[union-attr]
 

@@ -5,7 +5,6 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +82,7 @@ def test_a_reloaded_torch_program_answers_as_the_network(tmp_path: Path, case: s
 
 
 def test_an_autodecoder_is_refused(tmp_path: Path) -> None:
-    config = replace(PRESETS["tiny"].network, encoder="autodecoder", local_neighbors=0)
+    config = PRESETS["tiny"].network.changed(encoder="autodecoder", local_neighbors=0)
     save_model(Model(Network(config, 3).eval(), NAMES, PALETTE[:3]), tmp_path / "w.safetensors")
     with pytest.raises(
         ValueError, match=r"an autodecoder's, which finds the code .* by gradient steps; .*: train with"

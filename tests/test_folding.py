@@ -1,7 +1,5 @@
 """Folding changes the arithmetic, not the answers."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch import nn
@@ -11,7 +9,7 @@ from mereo.models.config import NetworkConfig
 from mereo.models.network import Network
 from mereo.training.config import PRESETS
 
-SMALL = replace(PRESETS["tiny"].network, points=64)
+SMALL = PRESETS["tiny"].network.changed(points=64)
 
 
 def lived_in(config: NetworkConfig) -> Network:
@@ -31,9 +29,9 @@ def lived_in(config: NetworkConfig) -> Network:
     "config",
     [
         SMALL,
-        replace(SMALL, align_points=0, rest_template=False, local_neighbors=0, sight_neighbors=0),
-        replace(SMALL, align_points=0, rest_template=False, encode_positions=False),
-        replace(SMALL, encoder="point-transformer", transformer_widths=(8, 16, 32), points=128),
+        SMALL.changed(align_points=0, rest_template=False, local_neighbors=0, sight_neighbors=0),
+        SMALL.changed(align_points=0, rest_template=False, encode_positions=False),
+        SMALL.changed(encoder="point-transformer", transformer_widths=(8, 16, 32), points=128),
     ],
     ids=["everything", "the paper's", "plain positions", "point transformer"],
 )

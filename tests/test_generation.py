@@ -222,7 +222,7 @@ def test_resuming_names_the_setting_that_differs(whole: Path, tmp_path: Path) ->
 def test_a_broken_manifest_cannot_be_resumed(tmp_path: Path) -> None:
     for text in ("{", "[]"):
         (tmp_path / "manifest.json").write_text(text)
-        with pytest.raises(ValueError, match="is not a manifest; it cannot be resumed: choose another --output"):
+        with pytest.raises(ValueError, match="holds no settings; what it belongs to cannot be continued: choose"):
             generate(TOY, tmp_path, SMALL, examples=4, seed=1, resume=True)
 
 

@@ -20,9 +20,9 @@ from mereo.models.weights import load_model
 
 KERNELS = """
 import numpy as np, torch
-from mereo.gpu.kernels import farthest_points, nearest
-from mereo.neighbors import nearest as expected
-from mereo.ordering import farthest_point_order
+from mereo.models.ops.triton_kernels import farthest_points, nearest
+from mereo.models.ops.neighbors import nearest as expected
+from mereo.geometry.farthest_point_sampling import farthest_point_order
 
 torch.manual_seed(0)
 points, valid = torch.randn(2, 300, 3), torch.rand(2, 300) > 0.3
@@ -130,7 +130,7 @@ def test_what_cannot_be_fixed_is_refused() -> None:
         frames.ask(np.zeros((1, 3)))
     with pytest.raises(ValueError, match=r"the image is \(4, 4\); the camera's are"):
         frames.see(np.ones((4, 4)))
-    odd = replace(model.network.config, encoder="autodecoder")
+    odd = model.network.config.changed(encoder="autodecoder")
     fake = replace(model)
     fake.network.config = odd
     with pytest.raises(ValueError, match="an autodecoder searches for its code"):

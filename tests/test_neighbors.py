@@ -63,7 +63,7 @@ def test_ball_query_finds_the_same_on_every_device() -> None:
 
 COMPILED = """
 import torch
-from mereo.neighbors import ball_query, nearest
+from mereo.models.ops.neighbors import ball_query, nearest
 
 points, queries = torch.rand(2, 60, 3), torch.rand(2, 40, 3)
 def both(points, queries):

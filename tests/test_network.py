@@ -1,16 +1,14 @@
 """The network's structure: what it must ignore, what it must share, and its paper sizes."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 import torch.nn.functional as F
 
-from mereo.models.config import NetworkConfig
+from mereo.models.config import Loss, NetworkConfig, Supervision
 from mereo.models.decoder import FrequencyEncoding, Prediction
 from mereo.models.encoders.pointnet2 import PointNet2
 from mereo.models.network import Network
-from mereo.training.config import PRESETS, Loss
+from mereo.training.config import PRESETS
 from mereo.training.losses import occupancy_loss
 
 TINY = PRESETS["tiny"].network
@@ -38,11 +36,10 @@ def settled(config: NetworkConfig, segments: int = 3) -> Network:
 def test_every_preset_answers_with_its_shapes(name: str) -> None:
     network = settled(PRESETS[name].network, segments=5)
     with torch.inference_mode():
-        logits, distance, direction, rest, coarse = network(
-            cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3)
-        )
-    assert logits.shape == (2, 11, 6) and distance.shape == (2, 11) and direction.shape == (2, 11, 3)
-    for found in (rest, coarse):
+        prediction, coarse = network(cloud_of(network.config), viewpoint_of(), torch.randn(2, 11, 3))
+    assert prediction.logits.shape == (2, 11, 6) and prediction.distance.shape == (2, 11)
+    assert prediction.direction.shape == (2, 11, 3)
+    for found in (prediction.rest, coarse):
         assert found is None if name == "paper" else found is not None and found.shape == (2, 11, 3)
 
 
@@ -54,13 +51,13 @@ def test_paper_preset_has_the_papers_sizes() -> None:
     assert [layer.in_features for layer in network.decoder.hidden] == [512] * 6
     assert len(network.decoder.norms) == 7
     assert network.decoder.latent2.in_features == 1024 and network.decoder.query2.in_features == 60
-    assert not network.decoder.local and config.sight_neighbors == 0 and network.aligner is None
+    assert not network.decoder.local and config.additions.sight_neighbors == 0 and network.aligner is None
 
 
 def test_what_all_clouds_have_in_common_is_not_rounded_to_bfloat16() -> None:
     """Normalization takes a channel's mean away, however large: in bfloat16 it would first erase what differs."""
     torch.manual_seed(0)
-    network = Network(replace(TINY, align_points=0, rest_template=False), 3).train()
+    network = Network(TINY.changed(align_points=0, rest_template=False), 3).train()
     encoder, decoder = network.encoder, network.decoder
     with torch.no_grad():  # the first pooled channel is 4 everywhere, and whoever reads it adds 400
         for shared in (encoder.level1.mlp, encoder.level2.mlp, encoder.pool):
@@ -70,15 +67,15 @@ def test_what_all_clouds_have_in_common_is_not_rounded_to_bfloat16() -> None:
         for reader in (encoder.level2.mlp.layers[0], encoder.pool.layers[0], decoder.latent1, *attentions):
             reader.weight[:, 0] = 100.0
     inputs = cloud_of(network.config, batch=8), viewpoint_of(8), torch.randn(8, 40, 3)
-    exact = network(*inputs)[0]
+    exact = network(*inputs).prediction.logits
     with torch.autocast("cpu", torch.bfloat16):
-        rounded = network(*inputs)[0]
+        rounded = network(*inputs).prediction.logits
     assert (rounded - exact).std() < 0.1 * exact.std()
 
 
 def test_encoder_ignores_the_order_within_its_last_half() -> None:
     """Centres are the first half (a farthest-point sample); the rest is a set, whatever its order."""
-    config = replace(TINY, neighbors=TINY.points)
+    config = TINY.changed(neighbors=TINY.points)
     encoder = settled(config).encoder
     cloud = cloud_of(config)
     half = config.points // 2
@@ -88,8 +85,8 @@ def test_encoder_ignores_the_order_within_its_last_half() -> None:
 
 
 def test_encoder_ignores_repeated_points() -> None:
-    config = replace(TINY, neighbors=TINY.points)
-    encoder = PointNet2(config).eval()
+    config = TINY.changed(neighbors=TINY.points)
+    encoder = PointNet2(config.pointnet2).eval()
     cloud = cloud_of(config)
     doubled = torch.cat([cloud, cloud[:, : config.points // 4]], dim=1)
     doubled = torch.cat([doubled[:, : config.points // 2], doubled[:, config.points // 2 :]], dim=1)
@@ -102,7 +99,7 @@ def test_encoder_ignores_repeated_points() -> None:
 
 def test_split_latent_layer_equals_concatenation() -> None:
     """W [z; x] = W_z z + W_x x: the paper's concatenated query vector, without building it."""
-    network = settled(replace(TINY, local_neighbors=0, sight_neighbors=0, align_points=0))
+    network = settled(TINY.changed(local_neighbors=0, sight_neighbors=0, align_points=0))
     decoder, cloud = network.decoder, cloud_of(TINY)
     points = torch.randn(2, 9, 3)
     with torch.inference_mode():
@@ -118,7 +115,7 @@ def test_split_latent_layer_equals_concatenation() -> None:
                 hidden = hidden + vector @ skip.T
             hidden = torch.relu(norm(hidden.flatten(0, 1))).view_as(hidden)
         expected = decoder.head(hidden)[..., :4]
-        logits, *_ = network(cloud, viewpoint_of(), points)
+        logits = network(cloud, viewpoint_of(), points).prediction.logits
     assert torch.allclose(logits, expected, atol=1e-4)
 
 
@@ -150,7 +147,7 @@ def test_negative_exponents_tell_far_points_apart() -> None:
 
 def test_without_encoding_the_query_is_its_three_coordinates() -> None:
     """The paper's ablation: a network of one layer is then piecewise linear in the position."""
-    plain = NetworkConfig(points=64, width=16, depth=1, skip_after=1, mlp_global=(8,), encode_positions=False)
+    plain = NetworkConfig().changed(points=64, width=16, depth=1, skip_after=1, mlp_global=(8,), encode_positions=False)
     network = settled(plain)
     assert network.decoder.query1.in_features == 3
     step = torch.tensor([1e-3, 2e-3, -1e-3])
@@ -163,8 +160,8 @@ def test_without_encoding_the_query_is_its_three_coordinates() -> None:
 
 
 def test_dropout_clears_its_share_and_only_in_training() -> None:
-    plain = NetworkConfig(points=64, width=512, depth=1, skip_after=1, mlp_global=(8,))
-    networks = [settled(replace(plain, dropout=share)) for share in (0.0, 0.2)]
+    plain = NetworkConfig().changed(points=64, width=512, depth=1, skip_after=1, mlp_global=(8,))
+    networks = [settled(plain.changed(dropout=share)) for share in (0.0, 0.2)]
     networks[1].load_state_dict(networks[0].state_dict())
     queries, seen = torch.randn(2, 40, 3), []
     for network in networks:
@@ -187,10 +184,10 @@ def example_prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor, torch.
 
 def test_loss_variants_add_up() -> None:
     prediction, labels, distances, directions = example_prediction()
-    full, terms = occupancy_loss(prediction, labels, distances, directions, "ce+l1+cd", 100.0)
+    full, terms = occupancy_loss(prediction, labels, distances, directions, Supervision.of("ce+l1+cd"), 100.0)
     assert torch.isclose(full, terms["ce"] + 100.0 * terms["l1"] + terms["cd"])
     for loss, names in (("ce", {"ce"}), ("l1", {"l1"}), ("ce+l1", {"ce", "l1"})):
-        _, part = occupancy_loss(prediction, labels, distances, directions, loss, 100.0)  # type: ignore[arg-type]
+        _, part = occupancy_loss(prediction, labels, distances, directions, Supervision.of(loss), 100.0)
         assert set(part) == names
         assert all(torch.isclose(part[name], terms[name]) for name in names)
 
@@ -198,14 +195,14 @@ def test_loss_variants_add_up() -> None:
 def test_cosine_term_is_minus_one_for_the_right_direction_of_any_length() -> None:
     prediction, labels, distances, directions = example_prediction()
     right = Prediction(prediction.logits, prediction.distance, 7.0 * directions)
-    _, terms = occupancy_loss(right, labels, distances, directions, "ce+l1+cd", 100.0)
+    _, terms = occupancy_loss(right, labels, distances, directions, Supervision.of("ce+l1+cd"), 100.0)
     assert torch.isclose(terms["cd"], torch.tensor(-1.0))
 
 
 def test_each_term_is_the_papers() -> None:
     """Against the formulas of equation 1, written out."""
     prediction, labels, distances, directions = example_prediction()
-    _, terms = occupancy_loss(prediction, labels, distances, directions, "ce+l1+cd", 100.0)
+    _, terms = occupancy_loss(prediction, labels, distances, directions, Supervision.of("ce+l1+cd"), 100.0)
     probability = prediction.logits.exp() / prediction.logits.exp().sum(dim=-1, keepdim=True)
     assert torch.isclose(terms["ce"], -probability.gather(-1, labels[..., None]).log().mean())
     assert torch.isclose(terms["l1"], (prediction.distance - distances).abs().mean())
@@ -215,8 +212,8 @@ def test_each_term_is_the_papers() -> None:
 
 @pytest.mark.parametrize("loss, rows", [("ce", [0, 1, 2, 3]), ("l1", [4]), ("ce+l1", [0, 1, 2, 3, 4])])
 def test_a_loss_trains_its_own_heads_only(loss: Loss, rows: list[int]) -> None:
-    network = settled(replace(TINY, align_points=0), segments=3).train()
-    logits, distance, direction, _, _ = network(cloud_of(TINY), viewpoint_of(), torch.randn(2, 5, 3))
-    _, labels, distances, directions = example_prediction()
-    occupancy_loss(Prediction(logits, distance, direction), labels, distances, directions, loss, 100.0)[0].backward()
+    network = settled(TINY.changed(align_points=0), segments=3).train()
+    prediction, _ = network(cloud_of(TINY), viewpoint_of(), torch.randn(2, 5, 3))
+    _, *truth = example_prediction()
+    occupancy_loss(prediction, *truth, Supervision.of(loss), 100.0)[0].backward()
     assert network.decoder.head.weight.grad.abs().amax(dim=1).nonzero().flatten().tolist() == rows

@@ -26,7 +26,7 @@ from mereo.reconstruction.pipeline import reconstruct
 from mereo.training import trainer
 from mereo.training.config import PRESETS, AugmentConfig
 
-TINY = NetworkConfig(
+TINY = NetworkConfig().changed(
     encoder="point-transformer",
     points=128,
     transformer_widths=(8, 12, 16, 20, 24),
@@ -42,7 +42,7 @@ def cloud_of(points: int = TINY.points, batch: int = 2, seed: int = 0) -> Tensor
 def settled(config: NetworkConfig = TINY) -> PointTransformer:
     """In evaluation mode, with batch statistics that are not the trivial initial ones."""
     torch.manual_seed(1)
-    encoder = PointTransformer(config).train()
+    encoder = PointTransformer(config.transformer, config.latent).train()
     encoder(cloud_of(config.points, batch=4))
     return encoder.eval()
 
@@ -146,23 +146,23 @@ def test_its_levels_are_prefixes_of_the_cloud() -> None:
 def test_gradient_reaches_every_parameter() -> None:
     """With two points or more in the last block: one alone has nothing to weigh."""
     torch.manual_seed(0)
-    network = Network(replace(TINY, points=512, width=24, local_neighbors=3, local_width=8), segments=3).train()
-    outputs = network(cloud_of(512, batch=4), torch.tensor([[0.0, 0.0, -8.0]] * 4), torch.randn(4, 30, 3))
-    sum(output.square().sum() for output in outputs if output is not None).backward()
+    network = Network(TINY.changed(points=512, width=24, local_neighbors=3, local_width=8), segments=3).train()
+    prediction, coarse = network(cloud_of(512, batch=4), torch.tensor([[0.0, 0.0, -8.0]] * 4), torch.randn(4, 30, 3))
+    sum(output.square().sum() for output in (*prediction, coarse) if output is not None).backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 1e-7, name
 
 
 def test_paper_sizes() -> None:
     """Five blocks and 1024 numbers; with local features, as many centres and channels as the levels of `base`."""
-    network = Network(replace(PRESETS["paper"].network, encoder="point-transformer"), 5)
+    network = Network(PRESETS["paper"].network.changed(encoder="point-transformer"), 5)
     assert isinstance(network.encoder, PointTransformer)
     assert [block.leave.in_features for block in network.encoder.blocks] == [32, 64, 128, 256, 512]
     assert network.decoder.latent1.in_features == 1024
     base = PRESETS["base"].network
     cloud = cloud_of(base.points)
     networks = [
-        Network(replace(base, encoder=name, align_points=0), 2).eval() for name in ("pointnet2", "point-transformer")
+        Network(base.changed(encoder=name, align_points=0), 2).eval() for name in ("pointnet2", "point-transformer")
     ]
     with torch.inference_mode():
         ours, theirs = ([level.features.shape for level in each.encoder(cloud).levels] for each in networks)
@@ -171,21 +171,20 @@ def test_paper_sizes() -> None:
 
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(ValueError, match="transformer_neighbors is 0; it must be at least 1"):
-        Network(replace(TINY, transformer_neighbors=0), 2)
+        Network(TINY.changed(transformer_neighbors=0), 2)
     with pytest.raises(ValueError, match="search_steps is -1; it must be at least 1"):
-        Network(replace(TINY, search_steps=-1), 2)
+        Network(TINY.changed(search_steps=-1), 2)
     with pytest.raises(ValueError, match="dropout is 1.0; it is a share from 0 to below 1"):
-        Network(replace(TINY, dropout=1.0), 2)
+        Network(TINY.changed(dropout=1.0), 2)
     with pytest.raises(ValueError, match=r"transformer_widths are \(8, 16\); a Point Transformer needs at least three"):
-        Network(replace(TINY, transformer_widths=(8, 16)), 2)
+        Network(TINY.changed(transformer_widths=(8, 16)), 2)
 
 
 # --- training ---------------------------------------------------------------------------------------------------------
 
 CONFIG = replace(
     SMALL,
-    network=replace(
-        SMALL.network,
+    network=SMALL.network.changed(
         encoder="point-transformer",
         transformer_widths=(8, 12, 16),
         transformer_neighbors=6,

@@ -89,6 +89,19 @@ def test_shipped_weights_have_a_true_card(name: str) -> None:
     assert {tensor.dtype for tensor in load_file(path).values() if tensor.is_floating_point()} == {torch.float16}
 
 
+def test_a_shipped_name_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of results named after the object hides nothing; a file of that name is meant."""
+    shipped = find_weights("bunny")
+    monkeypatch.chdir(tmp_path)
+    Path("bunny").mkdir()
+    assert find_weights("bunny") == shipped
+    Path("rope").write_bytes(b"")
+    assert find_weights("rope") == Path("rope")
+    with pytest.raises(FileNotFoundError, match="there are no weights 'runs'"):
+        Path("runs").mkdir()
+        find_weights("runs")
+
+
 def test_what_cannot_be_released_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = evaluation(tmp_path / "other", per_segment={"base": 1.0})
     for arguments, said in (

@@ -11,7 +11,8 @@ from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
 from mereo.cli import commands
-from mereo.evaluation import scoring
+from mereo.geometry.camera import PointCloud
+from mereo.models.model import EncodedCloud, Model
 from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
 from mereo.synthesis.depth_sensor import check_sensor
 from mereo.synthesis.shards import generate
@@ -104,20 +105,20 @@ def test_a_dataset_from_before_there_were_sensors_goes_on_without_one(tmp_path: 
 
 
 def test_evaluation_looks_through_the_sensor_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clouds = []
+    clouds: list[PointCloud] = []
 
-    def watch(*arguments: object) -> object:
-        clouds.append(arguments[1])
-        return predict(*arguments)
+    def watch(model: Model, cloud: PointCloud) -> EncodedCloud:
+        clouds.append(cloud)
+        return encode(model, cloud)
 
-    predict = scoring.predict_grid
-    monkeypatch.setattr(scoring, "predict_grid", watch)
+    encode = Model.encode
+    monkeypatch.setattr(Model, "encode", watch)
     for number, settings in enumerate((None, GenerateConfig(noise_std=0.5, sensor=SENSORS["structured-light"]))):
         evaluate_weights("rope", tmp_path / str(number), examples=1, cells=12, settings=settings)
     facts = [json.loads((tmp_path / str(number) / "metrics.json").read_text()) for number in range(2)]
     assert [fact["noise_std"] for fact in facts] == [0.1, 0.5]
     assert [SensorConfig(**fact["sensor"]) for fact in facts] == [SENSORS["paper"], SENSORS["structured-light"]]
-    assert len(clouds) == 2 and not np.array_equal(clouds[0].points[:20], clouds[1].points[:20])  # type: ignore[attr-defined]
+    assert len(clouds) == 2 and not np.array_equal(clouds[0].points[:20], clouds[1].points[:20])
 
 
 def test_real_scans_take_no_simulated_errors() -> None:

@@ -11,10 +11,10 @@ from toy_scene import toy_scene
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.raycasting import first_hits
+from mereo.geometry.raycasting import Hits, first_hits
 from mereo.geometry.solids import Solids
 from mereo.scenes.seeds import example_rng
-from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
+from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Backdrop, Capsule, Surroundings
 from mereo.synthesis.config import SENSORS, GenerateConfig, SamplingConfig, SensorConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import sample_view, synthesize
@@ -84,6 +84,17 @@ def test_rays_that_are_left_out_would_have_missed(part: Segment) -> None:
 
 
 # --- in front and behind ----------------------------------------------------------------------------------------------
+
+
+def test_what_the_object_hit_stays_what_it_was() -> None:
+    """Joining makes new hits, so that those of the object alone can still be asked for."""
+    alone = PAIR.first_hit(RAYS)
+    kept = Hits(*(part.copy() for part in alone))
+    around = Surroundings((Capsule(np.array([0.0, 0, 60]), np.array([30.0, 0, 60]), 5.0),), Backdrop(RAYS[0], 200.0))
+    first, source = around.join(alone, RAYS)
+    assert {OBJECT, OCCLUDER, BACKGROUND} == set(source)
+    assert all(np.array_equal(now, then) for now, then in zip(alone, kept, strict=True))
+    assert np.array_equal(first.distance == alone.distance, source == OBJECT)
 
 
 @pytest.mark.parametrize("term", ["tool", "hand"])

@@ -1,6 +1,5 @@
 """The template: the grid holds the model at rest, the lookup reads it exactly, and begins as nothing."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,15 +78,15 @@ def test_rest_frame_is_that_of_the_longest_side() -> None:
 
 def test_a_new_lookup_changes_no_answer() -> None:
     torch.manual_seed(0)
-    plain = Network(replace(TINY, rest_template=False), segments=3).eval()
+    plain = Network(TINY.changed(rest_template=False), segments=3).eval()
     added = Network(TINY, segments=3).eval()
     added.load_state_dict(added.state_dict() | plain.state_dict())
     cloud, viewpoint, queries = random_rest(2, TINY.points), torch.tensor([[0.0, 0.0, -8.0]] * 2), random_rest(2, 9)
     with torch.inference_mode():
-        before, after = plain(cloud, viewpoint, queries), added(cloud, viewpoint, queries)
+        before, after = (network(cloud, viewpoint, queries).prediction for network in (plain, added))
     for answer, same in zip(after[:3], before[:3], strict=True):
         torch.testing.assert_close(answer, same)  # products of other widths may be added in another order
-    assert before[3] is None and after[3].shape == queries.shape
+    assert before.rest is None and after.rest.shape == queries.shape
 
 
 def test_what_is_read_corrects_the_coordinates() -> None:

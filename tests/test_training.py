@@ -21,7 +21,7 @@ from mereo.training.run_directory import claim_run, start_network
 
 SMALL = replace(
     PRESETS["tiny"],
-    network=replace(PRESETS["tiny"].network, points=64, width=48, neighbors=8, mlp_global=(32, 48)),
+    network=PRESETS["tiny"].network.changed(points=64, width=48, neighbors=8, mlp_global=(32, 48)),
     batch=8,
     queries=48,
     epochs=2,
@@ -59,13 +59,13 @@ def test_a_run_of_an_older_mereo_is_continued(dataset: Path, tmp_path: Path) -> 
     path.write_text(json.dumps(settings))
     assert trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes() == first
     with pytest.raises(ValueError, match="another train setting network"):
-        other = replace(SMALL.network, encoder="point-transformer")
+        other = SMALL.network.changed(encoder="point-transformer")
         trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2, network=other))
 
 
 def test_a_directory_with_other_things_is_not_a_run(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(FileExistsError, match="exists and is not a training run"):
+    with pytest.raises(FileExistsError, match=r"is not empty and holds no config\.json"):
         trainer.train(dataset, tmp_path, SMALL)
     assert os.listdir(tmp_path) == ["thesis.tex"]
 
@@ -147,14 +147,14 @@ def test_training_starts_from_given_weights(dataset: Path, tmp_path: Path) -> No
     data, config = trainer.Dataset.load(dataset), replace(SMALL, init=str(first))
     network = start_network(config, data)
     assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
-    other_counts = replace(config.network, points=48, neighbors=6)  # the same weights fit
+    other_counts = config.network.changed(points=48, neighbors=6)  # the same weights fit
     network = start_network(replace(config, network=other_counts), data)
     assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
     assert network.config == other_counts
     with pytest.raises(ValueError, match="another network setting sight_neighbors"):
-        start_network(replace(config, network=replace(config.network, sight_neighbors=0)), data)
+        start_network(replace(config, network=config.network.changed(sight_neighbors=0)), data)
     with pytest.raises(ValueError, match="another network setting width"):
-        start_network(replace(config, network=replace(config.network, width=32)), data)
+        start_network(replace(config, network=config.network.changed(width=32)), data)
     with pytest.raises(FileNotFoundError, match="no weights 'lost'"):
         trainer.train(dataset, tmp_path / "second", replace(config, init="lost"))
     assert not (tmp_path / "second").exists()
@@ -180,7 +180,7 @@ def test_training_starts_from_another_objects_weights(dataset: Path, tmp_path: P
 
 def test_a_lookup_may_be_added_to_given_weights(dataset: Path, tmp_path: Path) -> None:
     """Its grid is the dataset's; all else is that of the weights."""
-    plain = replace(SMALL, network=replace(SMALL.network, rest_template=False))
+    plain = replace(SMALL, network=SMALL.network.changed(rest_template=False))
     first = trainer.train(dataset, tmp_path / "first", replace(plain, epochs=0.2))
     data = trainer.Dataset.load(dataset)
     network = start_network(replace(SMALL, init=str(first)), data)
@@ -199,7 +199,7 @@ def test_a_dataset_without_template_is_refused(dataset: Path, tmp_path: Path) ->
     ):
         trainer.train(old, tmp_path / "run", SMALL)
     assert not (tmp_path / "run").exists()
-    plain = replace(SMALL, epochs=0.2, network=replace(SMALL.network, rest_template=False))
+    plain = replace(SMALL, epochs=0.2, network=SMALL.network.changed(rest_template=False))
     trainer.train(old, tmp_path / "run", plain)
 
 
@@ -220,10 +220,10 @@ def test_only_the_first_process_claims_the_directory(
     monkeypatch.setattr(torch.distributed, "barrier", lambda: waited.append(True))
     run = tmp_path / "run"
     run.mkdir()
-    (run / ".config.json.partial").touch()  # what the first one is writing
+    (run / "metrics.csv").touch()  # of a directory without settings, as it is while the first one writes them
     claim_run(run, SMALL, data, trainer.Process(1, 2))
     assert waited and not (run / "config.json").exists()
-    with pytest.raises(FileExistsError, match="is not a training run"):
+    with pytest.raises(FileExistsError, match=r"holds no config\.json"):
         claim_run(run, SMALL, data, trainer.Process(0, 2))
 
 

@@ -209,20 +209,20 @@ def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progr
     total = np.zeros((len(names) + 1,) * 2, dtype=np.int64)
     examples: dict[str, Scores] = {}
     views: list[EvaluatedView] = []
-    for one, predicted in _predictions(model, case, count, progress):
+    for one, code, predicted in _predictions(model, case, count, progress):
         confusion = grid_confusion(one.truth, predicted, len(names))
         total += confusion
         examples[one.name] = intersection_over_union(confusion, model.segmented)
         if len(views) < KEPT_VIEWS:
-            views.append(_evaluated_view(one, model, colors))
+            views.append(_evaluated_view(one, model, code, colors))
     return Evaluation(names, total, examples, tuple(views), model.segmented)
 
 
-def _evaluated_view(one: TestCase, model: Model, colors: Sequence[Color]) -> EvaluatedView:
+def _evaluated_view(one: TestCase, model: Model, code: EncodedCloud, colors: Sequence[Color]) -> EvaluatedView:
     """Truth and prediction on the truth's grid and ``PICTURE_MARGIN`` cells around it."""
     wide = _widened(one.truth)
     reference = np.minimum(wide.grid.labels, np.uint8(len(colors)))
-    predicted = predict_grid(model, one.cloud, wide)
+    predicted = predict_grid(model, code, wide)
     return EvaluatedView(one.name, one.cloud, reference, predicted, wide.grid.origin, wide.grid.spacing, colors)
 
 
@@ -235,10 +235,11 @@ def _widened(truth: TruthGrid) -> TruthGrid:
 
 def _predictions(
     model: Model, case: Callable[[int], TestCase], count: int, progress: bool
-) -> Iterator[tuple[TestCase, UInt8[np.ndarray, "x y z"]]]:
+) -> Iterator[tuple[TestCase, EncodedCloud, UInt8[np.ndarray, "x y z"]]]:
     for index in track(range(count), "evaluating", console=Console(stderr=True), disable=not progress):
         one = case(index)
-        yield one, predict_grid(model, one.cloud, one.truth)
+        code = model.encode(one.cloud)
+        yield one, code, predict_grid(model, code, one.truth)
 
 
 # --- results ---------------------------------------------------------------------------------------------------------

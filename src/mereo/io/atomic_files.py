@@ -117,6 +117,42 @@ def _remove(partial: Path, made: list[Path]) -> None:
             directory.rmdir()
 
 
+def claim_directory(directory: Path, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
+    """Settings that a directory of earlier work holds, or None where it was made with ``settings`` just now.
+
+    Hidden files do not count: a process that was killed while writing leaves them.
+
+    Args:
+        directory: where work is done that may be stopped and continued; made when it is missing.
+        name: of the JSON file in it that says what the work is.
+        settings: what that file says of a new directory.
+        kind: of the directory, for messages: "a dataset".
+
+    Raises:
+        FileExistsError: it is a file, or holds something but no such file.
+        ValueError: its file holds no settings.
+    """
+    path = directory / name
+    if directory.exists() and not directory.is_dir():
+        raise FileExistsError(f"{directory} is a file; {kind} is a directory: choose another --output")
+    if path.is_file():
+        return _read_settings(path)
+    if directory.is_dir() and any(not file.name.startswith(".") for file in directory.iterdir()):
+        raise FileExistsError(f"{directory} is not empty and holds no {name}; choose another --output")
+    write_json(path, settings)
+    return None
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} holds no settings; what it belongs to cannot be continued: choose another --output")
+    return found
+
+
 def write_json(path: str | Path, value: Any) -> None:
     """Write ``to_json`` of a value, indented, whole or not at all."""
     with atomic_file(path) as partial:

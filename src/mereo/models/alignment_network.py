@@ -23,35 +23,33 @@ from mereo.models.rigid_alignment import Alignment, fit_rigid
 
 
 class Aligned(NamedTuple):
-    """The motion, and the rest-pose coordinates predicted at the queries, for the loss."""
+    """Rigid motion of each cloud, and the rest coordinates predicted at the queries, for the loss."""
 
     alignment: Alignment
     rest: Float[Tensor, "b q 3"]
 
 
 class AlignmentNet(nn.Module):
-    """Cloud in farthest-point order -> ``Alignment``, by way of rest-pose coordinates."""
+    """Network from a cloud in farthest-point order to its ``Alignment``, by way of rest coordinates."""
 
     FITTED = 128
     """Observed points whose coordinates are predicted and fitted."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.points = config.align_points
+        self.points = config.additions.align_points
         small = replace(
             config,
             encoder="pointnet2",  # whatever the network's own is: a small cloud needs no other
-            neighbors=min(config.neighbors, 16),
-            ratio1=0.5,
-            depth=3,
-            skip_after=2,
-            sight_neighbors=0,
-            dropout=0.0,
+            pointnet2=replace(config.pointnet2, neighbors=min(config.pointnet2.neighbors, 16), ratio1=0.5),
+            decoder=replace(config.decoder, depth=3, skip_after=2, dropout=0.0),
+            additions=replace(config.additions, sight_neighbors=0),
         )
-        self.encoder = PointNet2(small)
+        self.encoder = PointNet2(small.pointnet2)
         self.decoder = ConditionedMLP(small, outputs=3)
 
     def forward(self, cloud: Float[Tensor, "b n 3"], queries: Float[Tensor, "b q 3"] | None = None) -> Aligned:
+        """Alignment of each cloud, and rest coordinates at ``queries`` (none where there are none)."""
         seen = cloud[:, : self.FITTED]
         unused = torch.zeros_like(cloud[:, 0])  # the viewpoint: rest coordinates need no lines of sight
         code = self.decoder.prepare(self.encoder(cloud[:, : self.points]), cloud, unused)

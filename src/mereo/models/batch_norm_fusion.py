@@ -22,7 +22,7 @@ AnyModule = TypeVar("AnyModule", bound=nn.Module)
 @torch.inference_mode(False)  # a search for codes needs gradients, which tensors of inference mode cannot give
 @torch.no_grad()
 def fold_batch_norm(network: AnyModule) -> AnyModule:
-    """A copy for inference whose decoders and shared layers have no normalization left.
+    """Copy of a network for inference whose decoders and shared layers have no normalization left.
 
     Its parameters have other names and meanings: it can be neither trained nor saved. Raises ``ValueError`` for a
     network in training mode, whose normalization depends on the batch.
@@ -53,7 +53,7 @@ def _fold_conditioned(mlp: ConditionedMLP) -> None:
         assert norm.running_mean is not None and norm.running_var is not None
         scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
         for summand in mlp.summands(number):
-            summand.weight *= scale[:, None]
+            summand.weight = nn.Parameter(summand.weight * scale[:, None], requires_grad=False)
         takes_shift = mlp.latent1 if number == 0 else mlp.hidden[number - 1]
         takes_shift.bias = nn.Parameter(norm.bias - norm.running_mean * scale, requires_grad=False)
     mlp.norms = nn.ModuleList(nn.Identity() for _ in mlp.norms)

@@ -1,27 +1,32 @@
-"""Settings of networks and of how exactly they answer; light, so that the command line may import them.
+"""Settings of networks, of what a loss teaches them, and of where and how exactly they answer.
+
+Light, so that the command line may import them.
 
 Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise.
 """
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Annotated, Any, Literal
+
+from tyro.conf import arg
 
 Device = Literal["auto", "cpu", "cuda"]
 
-
 Encoder = Literal["pointnet2", "point-transformer", "autodecoder"]
-
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
+Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
+"""Terms by which networks are trained, as options and weights name them."""
 
 MOST_ORDERED = 16384
-"""Points of one cloud that a program of the GPU can keep: 16 in each of 1024 threads."""
+"""Number of points of one cloud that a program of the GPU can keep: 16 in each of 1024 threads."""
 
 
 @dataclass(frozen=True)
 class InferenceConfig:
-    """Where and how exactly the network computes.
+    """Settings of where and how exactly a network computes.
 
     Attributes:
         device: where the network runs; auto takes a CUDA device where there is one.
@@ -34,37 +39,45 @@ class InferenceConfig:
 
 
 EXACT = InferenceConfig(precision="float32")
-"""For measuring a network: the same figures on every machine."""
+"""Settings for measuring a network: the same figures on every machine."""
 
 
 @dataclass(frozen=True)
-class NetworkConfig:
-    """Encoder and decoder (paper, section 3.1 and appendix B; PointNet++ sizes from its reference implementation).
+class Supervision:
+    """Kinds of truth that a loss has taught a network, and so what it can be asked.
 
     Attributes:
-        encoder: what makes the latent vector of a cloud (docs/design/0009-encoders.md).
-        points: the network sees at most this many points, the first in farthest-point order.
-        neighbors: largest number of neighbours in a ball, the first in farthest-point order.
-        ratio1, radius1, mlp1: first set abstraction: share of points kept as centres, ball radius, layer widths.
-        ratio2, radius2, mlp2: second set abstraction, the ratio relative to the first level's centres.
-        mlp_global: layer widths before the global max pool; the last one is the latent size of every encoder.
-        transformer_widths: Point Transformer: one block per width; from one to the next a quarter of the points stay.
-        transformer_neighbors: Point Transformer: nearest points that a point attends to; half as many in block one.
-        search_steps, search_rate: autodecoder: steps and learning rate of the search for a cloud's code.
-        code_penalty: autodecoder: weight of a code's squared length beside the L1 distance.
-        width, depth, skip_after: the decoder's layer width, layer count, and after which layer the query returns.
-        dropout: share of each decoder layer's outputs set to zero in training.
-        encode_positions: frequency encoding of the query position; off means the three coordinates themselves.
-        lowest_exponent, highest_exponent: of the frequencies 2^e * pi, both included.
-        local_neighbors: set-abstraction centres per level that a query attends to; 0 switches local features off.
-        local_width: channels of that attention.
-        sight_neighbors: observed points nearest to the query's line of sight that it compares depth with; 0 is off.
-        align_points: points from which the object's rest-pose frame is estimated first; 0 works in the camera frame.
-        rest_template: look queries up in the rest pose's model, at predicted rest coordinates.
+        labels: by cross-entropy ("ce"); a network trained without it only knows inside from outside.
+        distances: signed ones, by L1 ("l1").
+        directions: to the nearest surface, by their cosine ("cd").
     """
 
-    encoder: Encoder = "pointnet2"
-    points: int = 1024
+    labels: bool
+    distances: bool
+    directions: bool
+
+    @classmethod
+    def of(cls, loss: str) -> "Supervision":
+        """Supervision by the loss of that name, for example "ce+l1"."""
+        terms = loss.split("+")
+        return cls("ce" in terms, "l1" in terms, "cd" in terms)
+
+
+@dataclass(frozen=True)
+class PointNet2Config:
+    """Settings of PointNet++; sizes are those of its reference implementation.
+
+    Attributes:
+        neighbors: largest number of neighbours in a ball of PointNet++, the first in farthest-point order.
+        ratio1: share of points kept as centres by PointNet++'s first set abstraction.
+        radius1: radius of its balls.
+        mlp1: its layer widths.
+        ratio2: share of those centres kept by its second set abstraction.
+        radius2: radius of that one's balls.
+        mlp2: that one's layer widths.
+        mlp_global: layer widths before the global max pool; the last one is the latent size of every encoder.
+    """
+
     neighbors: int = 64
     ratio1: float = 0.5
     radius1: float = 0.2
@@ -73,11 +86,50 @@ class NetworkConfig:
     radius2: float = 0.4
     mlp2: tuple[int, ...] = (128, 128, 256)
     mlp_global: tuple[int, ...] = (256, 512, 1024)
+
+
+@dataclass(frozen=True)
+class PointTransformerConfig:
+    """Settings of the Point Transformer.
+
+    Attributes:
+        transformer_widths: one block of the Point Transformer per width; each has a quarter of the last one's points.
+        transformer_neighbors: nearest points that a point of it attends to; half as many in block one.
+    """
+
     transformer_widths: tuple[int, ...] = (32, 64, 128, 256, 512)
     transformer_neighbors: int = 16
+
+
+@dataclass(frozen=True)
+class AutodecoderConfig:
+    """Settings of the autodecoder.
+
+    Attributes:
+        search_steps: steps of the autodecoder's search for a cloud's code.
+        search_rate: learning rate of that search.
+        code_penalty: weight of a code's squared length in it, beside the L1 distance.
+    """
+
     search_steps: int = 75
     search_rate: float = 1e-3
     code_penalty: float = 1e-4
+
+
+@dataclass(frozen=True)
+class DecoderConfig:
+    """Settings of the decoder, the occupancy predictor.
+
+    Attributes:
+        width: channels of each of the decoder's layers.
+        depth: number of these layers.
+        skip_after: the layer after which the query and the latent vector return.
+        dropout: share of each of these layers' outputs set to zero in training.
+        encode_positions: frequency encoding of the query position; off means the three coordinates themselves.
+        lowest_exponent: least e of the frequencies 2^e * pi.
+        highest_exponent: greatest e of these frequencies.
+    """
+
     width: int = 512
     depth: int = 7
     skip_after: int = 4
@@ -85,19 +137,103 @@ class NetworkConfig:
     encode_positions: bool = True
     lowest_exponent: int = -4
     highest_exponent: int = 5
+
+
+@dataclass(frozen=True)
+class AdditionsConfig:
+    """Settings of what is added to the paper's network, each off by default.
+
+    Attributes:
+        local_neighbors: set-abstraction centres per level that a query attends to; 0 switches local features off.
+        local_width: channels of that attention.
+        sight_neighbors: observed points nearest to the query's line of sight that it compares depth with; 0 is off.
+        align_points: points from which the object's rest-pose frame is estimated first; 0 works in the camera frame.
+        rest_template: look queries up in the rest pose's model, at predicted rest coordinates.
+    """
+
     local_neighbors: int = 0
     local_width: int = 128
     sight_neighbors: int = 0
     align_points: int = 0
     rest_template: bool = False
 
+
+PARTS: dict[str, type[Any]] = {
+    "pointnet2": PointNet2Config,
+    "transformer": PointTransformerConfig,
+    "autodecoder": AutodecoderConfig,
+    "decoder": DecoderConfig,
+    "additions": AdditionsConfig,
+}
+"""The parts of a network's settings by their place in it."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Settings of a network, a part for each encoder, the decoder and what is added to the paper's (section 3.1).
+
+    Weights, runs and options name the settings of all parts side by side (``to_dict``), so their names are unique. The
+    parts of encoders other than the chosen one mean nothing, but PointNet++'s: alignments have such an encoder too.
+
+    Attributes:
+        encoder: what makes the latent vector of a cloud (docs/design/0009-encoders.md).
+        points: the network sees at most this many points, the first in farthest-point order.
+        pointnet2: PointNet++.
+        transformer: Point Transformer.
+        autodecoder: autodecoder.
+        decoder: decoder.
+        additions: what the paper's network does not have.
+    """
+
+    encoder: Encoder = "pointnet2"
+    points: int = 1024
+    # empty names keep the options --network.width, --network.mlp1 and so on, without those of the parts
+    pointnet2: Annotated[PointNet2Config, arg(name="")] = field(default_factory=PointNet2Config)
+    transformer: Annotated[PointTransformerConfig, arg(name="")] = field(default_factory=PointTransformerConfig)
+    autodecoder: Annotated[AutodecoderConfig, arg(name="")] = field(default_factory=AutodecoderConfig)
+    decoder: Annotated[DecoderConfig, arg(name="")] = field(default_factory=DecoderConfig)
+    additions: Annotated[AdditionsConfig, arg(name="")] = field(default_factory=AdditionsConfig)
+
     @property
     def latent(self) -> int:
-        return self.mlp_global[-1]
+        """Number of channels of the latent vector."""
+        return self.pointnet2.mlp_global[-1]
 
     @property
     def level_widths(self) -> tuple[int, ...]:
-        """Channels of the encoder's levels that queries can attend to."""
+        """Numbers of channels of the encoder's levels that queries can attend to."""
         if self.encoder == "autodecoder":
             return ()
-        return self.transformer_widths[1:3] if self.encoder == "point-transformer" else (self.mlp1[-1], self.mlp2[-1])
+        if self.encoder == "point-transformer":
+            return self.transformer.transformer_widths[1:3]
+        return self.pointnet2.mlp1[-1], self.pointnet2.mlp2[-1]
+
+    def to_dict(self) -> dict[str, Any]:
+        """All settings by name, those of all parts side by side, as files hold them."""
+        settings: dict[str, Any] = {}
+        for name, value in asdict(self).items():
+            settings |= value if isinstance(value, dict) else {name: value}
+        return settings
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> "NetworkConfig":
+        """Settings from ``to_dict``, also after a trip through JSON.
+
+        What older weights do not state has its default: what it switches on did not exist then.
+
+        Raises:
+            ValueError: a name is unknown.
+        """
+        given = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+        parts: dict[str, Any] = {
+            name: part(**{item.name: given.pop(item.name) for item in fields(part) if item.name in given})
+            for name, part in PARTS.items()
+        }
+        odd = given.keys() - {"encoder", "points"}
+        if odd:
+            raise ValueError(f"the network settings differ in {min(odd)!r} from this version of mereo; train again")
+        return cls(**(parts | given))
+
+    def changed(self, **settings: Any) -> "NetworkConfig":
+        """Copy with other values for these settings, whichever parts they belong to."""
+        return self.from_dict(self.to_dict() | settings)

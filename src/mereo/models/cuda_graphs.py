@@ -1,4 +1,4 @@
-"""Depth images of one camera, answered with shapes that never change, so that a GPU runs each step as one CUDA graph.
+"""Answers to the depth images of one camera with shapes that never change, so that a GPU runs them as CUDA graphs.
 
 Launching the network's few hundred kernels one by one takes longer than running them. With fixed shapes the launches
 are recorded once and replayed: an image goes up, the labels come down, and nothing in between waits for the host. On a
@@ -24,17 +24,17 @@ from mereo.models.model import Model, check_enough
 from mereo.models.ops.neighbors import gpu_kernels
 
 SIZES = (4096, 10_000, 40_000)
-"""Queries at once; what is asked is padded to the next of them."""
+"""Numbers of queries at once; what is asked is padded to the next of them."""
 
 WARM_UPS = 3
-"""Runs before recording, as PyTorch asks for: libraries set themselves up in the first ones."""
+"""Number of runs before recording, as PyTorch asks for: libraries set themselves up in the first ones."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """One image, ready to be queried.
+    """Encoded depth image, ready to be queried.
 
     Attributes:
         code: the network's side.
@@ -49,7 +49,7 @@ class Seen:
 
 
 class StaticFrames:
-    """A model's answers to the depth images of one camera.
+    """Answers of a model to the depth images of one camera, as CUDA graphs on a GPU.
 
     Args:
         model: any but an autodecoder, whose search needs gradients.
@@ -83,7 +83,7 @@ class StaticFrames:
         self._seen: Seen | None = None
 
     def see(self, depth: Float[np.ndarray, "h w"]) -> None:
-        """Take the next image: depth in any unit, 0 where nothing was measured. Does not wait for the device."""
+        """Take the next image: depth in any unit, 0 where nothing was measured; does not wait for the device."""
         expected = (self.camera.height, self.camera.width)
         if depth.shape != expected:
             raise ValueError(f"the image is {depth.shape}; the camera's are {expected} (rows, columns): use its camera")

@@ -1,4 +1,4 @@
-"""The occupancy predictor's decoder (paper, section 3.1) with optional local features at the query.
+"""Decoder of the network, the occupancy predictor (paper, section 3.1), with optional local features at the query.
 
 Every layer that reads the latent vector is split, ``W [z; x] = W_z z + W_x x``: the latent half is computed once per
 cloud and broadcast over its queries, which is exact and removes the (queries x 1084) buffers.
@@ -8,6 +8,7 @@ Notation: b clouds, q queries, k neighbours, z latent channels, h hidden channel
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -23,7 +24,7 @@ from mereo.models.template_lookup import RestLookup
 
 @dataclass(frozen=True, eq=False)
 class Code:
-    """All that a query needs to know of a cloud; computed once.
+    """Encoded cloud: all that a query needs to know of it, computed once.
 
     Attributes:
         latent1, latent2: the latent half of the first layer and of the layer after the skip connection.
@@ -41,11 +42,14 @@ class Code:
     alignment: Alignment | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """Raw outputs at each query: class logits (0 is empty), signed distance, direction (not yet unit length).
+class Prediction(NamedTuple):
+    """Raw outputs of a network at each query.
 
-    ``rest`` are rest coordinates (``rest_pose``), meant inside the object; None where the network predicts none.
+    Attributes:
+        logits: of the classes, of which 0 is empty space.
+        distance: signed, normalized.
+        direction: to the nearest surface, camera frame, not yet of unit length.
+        rest: rest coordinates (``scenes.rest_pose``), meant inside the object; None where the network predicts none.
     """
 
     logits: Float[Tensor, "b q c"]
@@ -55,7 +59,7 @@ class Prediction:
 
 
 class FrequencyEncoding(nn.Module):
-    """``sin(2^e pi x), cos(2^e pi x)`` for every exponent e (paper, equation 2, with negative exponents)."""
+    """Layer ``sin(2^e pi x), cos(2^e pi x)`` for every exponent e (paper, equation 2, with negative exponents)."""
 
     def __init__(self, lowest: int, highest: int) -> None:
         super().__init__()
@@ -65,6 +69,7 @@ class FrequencyEncoding(nn.Module):
         self.channels = 6 * len(frequency)
 
     def forward(self, points: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q e"]:
+        """Sines, then cosines, of each coordinate at each frequency."""
         phase = (points[..., None] * self.frequency).flatten(-2)
         return torch.cat([phase.sin(), phase.cos()], dim=-1)
 
@@ -86,7 +91,7 @@ class LocalAttention(nn.Module):
         self.score = nn.Linear(width, self.HEADS)
 
     def forward(self, level: Level, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q w"]:
-        """``level.features`` are already projected."""
+        """Attended features at each query; ``level.features`` are already projected."""
         index = nearest(queries, level.centers, self.neighbors)
         offset = queries[:, :, None] - gather(level.centers, index)
         offset = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], dim=-1)
@@ -99,7 +104,7 @@ class LocalAttention(nn.Module):
 def line_of_sight(
     queries: Float[Tensor, "b q 3"], cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], count: int
 ) -> Float[Tensor, "b q f"]:
-    """Free-space evidence: lateral offset and depth difference to the observed points nearest in the image.
+    """Evidence of free space: lateral offset and depth difference to the observed points nearest in the image.
 
     A query in front of them is in seen empty space; one behind is hidden; one with none nearby is outside the
     silhouette. Both the plain values and eight times them, clipped to [-1, 1], so that near is resolved finely.
@@ -115,7 +120,7 @@ def line_of_sight(
 
 
 class ConditionedMLP(nn.Module):
-    """Code and query points -> features: the decoder's layers, whatever is asked of them.
+    """Layers of the decoder, from code and query points to features, whatever is asked of them.
 
     Queries are in the camera frame; the levels of the code may be in an aligned one.
     """
@@ -123,31 +128,33 @@ class ConditionedMLP(nn.Module):
     def __init__(self, config: NetworkConfig, outputs: int, lookup: RestLookup | None = None) -> None:
         super().__init__()
         self.config, self.lookup = config, lookup
-        self.encode = FrequencyEncoding(config.lowest_exponent, config.highest_exponent)
-        query, width = self.encode.channels if config.encode_positions else 3, config.width
+        layers, added = config.decoder, config.additions
+        self.encode = FrequencyEncoding(layers.lowest_exponent, layers.highest_exponent)
+        query, width = self.encode.channels if layers.encode_positions else 3, layers.width
         self.latent1 = nn.Linear(config.latent, width, bias=False)
         self.latent2 = nn.Linear(config.latent, width, bias=False)
         self.query1 = nn.Linear(query, width, bias=False)
         self.query2 = nn.Linear(query, width, bias=False)
-        self.hidden = nn.ModuleList(nn.Linear(width, width, bias=False) for _ in range(config.depth - 1))
-        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for _ in range(config.depth))
+        self.hidden = nn.ModuleList(nn.Linear(width, width, bias=False) for _ in range(layers.depth - 1))
+        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for _ in range(layers.depth))
         self.local = nn.ModuleList()
-        if config.local_neighbors:
+        if added.local_neighbors:
             self.local.extend(
-                LocalAttention(channels, config.local_width, config.local_neighbors) for channels in config.level_widths
+                LocalAttention(channels, added.local_width, added.local_neighbors) for channels in config.level_widths
             )
-            self.local1 = nn.Linear(len(self.local) * config.local_width, width, bias=False)
-        if config.sight_neighbors:
-            self.sight1 = nn.Linear(6 * config.sight_neighbors, width, bias=False)
+            self.local1 = nn.Linear(len(self.local) * added.local_width, width, bias=False)
+        if added.sight_neighbors:
+            self.sight1 = nn.Linear(6 * added.sight_neighbors, width, bias=False)
         self.head = nn.Linear(width, outputs)
 
     def summands(self, number: int) -> list[nn.Linear]:
-        """The layers whose sum is normalized in layer ``number``, counted from 0."""
+        """Layers whose sum is normalized in layer ``number``, counted from 0."""
         if number == 0:
-            extra = ("local1",) * bool(self.config.local_neighbors) + ("sight1",) * bool(self.config.sight_neighbors)
+            added = self.config.additions
+            extra = ("local1",) * bool(added.local_neighbors) + ("sight1",) * bool(added.sight_neighbors)
             return [self.latent1, self.query1, *(getattr(self, name) for name in extra)]
         summands: list[nn.Linear] = [self.hidden[number - 1]]  # type: ignore[list-item]
-        if number == self.config.skip_after:
+        if number == self.config.decoder.skip_after:
             summands += [self.latent2, self.query2, *(() if self.lookup is None else (self.lookup.read,))]
         return summands
 
@@ -158,7 +165,7 @@ class ConditionedMLP(nn.Module):
         viewpoint: Float[Tensor, "b 3"],
         alignment: Alignment | None = None,
     ) -> Code:
-        """The part of the work that does not depend on the queries."""
+        """Code of each cloud: the part of the work that does not depend on the queries."""
         with exact(cloud):  # pooled features have much in common, and the rest is what counts
             levels = tuple(
                 Level(level.centers, attention.project(level.features.float()))  # type: ignore[operator]
@@ -170,38 +177,39 @@ class ConditionedMLP(nn.Module):
     def features(
         self, code: Code, queries: Float[Tensor, "b q 3"]
     ) -> tuple[Float[Tensor, "b q f"], Float[Tensor, "b q 3"] | None]:
-        """The last layer's outputs, and the rest coordinates of the lookup on the way, if there is one."""
+        """Outputs of the last layer, and the rest coordinates of the lookup on the way, if there is one."""
+        layers, added = self.config.decoder, self.config.additions
         placed = queries if code.alignment is None else code.alignment.apply(queries)
-        encoded = self.encode(placed) if self.config.encode_positions else placed
+        encoded = self.encode(placed) if layers.encode_positions else placed
         with exact(queries):  # up to the first normalization
             rows = [encoded]
-            if self.config.local_neighbors:
+            if added.local_neighbors:
                 rows += [layer(level, placed) for layer, level in zip(self.local, code.levels, strict=True)]
-            if self.config.sight_neighbors:
-                rows.append(line_of_sight(queries, code.cloud, code.viewpoint, self.config.sight_neighbors))
+            if added.sight_neighbors:
+                rows.append(line_of_sight(queries, code.cloud, code.viewpoint, added.sight_neighbors))
             hidden = self._activate(0, joint_linear(self.summands(0)[1:], rows, code.latent1))
         rest = None
         for number in range(1, len(self.norms)):
             rows, latent = [hidden], None
-            if number == self.config.skip_after:
+            if number == layers.skip_after:
                 rows, latent = [hidden, encoded], code.latent2
                 if self.lookup is not None:
                     rest, seen = self.lookup(hidden, placed)
                     rows.append(seen)
-            layers = [layer for layer in self.summands(number) if layer is not self.latent2]
-            hidden = self._activate(number, joint_linear(layers, rows, latent))
+            read = [layer for layer in self.summands(number) if layer is not self.latent2]
+            hidden = self._activate(number, joint_linear(read, rows, latent))
         return self.head(hidden).float(), rest
 
     def _activate(self, number: int, hidden: Float[Tensor, "b q h"]) -> Float[Tensor, "b q h"]:
         """Normalization, ReLU and dropout of layer ``number``, counted from 0."""
         hidden = self.norms[number](hidden.flatten(0, 1)).relu_().unflatten(0, hidden.shape[:2])
-        return nn.functional.dropout(hidden, self.config.dropout, self.training)
+        return nn.functional.dropout(hidden, self.config.decoder.dropout, self.training)
 
 
 def joint_linear(
     layers: Sequence[nn.Linear], rows: Sequence[Float[Tensor, "b q _"]], latent: Float[Tensor, "b h"] | None
 ) -> Float[Tensor, "b q h"]:
-    """``sum_i W_i x_i`` (+ the cloud's ``latent``) as one product of joined rows: the sum is written once.
+    """Sum ``sum_i W_i x_i`` (+ the cloud's ``latent``) as one product of joined rows: it is written once.
 
     ``rows`` may be fewer, and wider, than ``layers``, as long as the channels match in order.
     """
@@ -217,14 +225,15 @@ def joint_linear(
 
 
 class Decoder(ConditionedMLP):
-    """Code and query points -> class logits, signed distance, direction."""
+    """Decoder from code and query points to class logits, signed distance and direction."""
 
     def __init__(self, config: NetworkConfig, classes: int) -> None:
-        lookup = RestLookup(config.width, classes - 1) if config.rest_template else None
+        lookup = RestLookup(config.decoder.width, classes - 1) if config.additions.rest_template else None
         super().__init__(config, classes + 4, lookup)
         self.classes = classes
 
     def forward(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Prediction:
+        """Prediction at each query, the direction in the camera frame."""
         features, rest = self.features(code, queries)
         logits, distance, direction = features.split([self.classes, 1, 3], dim=-1)
         if code.alignment is not None:

@@ -1,4 +1,4 @@
-"""What this machine offers: device, precision, and an allocator setting that matters."""
+"""Device, precision, and an allocator setting that matters: what this machine offers."""
 
 import ctypes
 import shutil
@@ -14,14 +14,14 @@ from mereo.models.config import Device, Precision
 
 
 def pick_device(rank: int = 0) -> torch.device:
-    """A CUDA device where there is one, else the CPU."""
+    """CUDA device of a process where there is one, else the CPU."""
     if torch.cuda.is_available():
         return torch.device("cuda", rank % torch.cuda.device_count())
     return torch.device("cpu")
 
 
 def find_device(device: Device) -> torch.device:
-    """The device that was asked for; ``ValueError`` for CUDA where torch sees none."""
+    """Device that was asked for; ``ValueError`` for CUDA where torch sees none."""
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("the device is cuda, but torch sees no CUDA device; leave out --device to use the CPU")
     return torch.device("cpu") if device == "cpu" else pick_device()
@@ -29,7 +29,7 @@ def find_device(device: Device) -> torch.device:
 
 @cache
 def bfloat16_gain() -> float:
-    """How many times faster this CPU multiplies matrices of the network's size in bfloat16 than in float32.
+    """Ratio of this CPU's rates of matrix products in bfloat16 and in float32, at the network's size.
 
     Measured once, in about 10 ms, because what a CPU says of itself does not tell: AVX-512's bfloat16 instructions
     double the rate on AMD's Zen 4 and change nothing on Intel's Xeons, where AMX makes it five times.
@@ -48,11 +48,11 @@ def _seconds(a: Tensor, b: Tensor) -> float:
 
 
 BFLOAT16_PAYS = 1.5
-"""From this gain in products on, a training step is faster too: the rest of it stays in float32."""
+"""Gain in products from which on a training step is faster too: the rest of it stays in float32."""
 
 
 def pick_precision(precision: Precision, device: torch.device) -> torch.dtype | None:
-    """The autocast type, or None for float32; auto takes bfloat16 on CUDA and on CPUs that are much faster in it."""
+    """Type of products for autocast, or None for float32; auto takes bfloat16 on CUDA and where a CPU gains by it."""
     if precision == "float32":
         return None
     if precision == "bfloat16" or device.type == "cuda" or bfloat16_gain() >= BFLOAT16_PAYS:
@@ -61,7 +61,7 @@ def pick_precision(precision: Precision, device: torch.device) -> torch.dtype | 
 
 
 def exact(tensor: Tensor) -> AbstractContextManager[object]:
-    """Switches autocast off where bfloat16, with its eight bits, is too coarse.
+    """Context that switches autocast off where bfloat16, with its eight bits, is too coarse.
 
     A coordinate near 1 would be off by up to 0.004, more than sensor noise; and what all rows have in common, which
     batch normalization takes away again, may be hundreds of times their spread, which rounding would then erase.
@@ -107,7 +107,7 @@ def cpu_features() -> dict[str, bool | None]:
 
 
 def _ask_torch(function: str) -> bool | None:
-    """The probes are private functions of torch: they come and go, and must never stop the report."""
+    """Answer of a private function of torch: they come and go, and must never stop the report."""
     probe = getattr(torch.cpu, function, None)
     try:
         return None if probe is None else bool(probe())

@@ -1,4 +1,4 @@
-"""The trained model that a user holds.
+"""Trained model that a user holds.
 
 ``Network`` works on normalized batches; ``Model`` takes clouds and points in the user's frame and units, and answers
 in them. The code of a cloud is computed once and then queried as often as one likes.
@@ -21,7 +21,7 @@ from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.geometry.mesh import Color
 from mereo.geometry.normalizer import Normalizer
 from mereo.models.batch_norm_fusion import fold_batch_norm
-from mereo.models.config import Precision
+from mereo.models.config import Precision, Supervision
 from mereo.models.decoder import Code, Prediction
 from mereo.models.device import pick_precision
 from mereo.models.network import Network
@@ -30,19 +30,19 @@ SURE_LOGIT = 20.0
 """Lead of empty space where there can be nothing; trained networks reach about this in plainly empty space."""
 
 DENSE_FACTOR = 8
-"""Clouds this many times denser than the network's input are thinned at random first: ordering all is quadratic."""
+"""Density, relative to the network's input, above which clouds are thinned at random: ordering all is quadratic."""
 
 CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 4096, 65536
-"""Queries evaluated at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
+"""Numbers of queries at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
 
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]
-"""Lower and upper corner."""
+"""Lower and upper corner of a box, normalized."""
 
 
 @dataclass(frozen=True, eq=False)
 class EncodedCloud:
-    """One observed cloud, ready to be queried.
+    """Observed cloud, encoded and ready to be queried.
 
     Attributes:
         code: the network's side.
@@ -57,7 +57,7 @@ class EncodedCloud:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What the model says about each point, in the user's frame and units.
+    """Answers of a model at points, in the user's frame and units.
 
     Attributes:
         label: 0 for empty space, i + 1 for the model's segment i.
@@ -74,7 +74,7 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A trained network with everything needed to use it.
+    """Trained network with everything needed to use it.
 
     Attributes:
         network: in evaluation mode; not to be changed once the model has been asked.
@@ -99,30 +99,39 @@ class Model:
 
     @property
     def segmented(self) -> bool:
-        """Whether it tells segments apart; one trained on distances alone only knows inside from outside."""
-        return "ce" in self.loss
+        """Whether the model tells segments apart; one trained on distances alone only knows inside from outside."""
+        return self.supervision.labels
+
+    @property
+    def supervision(self) -> Supervision:
+        """Supervision by the loss that the model was trained with: what of its answers means anything."""
+        return Supervision.of(self.loss)
 
     @cached_property
     def inference(self) -> Network:
-        """What answers: the network without normalization layers, made at the first question."""
+        """Network that answers: without normalization layers, made at the first question."""
         return fold_batch_norm(self.network)
 
     @property
     def device(self) -> torch.device:
+        """Device of the network's weights."""
         return next(self.network.parameters()).device
 
     @property
     def working_dtype(self) -> torch.dtype:
-        """Of the products on this machine: float32 or bfloat16."""
+        """Type of the products on this machine: float32 or bfloat16."""
         return pick_precision(self.precision, self.device) or torch.float32
 
     @property
     def working_precision(self) -> str:
-        """The name of ``working_dtype``."""
+        """Name of ``working_dtype``."""
         return str(self.working_dtype).removeprefix("torch.")
 
     def encode(self, cloud: PointCloud | Float[np.ndarray, "n 3"]) -> EncodedCloud:
-        """Points in a camera frame (z forward), any unit, any density. Raises ``ValueError`` on unusable clouds."""
+        """Encoded cloud of points in a camera frame (z forward), any unit, any density.
+
+        Raises ``ValueError`` on unusable clouds.
+        """
         cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
         ordered, normalizer = self.normalized_cloud(cloud)
         seen = ordered[0, : len(cloud)].numpy().astype(np.float64)
@@ -132,7 +141,7 @@ class Model:
         return EncodedCloud(code, normalizer, normalizer.invert(seen))
 
     def normalized_cloud(self, cloud: PointCloud) -> tuple[Float[Tensor, "1 n 3"], Normalizer]:
-        """What the network sees of a cloud, in farthest-point order; repeated where there are too few points.
+        """Cloud as the network sees it, in farthest-point order; repeated where there are too few points.
 
         Raises ``ValueError`` on unusable clouds.
         """
@@ -159,11 +168,11 @@ class Model:
         )
 
     def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
-        """Class logits only: what surface extraction needs."""
+        """Class logits at each point, without the rest of the answer: what surface extraction needs."""
         return self._chunked(code, points, lambda *found: (self.class_logits(*found),))[0]
 
     def rest(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"] | None:
-        """Where each point was at rest, in rest coordinates (see ``rest_pose``); None from a model without template."""
+        """Rest coordinates of each point (``scenes.rest_pose``); None from a model without template."""
         if self.network.decoder.lookup is None:
             return None
 
@@ -181,9 +190,9 @@ class Model:
         A head that no term of the loss has trained says nothing: it is NaN.
         """
         distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
-        if "l1" not in self.loss:
+        if not self.supervision.distances:
             distance = torch.full_like(distance, torch.nan)
-        if "cd" not in self.loss:
+        if not self.supervision.directions:
             direction = torch.full_like(direction, torch.nan)
         return self.class_logits(prediction, queries), distance, direction
 
@@ -208,7 +217,7 @@ class Model:
 
     @contextmanager
     def answering(self) -> Iterator[None]:
-        """Around whatever the network computes for a user: no gradients, in the model's precision."""
+        """Context of whatever the network computes for a user: no gradients, in the model's precision."""
         dtype = pick_precision(self.precision, self.device)
         with torch.inference_mode(), torch.autocast(self.device.type, dtype, enabled=dtype is not None):
             yield
@@ -219,6 +228,7 @@ class Model:
         points: Float[np.ndarray, "n 3"],
         answer: Callable[[Prediction, Tensor], tuple[Tensor, ...]],
     ) -> list[np.ndarray]:
+        """Parts of the answers at all points, asked chunk by chunk."""
         normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
         size = CUDA_QUERY_CHUNK if self.device.type == "cuda" else CPU_QUERY_CHUNK
         chunks = []
@@ -238,7 +248,7 @@ def check_enough(count: int, said: str) -> None:
 
 
 def checked_points(cloud: PointCloud) -> Float[np.ndarray, "n 3"]:
-    """The cloud's points as float64, or one sentence on why they cannot be used."""
+    """Points of a cloud as float64, or ``ValueError`` with one sentence on why they cannot be used."""
     points = np.asarray(cloud.points, dtype=np.float64)
     check_enough(len(points), f"the cloud has {len(points)} points")
     if (points[:, 2] <= 0).any():

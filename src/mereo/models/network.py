@@ -1,6 +1,6 @@
-"""Encoder and decoder together, on normalized batches; ``mereo.models.model`` puts them into the user's frame."""
+"""Network of encoder and decoder on normalized batches; ``mereo.models.model`` puts it into the user's frame."""
 
-from dataclasses import fields
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +18,19 @@ ALIGNED_QUERIES = 128
 """Queries per example that train the alignment: neighbours say much the same about a nearly rigid motion."""
 
 
+class TrainingOutput(NamedTuple):
+    """Answers of a network in training.
+
+    Attributes:
+        prediction: at all queries.
+        coarse: rest coordinates from which the alignment is made, at the first ``ALIGNED_QUERIES``; None where the
+            network aligns nothing.
+    """
+
+    prediction: Prediction
+    coarse: Float[Tensor, "b a 3"] | None
+
+
 class Network(nn.Module):
     """Encoder and decoder on normalized coordinates."""
 
@@ -26,10 +39,10 @@ class Network(nn.Module):
         self.config, self.segments = config, segments
         self.encoder = make_encoder(config)
         self.decoder = Decoder(config, segments + 1)
-        self.aligner = AlignmentNet(config) if config.align_points else None
+        self.aligner = AlignmentNet(config) if config.additions.align_points else None
 
     def encode(self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
-        """``cloud`` in farthest-point order. An autodecoder searches for its code, in evaluation mode."""
+        """Code of each cloud, given in farthest-point order; an autodecoder searches for it, in evaluation mode."""
         if isinstance(self.encoder, Autodecoder):
             # the search needs gradients, which tensors of inference mode cannot give
             with torch.inference_mode(False), torch.no_grad():
@@ -62,6 +75,7 @@ class Network(nn.Module):
         return prepare(encoder.search(lambda latent: self.query(prepare(latent), cloud).distance, len(cloud)))
 
     def query(self, code: Code, points: Float[Tensor, "b q 3"]) -> Prediction:
+        """Prediction at each point."""
         prediction: Prediction = self.decoder(code, points)
         return prediction
 
@@ -71,32 +85,12 @@ class Network(nn.Module):
         viewpoint: Float[Tensor, "b 3"],
         points: Float[Tensor, "b q 3"],
         index: Int[Tensor, " b"] | None = None,
-    ) -> tuple[
-        Float[Tensor, "b q c"],
-        Float[Tensor, "b q"],
-        Float[Tensor, "b q 3"],
-        Float[Tensor, "b q 3"] | None,
-        Float[Tensor, "b a 3"] | None,
-    ]:
-        """What training needs: logits, distance, direction, and rest coordinates twice.
+    ) -> TrainingOutput:
+        """Predictions at ``points`` for training, with what else a loss looks at.
 
-        First those of the template lookup, then those that the alignment is made from, at the first
-        ``ALIGNED_QUERIES``; None where the network has no such part. ``index`` says which training examples the clouds
-        are: an autodecoder takes their codes.
+        ``index`` says which training examples the clouds are: an autodecoder takes their codes.
         """
         alignment, coarse = None, None
         if self.aligner is not None:
             alignment, coarse = self.aligner(cloud, points[:, :ALIGNED_QUERIES])
-        prediction = self.query(self._encode(cloud, viewpoint, alignment, index), points)
-        return prediction.logits, prediction.distance, prediction.direction, prediction.rest, coarse
-
-
-def config_from_dict(values: dict[str, object]) -> NetworkConfig:
-    """Inverse of ``dataclasses.asdict`` after a trip through JSON; unknown keys raise ``ValueError``.
-
-    Settings that older weights do not state have their defaults: what they switch on did not exist then.
-    """
-    odd = sorted(set(values) - {f.name for f in fields(NetworkConfig)})
-    if odd:
-        raise ValueError(f"the network settings differ in {odd[0]!r} from this version of mereo; train again")
-    return NetworkConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})  # type: ignore[arg-type]
+        return TrainingOutput(self.query(self._encode(cloud, viewpoint, alignment, index), points), coarse)

@@ -15,7 +15,7 @@ from mereo.models.ops.svd import svd3
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """``aligned = rotation @ x + shift``, one rigid motion per cloud, from normalized camera coordinates.
+    """Rigid motion of each cloud, ``aligned = rotation @ x + shift``, from normalized camera coordinates.
 
     There is no scale: cloud and rest pose are both about two units long, and an unsure estimate would shrink.
     """
@@ -36,7 +36,7 @@ class Alignment:
 
 @torch.no_grad()
 def fit_rigid(source: Float[Tensor, "b n 3"], target: Float[Tensor, "b n 3"]) -> Alignment:
-    """The rotation and shift with the least squared distance of moved ``source`` to ``target`` (Kabsch, 1976)."""
+    """Rotation and shift with the least squared distance of moved ``source`` to ``target`` (Kabsch, 1976)."""
     middle, aim = source.mean(dim=1, keepdim=True), target.mean(dim=1, keepdim=True)
     with exact(source):
         u, _, v = _svd((target - aim).transpose(1, 2) @ (source - middle))

@@ -1,4 +1,4 @@
-"""What the object looks like is known, only its deformation is not: the decoder looks queries up in the rest pose.
+"""Lookup of queries in the rest pose: what an object looks like is known, only its deformation is not.
 
 Halfway through its layers the decoder predicts where in the rest pose a query is, and reads there, from a grid, the
 signed distance to every segment of the model it was trained for. Deformations are smooth, so the position is easy to
@@ -18,15 +18,15 @@ from mereo.models.device import exact
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 
 SCALES = (1.0, 8.0, 32.0)
-"""Distances are seen at these magnifications, clipped to [-1, 1], so that what is near is resolved finely."""
+"""Magnifications at which distances are seen, clipped to [-1, 1], so that what is near is resolved finely."""
 
 
 class RestLookup(nn.Module):
-    """Hidden features and place of a query -> its rest coordinates, and how far the model's surfaces are there.
+    """Layer from a query's hidden features and place to its rest coordinates and the model's surfaces there.
 
     Attributes:
         read: from those distances to the decoder's hidden features; the decoder applies it.
-        distance: signed distances (``rest_pose.rest_distances``), a constant of the trained object.
+        distance: signed distances (``scenes.rest_pose.rest_distances``), a constant of the trained object.
     """
 
     def __init__(self, width: int, segments: int) -> None:

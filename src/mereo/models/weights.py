@@ -1,7 +1,7 @@
 """Trained models on disk: one safetensors file whose header holds everything needed to run without the dataset."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -11,32 +11,34 @@ from safetensors.torch import save
 from torch import Tensor
 
 from mereo.io.atomic_files import atomic_file
-from mereo.models.config import InferenceConfig
+from mereo.models.config import InferenceConfig, NetworkConfig
 from mereo.models.device import find_device
 from mereo.models.encoders.autodecoder import CODES
 from mereo.models.model import Model
-from mereo.models.network import Network, config_from_dict
+from mereo.models.network import Network
 
 FORMAT_VERSION = 2
-"""Version 2 may hold the template in bytes; the rest is as in version 1, which is read too."""
+"""Version of the files: 2 may hold the template in bytes; the rest is as in version 1, which is read too."""
 
 PACKED = "decoder.lookup.distance"
 """The template's signed distances: with ten segments more than half of a float16 file."""
 
 FINE = 0.1
-"""Packed distances are finest within this of a surface: steps of 0.0008 at it, a fiftieth of the grid's, 0.1 at 1."""
+"""Reach of a surface, where packed distances are finest: steps of 0.0008 at it, a fiftieth of the grid's, 0.1 at 1."""
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 
 
 def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> None:
-    """Write weights and header atomically; ``float16`` halves the file and packs the template. All is read as float32.
+    """Write weights and header atomically; ``float16`` halves the file and packs the template.
+
+    All is read as float32.
 
     An autodecoder's codes of training examples are left out: using a network needs their mean only.
     """
     header = {
         "version": FORMAT_VERSION,
-        "network": asdict(model.network.config),
+        "network": model.network.config.to_dict(),
         "names": model.names,
         "colors": model.colors,
         "loss": model.loss,
@@ -85,10 +87,10 @@ def shipped_names() -> tuple[str, ...]:
 
 
 def find_weights(name: str | Path) -> Path:
-    """A shipped name or a path to an existing file."""
+    """Path of weights that are given by a shipped name or as an existing file."""
     path = Path(name)
     shipped = SHIPPED / f"{name}.safetensors"
-    if path.suffix == "" and not path.exists() and shipped.is_file():
+    if path.suffix == "" and not path.is_file() and shipped.is_file():
         return shipped
     if not path.is_file():
         raise FileNotFoundError(
@@ -99,12 +101,15 @@ def find_weights(name: str | Path) -> Path:
 
 
 def load_for(name: str | Path, inference: InferenceConfig) -> Model:
-    """``load_model``, on the device and in the precision that are asked for."""
+    """Trained model (``load_model``) on the device and in the precision that are asked for."""
     return replace(load_model(name, find_device(inference.device)), precision=inference.precision)
 
 
 def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
-    """A shipped model by name, or a file. Raises ``ValueError`` when it is not weights of this version."""
+    """Trained model, a shipped one by its name or one from a file.
+
+    Raises ``FileNotFoundError`` for unknown names, ``ValueError`` when it is not weights of this version.
+    """
     path = find_weights(name)
     try:
         with safe_open(path, framework="pt") as file:
@@ -122,7 +127,7 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
             f"{path} has weights format {header.get('version')}; this mereo reads formats up to {FORMAT_VERSION}: "
             "train again, or install the matching version"
         )
-    network = Network(config_from_dict(header["network"]), len(header["names"]))
+    network = Network(NetworkConfig.from_dict(header["network"]), len(header["names"]))
     try:
         network.load_state_dict({name: _restored(name, value) for name, value in tensors.items()})
     except RuntimeError as error:

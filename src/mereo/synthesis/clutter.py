@@ -1,4 +1,4 @@
-"""What else a camera sees: a tool or a hand in front of the object, a plane behind it.
+"""Tools and hands in front of an object, and a plane behind it: what else a camera sees.
 
 Everything is in the camera frame, in scene units; lengths in metres are multiplied by ``unit``, scene units per metre.
 Occluders made in front of a rendered object are a common way to train for occlusion (Sárándi et al., "How robust is 3D
@@ -22,14 +22,14 @@ Vector = Float[np.ndarray, "3"]
 
 @dataclass(frozen=True, eq=False)
 class Capsule:
-    """All points within ``radius`` of the segment from ``start`` to ``end``."""
+    """Solid of all points within ``radius`` of the segment from ``start`` to ``end``."""
 
     start: Vector
     end: Vector
     radius: float
 
     def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
-        """Which rays from the origin hit the capsule, and where each of them does first."""
+        """Rows of the rays from the origin that hit the capsule, and where each of them does first."""
         low, high = np.minimum(self.start, self.end) - self.radius, np.maximum(self.start, self.end) + self.radius
         rows = toward(directions, low, high)
         rays = directions[rows]
@@ -77,13 +77,13 @@ def _entry(
 
 @dataclass(frozen=True, eq=False)
 class Backdrop:
-    """All points with ``normal @ point = offset``; ``offset`` is positive, so that the normal points away."""
+    """Plane of all points with ``normal @ point = offset``; ``offset`` is positive, so that the normal points away."""
 
     normal: Vector
     offset: float
 
     def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
-        """Which rays from the origin hit the plane, and where."""
+        """Rows of the rays from the origin that hit the plane, and where."""
         slope = directions @ self.normal
         rows = np.flatnonzero(slope > 1e-6)
         return rows, Hits(self.offset / slope[rows], np.tile(self.normal, (len(rows), 1)))
@@ -91,19 +91,20 @@ class Backdrop:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """All that is not the object."""
+    """Everything in a view that is not the object: tools, hands, a plane behind."""
 
     occluders: tuple[Capsule, ...] = ()
     background: Backdrop | None = None
 
-    def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-        """Let what is nearer replace the hits of the object, in place; returns what each ray meets first."""
+    def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
+        """First hits of rays among object and surroundings, and what is hit; ``hits`` are those of the object alone."""
+        first = Hits(hits.distance.copy(), hits.normal.copy())
         source = np.where(np.isfinite(hits.distance), OBJECT, NOTHING).astype(np.uint8)
         if self.background is not None:
-            source[hits.nearer(*self.background.first_hit(directions))] = BACKGROUND
+            source[first.nearer(*self.background.first_hit(directions))] = BACKGROUND
         for capsule in self.occluders:
-            source[hits.nearer(*capsule.first_hit(directions))] = OCCLUDER
-        return source
+            source[first.nearer(*capsule.first_hit(directions))] = OCCLUDER
+        return first, source
 
 
 def sample_surroundings(
@@ -113,7 +114,7 @@ def sample_surroundings(
     reach: float,
     streams: dict[str, np.random.Generator],
 ) -> Surroundings:
-    """Random things around an object of which the points ``seen`` are visible.
+    """Random tool, hand and plane around an object of which the points ``seen`` are visible.
 
     Args:
         sensor: how probable each is.
@@ -135,7 +136,7 @@ def sample_surroundings(
 
 
 def sample_plane(solids: Solids, unit: float, rng: np.random.Generator) -> Backdrop:
-    """A table or wall behind the object: up to 45 degrees off the image plane, touching to 5 cm behind."""
+    """Random table or wall behind the object: up to 45 degrees off the image plane, touching to 5 cm behind."""
     normal = _polar(np.tan(rng.uniform(0, np.pi / 4)), rng.uniform(0, 2 * np.pi))
     normal = normal / np.linalg.norm(normal)
     farthest = max(float((segment.vertices @ normal).max()) for segment in solids.mesh.segments)
@@ -143,6 +144,7 @@ def sample_plane(solids: Solids, unit: float, rng: np.random.Generator) -> Backd
 
 
 def _polar(radius: float, angle_rad: float) -> Vector:
+    """Direction with z = 1 whose slope has this length and angle."""
     return np.array([radius * np.cos(angle_rad), radius * np.sin(angle_rad), 1.0])
 
 
@@ -157,7 +159,7 @@ def _approach(
 
 
 def sample_tool(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
-    """A straight shaft that ends in two jaws, as laparoscopic instruments have: 5 to 12 mm thick."""
+    """Random straight shaft that ends in two jaws, as laparoscopic instruments have: 5 to 12 mm thick."""
     tip, out = _approach(seen, reach, unit, rng)
     radius, jaw, opening = rng.uniform(0.0025, 0.006) * unit, 0.018 * unit, rng.uniform(0.05, 0.4)
     axis = (out - tip) / np.linalg.norm(out - tip)
@@ -173,7 +175,7 @@ _FINGERS = ((-0.030, 0.90), (-0.010, 1.0), (0.010, 0.93), (0.030, 0.75))
 
 
 def sample_hand(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
-    """A left or right hand with forearm, as capsules, that reaches up to 7 cm past the point it is sent to.
+    """Random left or right hand with forearm, as capsules, that reaches up to 7 cm past the point it is sent to.
 
     Hands of simple solids are known from tracking (Oikonomidis et al., "Efficient model-based 3D tracking of hand
     articulations using Kinect", BMVC 2011). An adult's: about 18 cm long, 8 cm wide, with 10 % of variation. Fingers

@@ -1,4 +1,7 @@
-"""Settings of making examples: simulated depth cameras and query points; light, for the command line."""
+"""Settings of making examples: simulated depth cameras, query points, the depth image and its cloud.
+
+Light, so that the command line may import them.
+"""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -10,7 +13,7 @@ SensorModel = Literal["structured-light", "time-of-flight"]
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """Errors of real depth cameras, on top of the paper's noise; each is off at 0 (docs/design/0006-sensors.md).
+    """Strengths of real depth cameras' errors beside the paper's noise, each off at 0 (docs/design/0006-sensors.md).
 
     A strength of 1 is as published. The formulas are in metres, scenes in their own units.
 
@@ -58,7 +61,7 @@ SENSOR_TERMS = (
     *("axial", "lateral", "quantization", "flying", "dropout", "holes", "tool", "hand", "background"),
     *("mask_offset_px", "mask_shift_px"),
 )
-"""What a sensor is off without; each term draws from a random stream of its own."""
+"""Settings without which a sensor is off; each term draws from a random stream of its own."""
 
 Sensor = Literal["paper", "structured-light", "time-of-flight"]
 
@@ -92,7 +95,7 @@ SENSORS: dict[Sensor, SensorConfig] = {
 
 
 TEMPLATE = "template.safetensors"
-"""A dataset's file with the segments at rest (``rest_pose``)."""
+"""File of a dataset with the segments at rest (``scenes.rest_pose``)."""
 
 
 Sampler = Literal["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"]
@@ -100,7 +103,7 @@ Sampler = Literal["volume-uniform", "label-uniform", "sort-sample", "nested-sort
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """Where training queries are drawn (paper, section 3.2, "Sampling Method for Query Points").
+    """Settings of where training queries are drawn (paper, section 3.2, "Sampling Method for Query Points").
 
     Attributes:
         sampler: one of the paper's three samplers, or the authors' later NestedSortSample.
@@ -123,7 +126,7 @@ class SamplingConfig:
 
 @dataclass(frozen=True)
 class GenerateConfig:
-    """How one example is made (paper, appendix B).
+    """Settings of how one example is made (paper, appendix B).
 
     Attributes:
         image_size: the depth image is square, in pixels.

@@ -1,4 +1,4 @@
-"""The virtual depth camera: ray casting and sensor noise (paper, appendix B)."""
+"""Virtual depth camera: ray casting and Gaussian noise (paper, appendix B)."""
 
 import numpy as np
 
@@ -20,7 +20,9 @@ def render_depth(mesh: SegmentedMesh | Solids, camera: Camera) -> DepthImage:
 
 
 def add_depth_noise(image: DepthImage, std: float, rng: np.random.Generator) -> DepthImage:
-    """Gaussian noise of standard deviation ``std`` (the depth's unit) on every measured pixel; misses stay misses.
+    """Depth image with Gaussian noise of standard deviation ``std`` (the depth's unit) on every measured pixel.
+
+    Misses stay misses.
 
     ``rng`` advances by one number per pixel, measured or not. Raises ``ValueError`` when ``std`` is not finite and at
     least 0.

@@ -1,4 +1,4 @@
-"""What a depth camera makes of a scene: the paper's Gaussian noise, and errors that real cameras add (off by default).
+"""Simulated depth cameras: the paper's Gaussian noise, and errors that real ones add (off by default).
 
 Order of a measurement: what each pixel's ray meets, along a direction that is slightly off (lateral noise); mixed
 pixels at depth edges; noise in depth; quantization; missing pixels; and the mask that cuts out the object.
@@ -22,13 +22,13 @@ from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
 from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
 
 STEEPEST_RAD = float(np.deg2rad(80.0))
-"""The noise formulas have a pole at 90 degrees; surfaces seen at a larger angle count as seen at this one."""
+"""Largest angle of the noise formulas, which have a pole at 90 degrees: steeper surfaces count as seen at this one."""
 
 GRAZING_RAD = float(np.deg2rad(60.0))
-"""From here on axial noise rises steeply (Nguyen et al. 2012) and pixels go missing."""
+"""Angle from which on axial noise rises steeply (Nguyen et al. 2012) and pixels go missing."""
 
 KINECT_FOCAL_PX = 585.0
-"""Nguyen et al. state lateral noise in pixels of this focal length."""
+"""Focal length of the pixels in which Nguyen et al. state lateral noise."""
 
 KINECT_DISPARITY_M = 351.3
 """Depth in metres times disparity in steps; 35130 in centimetres (Barron and Malik 2013)."""
@@ -38,12 +38,12 @@ PROBABILITIES = ("flying", "dropout", "tool", "hand", "background")
 
 @dataclass(frozen=True, eq=False)
 class SimulatedView:
-    """What a camera gives, and the truth about it.
+    """Measurement of a simulated camera, and the truth about it.
 
     Attributes:
         whole: everything that was measured.
         mask: the object's pixels, according to the segmentation.
-        source: what each pixel's ray met first, ``surroundings.OBJECT`` and so on.
+        source: what each pixel's ray met first, ``clutter.OBJECT`` and so on.
     """
 
     whole: DepthImage
@@ -52,17 +52,17 @@ class SimulatedView:
 
     @property
     def image(self) -> DepthImage:
-        """The depth image cut out by the mask."""
+        """Depth image cut out by the mask."""
         return DepthImage(np.where(self.mask, self.whole.depth, 0.0), self.whole.camera)
 
     @property
     def object_points(self) -> int:
-        """Pixels of ``image`` that show the object."""
+        """Number of pixels of ``image`` that show the object."""
         return int((self.mask & self.whole.valid & (self.source == OBJECT)).sum())
 
 
 def check_sensor(sensor: SensorConfig) -> None:
-    """Raise ``ValueError`` naming the setting, its rule and the cure."""
+    """Raise ``ValueError`` for sensor settings out of their range, naming the setting, its rule and the cure."""
     for name in SENSOR_TERMS:
         value = getattr(sensor, name)
         if name in PROBABILITIES and not 0 <= value <= 1:
@@ -77,7 +77,7 @@ def check_sensor(sensor: SensorConfig) -> None:
 def observe(
     solids: Solids, camera: Camera, noise_std: float, sensor: SensorConfig, rng: np.random.Generator
 ) -> SimulatedView:
-    """One picture of an object in the camera frame.
+    """Measurement of an object in the camera frame by a simulated sensor.
 
     The Gaussian noise of ``noise_std`` is drawn from ``rng`` itself, every other term from a stream of its own that is
     spawned from it. So whatever is drawn from ``rng`` afterwards is the same with any sensor, and switching one term on
@@ -121,14 +121,14 @@ def _look(
     seen = directions[visible] * hits.distance[visible, None]
     reach = float(np.linalg.norm(directions[:, :2], axis=1).max())
     around = sample_surroundings(sensor, solids, seen, reach, streams)
-    source = around.join(hits, directions)
-    if sensor.lateral > 0:
-        depth = np.where(np.isfinite(hits.distance), hits.distance, np.median(seen[:, 2]))
-        std = lateral_std(depth * sensor.metres_per_unit, _incidence(hits, directions), sensor.model)
-        directions[:, :2] += sensor.lateral * std[:, None] * streams["lateral"].normal(size=(len(directions), 2))
-        hits = solids.first_hit(directions)
-        source = around.join(hits, directions)
-    return hits, source
+    hits, source = around.join(hits, directions)
+    if sensor.lateral == 0:
+        return hits, source
+    depth = np.where(np.isfinite(hits.distance), hits.distance, np.median(seen[:, 2]))
+    std = lateral_std(depth * sensor.metres_per_unit, _incidence(hits, directions), sensor.model)
+    moved = directions.copy()
+    moved[:, :2] += sensor.lateral * std[:, None] * streams["lateral"].normal(size=(len(directions), 2))
+    return around.join(solids.first_hit(moved), moved)
 
 
 def _incidence(hits: Hits, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -176,7 +176,7 @@ def axial_std_m(
 def add_axial_noise(
     depth: Float[np.ndarray, "h w"], angle_rad: Float[np.ndarray, "h w"], sensor: SensorConfig, rng: np.random.Generator
 ) -> Float[np.ndarray, "h w"]:
-    """Gaussian noise of ``axial_std_m`` on every measured pixel; misses (0) stay misses."""
+    """Depth with Gaussian noise of ``axial_std_m`` on every measured pixel; misses (0) stay misses."""
     if sensor.axial == 0:
         return depth
     measured = depth > 0
@@ -206,7 +206,7 @@ def quantize(z_m: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray,
 def mix_edges(
     depth: Float[np.ndarray, "h w"], focal_px: float, probability: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "h w"]:
-    """Flying pixels: at depth edges, with this probability, a depth between the pixel's own and its neighbour's.
+    """Depth with flying pixels: at edges, with this probability, a depth between the pixel's own and its neighbour's.
 
     A pixel whose footprint covers both sides of an edge returns a mixture (Hebert and Krotkov, "3D measurements from
     imaging laser radars: how good are they?", Image and Vision Computing 1992; for time-of-flight cameras Sabov and
@@ -230,7 +230,7 @@ def mix_edges(
 
 
 def dropout_probability(angle_rad: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray, "*n"]:
-    """How probably a pixel is missing: 0 up to 60 degrees, then rising to ``strength`` at 90.
+    """Probability that a pixel is missing: 0 up to 60 degrees of slant, then rising to ``strength`` at 90.
 
     The light that comes back from a matt surface falls with the cosine of the angle (Lambert), and cameras give up on
     weak or distorted returns (Mallick, Das and Majumdar, "Characterizations of noise in Kinect depth images: a review",
@@ -269,7 +269,7 @@ def sample_holes(
 def sample_mask(
     seen: Bool[np.ndarray, "h w"], sensor: SensorConfig, streams: dict[str, np.random.Generator]
 ) -> Bool[np.ndarray, "h w"]:
-    """The object's mask as a segmentation gives it: shifted, its edge too far out here and too far in there.
+    """Mask of the object as a segmentation gives it: shifted, its edge too far out here and too far in there.
 
     Xie et al. (T-RO 2021) shift, erode and dilate masks to resemble those of a network. Here the signed distance to the
     true edge is compared with a smooth random offset, so that neighbouring parts of the edge are wrong alike.
@@ -285,7 +285,7 @@ def sample_mask(
 
 
 def smooth_field(height: int, width: int, rng: np.random.Generator, nodes: int = 7) -> Float[np.ndarray, "h w"]:
-    """A Gaussian random field of mean 0 and variance 1 everywhere, with ``nodes`` hills along each axis."""
+    """Gaussian random field of mean 0 and variance 1 everywhere, with ``nodes`` hills along each axis."""
     return _bumps(height, nodes) @ rng.normal(size=(nodes, nodes)) @ _bumps(width, nodes).T
 
 

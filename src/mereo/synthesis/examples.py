@@ -1,4 +1,4 @@
-"""One labelled example: a random state, a random view, labelled query points (paper, section 3.2).
+"""Labelled examples: a random state, a random view, labelled query points (paper, section 3.2).
 
     SegmentedMesh -deform-> -render-> DepthImage -unproject-> PointCloud
                       '---- sample and label query points ---> LabelledPoints
@@ -28,12 +28,12 @@ from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.query_sampling import Samples, sample_queries
 
 ATTEMPTS = 100
-"""Views drawn before giving up on a scene."""
+"""Number of views drawn before giving up on a scene."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A random state seen by a random camera.
+    """Random state of a scene, seen by a random camera.
 
     Attributes:
         mesh: the deformed segments in the CAMERA frame, in scene units.
@@ -56,8 +56,8 @@ class LabelledPoints:
         positions, labels: where, and which segment (0 is empty space).
         distances: signed, to the nearest segment surface, negative inside any segment.
         directions: unit vector to that surface.
-        rest: rest coordinates (``rest_pose``) of inside points; NaN outside, and where the deformation could not be
-            inverted.
+        rest: rest coordinates (``scenes.rest_pose``) of inside points; NaN outside, and where the deformation could
+            not be inverted.
     """
 
     positions: Float[np.ndarray, "q 3"]
@@ -69,7 +69,7 @@ class LabelledPoints:
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """What a network learns from.
+    """Observed cloud with labelled queries: what a network learns from.
 
     Attributes:
         cloud: observed points, normalized, in farthest-point order.
@@ -83,7 +83,7 @@ class Example:
 
 
 def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> Example:
-    """One training example: a random state, seen and noisy, and query points with their answers.
+    """Training example: a random state, seen and noisy, and query points with their answers.
 
     Raises:
         ValueError: no random view sees the object, or a segment cannot be sampled (``query_sampling``).
@@ -101,8 +101,9 @@ def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator)
 
 
 def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> View:
-    """A random state seen by a random camera; both are drawn again while fewer than ``MIN_POINTS`` points of the object
-    are seen.
+    """Random state of a scene, seen by a random camera.
+
+    Both are drawn again while fewer than ``MIN_POINTS`` points of the object are seen.
 
     Raises ``ValueError`` naming the scene after ``ATTEMPTS`` such views.
     """
@@ -110,7 +111,7 @@ def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator
 
 
 def _sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> tuple[View, Solids]:
-    """The view, and the search structures on its mesh that rendering has built."""
+    """View of a random state, and the search structures on its mesh that rendering has built."""
     camera = Camera.from_fov(settings.image_size, settings.image_size, scene.workspace.fov_rad)
     for _ in range(ATTEMPTS):
         state = scene.sample_state(rng)
@@ -128,7 +129,7 @@ def _sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generato
 
 
 def label_queries(scene: Scene, view: View, solids: Solids, samples: Samples, normalizer: Normalizer) -> LabelledPoints:
-    """Distances, directions and rest coordinates of sampled points, normalized."""
+    """Labels, distances, directions and rest coordinates of sampled points, normalized."""
     nearest = solids.nearest(samples.points)
     distance, direction = signed_distance_and_direction(solids, samples.points, samples.labels, nearest)
     return LabelledPoints(
@@ -141,7 +142,7 @@ def label_queries(scene: Scene, view: View, solids: Solids, samples: Samples, no
 
 
 def rest_coordinates(scene: Scene, view: View, samples: Samples, nearest: Nearest) -> Float[np.ndarray, "q 3"]:
-    """Where inside points were before the deformation, normalized by the joint rest box; NaN for the others."""
+    """Rest coordinates of points inside segments, normalized by the joint rest box; NaN for the others."""
     inside = np.flatnonzero(samples.labels)
     world = transform_points(view.T_world_camera, samples.points[inside])
     guess = _rest_guess(scene.rest, view.mesh, samples.points[inside], nearest.point[inside], nearest.face[inside])

@@ -1,4 +1,4 @@
-"""What a sampler asks of an object, and who owns a point that several of its segments hold.
+"""Rules of who owns a point that several segments hold, and what a sampler asks of an object.
 
 Where segments overlap, the first one owns the point (``Shape.label``): nested ones are declared, and the inner one
 comes first. ``owner_labels`` is the rule of the authors' later work, which needs no declaration.
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 @runtime_checkable
 class Shape(Protocol):
-    """What a sampler asks of an object; ``solid.Solids`` and the polygons of ``examples/sampling_2d.py`` satisfy it.
+    """Questions that a sampler asks of an object; ``geometry.solids.Solids`` answers them, as do polygons.
 
     Points are [n, d] in the object's frame, distances are in its units.
     """
@@ -27,17 +27,17 @@ class Shape(Protocol):
         """Lower and upper corner of each segment's axis-aligned box."""
 
     def label(self, points: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, " n"]:
-        """0 in empty space, else index + 1 of the segment that holds the point; the first one where two overlap."""
+        """Label of each point: 0 in empty space, else index + 1 of the first segment that holds it."""
 
     def inside(self, index: int, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         """Whether each point lies in segment ``index``."""
 
     def segment_distance(self, index: int, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        """Unsigned distance to segment ``index``'s surface."""
+        """Unsigned distance of each point to the surface of segment ``index``."""
 
 
 def owner_labels(shape: Shape, points: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, " n"]:
-    """Labels where solids may overlap, an organ inside an organ: the segment whose surface is nearest owns the point.
+    """Label of each point where solids may overlap, an organ inside an organ: the nearest surface's segment owns it.
 
     Only segments that hold the point compete. The nearest surface of all may belong to one that does not: just outside
     the innermost of three nested balls, it is the innermost ball's. Where one segment lies wholly inside another this

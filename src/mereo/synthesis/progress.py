@@ -1,4 +1,4 @@
-"""How far a long piece of work has come: a bar on a terminal, a line now and then elsewhere."""
+"""Progress of a long piece of work: a bar on a terminal, a line now and then elsewhere."""
 
 import sys
 import time
@@ -12,7 +12,10 @@ SECONDS_BETWEEN_LINES = 10.0
 
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[int], None]]:
-    """Yields a function that takes the number of new examples; a bar on a terminal, a line now and then elsewhere."""
+    """Context that shows progress: yields a function that takes the number of new examples.
+
+    It draws a bar on a terminal, and prints a line now and then elsewhere.
+    """
     bar = Progress(BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), transient=True)
     task = bar.add_task("", total=total)
     terminal, done = sys.stdout.isatty(), 0
@@ -35,6 +38,7 @@ def progress(total: int) -> Iterator[Callable[[int], None]]:
 
 
 def _duration(seconds: float) -> str:
+    """Seconds in words."""
     minutes = round(seconds / 60)
     if seconds < 90:
         return f"{seconds:.0f} s"

@@ -1,4 +1,4 @@
-"""Where training queries are drawn: the paper's samplers, in any dimension (Henrich et al., WACV 2024, section 3.2).
+"""Samplers of training queries, the paper's, in any dimension (Henrich et al., WACV 2024, section 3.2).
 
 Notation: k is the number of points kept on each side of a segment's surface, n >= k the number drawn on each side
 before the k nearest are kept. "Inside" means in this segment; "empty" means in no segment.
@@ -19,7 +19,7 @@ from mereo.synthesis.config import SamplingConfig
 from mereo.synthesis.label_rules import Shape, owner_labels
 
 MAX_DRAWS = 2_000_000
-"""Draws for one segment after which sampling gives up: its share of its box is too small to be sampled from."""
+"""Number of draws for one segment after which sampling gives up: its share of its box is too small for it."""
 
 _FIRST_BATCH = 8
 """The first batch draws this many times n; a segment usually fills a tenth to a quarter of its extended box."""
@@ -39,14 +39,14 @@ Label = Callable[[Float[np.ndarray, "n d"]], UInt8[np.ndarray, " n"]]
 
 
 def extended_boxes(shape: Shape, margin: float = 0.5) -> Boxes:
-    """Each segment's box, extended by ``margin`` of its size, half on each side (the paper: 50 %)."""
+    """Box of each segment, extended by ``margin`` of its size, half on each side (the paper: 50 %)."""
     boxes = shape.boxes()
     reach = (boxes[:, 1] - boxes[:, 0]) * margin / 2
     return np.stack([boxes[:, 0] - reach, boxes[:, 1] + reach], axis=1)
 
 
 def joint_box(shape: Shape) -> Float[np.ndarray, "2 d"]:
-    """The box of all segments together, not extended.
+    """Box of all segments together, not extended.
 
     The paper's "joint boundaries of all segments", read as its evaluation's "joint bounding box of all objects".
     """
@@ -55,7 +55,7 @@ def joint_box(shape: Shape) -> Float[np.ndarray, "2 d"]:
 
 
 def volume_uniform(shape: Shape, count: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
-    """Volume Uniform: ``count`` points per segment, uniform in its draw box, whatever they hit.
+    """Volume Uniform samples: ``count`` points per segment, uniform in its draw box, whatever they hit.
 
     ``boxes`` [s, 2, d] are the draw boxes; by default ``extended_boxes(shape)``.
     """
@@ -65,7 +65,7 @@ def volume_uniform(shape: Shape, count: int, rng: np.random.Generator, boxes: Bo
 
 
 def label_uniform(shape: Shape, keep: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
-    """Label Uniform: per segment, ``keep`` points uniform inside it and ``keep`` uniform outside it in its draw box.
+    """Label Uniform samples: per segment, ``keep`` points uniform inside it and ``keep`` outside it in its draw box.
 
     Points outside may lie in other segments and carry their labels. Raises ``ValueError`` as ``sort_sample``.
     """
@@ -105,7 +105,7 @@ def nested_sort_sample(
 
 
 def sample_queries(shape: Shape, settings: SamplingConfig, rng: np.random.Generator) -> Samples:
-    """The queries of one example: ``settings.sampler``, then uniform points in ``joint_box`` (paper, section 3.2).
+    """Queries of one example: ``settings.sampler``'s, then uniform points in ``joint_box`` (paper, section 3.2).
 
     Returns:
         ``settings.total(shape.count)`` points.
@@ -129,7 +129,7 @@ def sample_queries(shape: Shape, settings: SamplingConfig, rng: np.random.Genera
 
 
 def check_settings(settings: SamplingConfig) -> None:
-    """Raise ``ValueError`` naming the setting, its rule and the cure."""
+    """Raise ``ValueError`` for sampling settings out of their range, naming the setting, its rule and the cure."""
     if settings.per_segment < 2 or settings.per_segment % 2:
         raise ValueError(
             f"per_segment is {settings.per_segment}; half the points go inside and half outside: pass an even number"
@@ -222,6 +222,7 @@ def _outside(shape: Shape, others: bool) -> Bool[np.ndarray, "s c"]:
 def _sort(
     shape: Shape, keep: int, draw: int, label: Label, others: bool, rng: np.random.Generator, boxes: Boxes | None
 ) -> Samples:
+    """Samples with the ``keep`` points on each side of every segment that are nearest to its surface."""
     if not 1 <= keep <= draw:
         raise ValueError(f"keep is {keep} and draw is {draw}; at least as many are drawn as kept: pass keep <= draw")
     sides = []

@@ -1,4 +1,4 @@
-"""Many examples on disk: shards of 64, each written whole or not at all, the same bits for any number of workers.
+"""Datasets on disk: shards of 64 examples, each written whole or not at all, the same bits for any number of workers.
 
 Example i comes from (seed, i) alone. A dataset is a directory with ``manifest.json``, everything needed to make it
 again, and ``shard-00000.safetensors`` and so on, whose tensors are (e examples, p stored points, q queries):
@@ -6,7 +6,7 @@ again, and ``shard-00000.safetensors`` and so on, whose tensors are (e examples,
     cloud f32 [e, p, 3], cloud_count i32 [e], center f64 [e, 3], scale f64 [e],
     positions f32 [e, q, 3], labels u8 [e, q], distances f32 [e, q], directions f16 [e, q, 3], rest f16 [e, q, 3]
 
-and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``rest_pose``).
+and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``scenes.rest_pose``).
 
 Workers only compute; this process alone writes. So one place meets a full disk, and whatever kills a worker leaves
 nothing half-written.
@@ -27,7 +27,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from mereo.io.atomic_files import atomic_file, write_json
+from mereo.io.atomic_files import atomic_file, claim_directory
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.rest_pose import rest_distances
 from mereo.scenes.scene import Scene
@@ -42,7 +42,7 @@ from mereo.synthesis.workers import in_processes
 SHARD_SIZE = 64
 MANIFEST = "manifest.json"
 LIBRARIES = ("numpy", "scipy", "embreex", "libigl", "manifold3d", "trimesh")
-"""Their versions are in the manifest: others may move last bits, but make no other dataset."""
+"""Libraries whose versions are in the manifest: others may move last bits, but make no other dataset."""
 
 NOT_COMPARED = ("libraries", "bytes")
 """Manifest entries that may differ when a dataset is resumed."""
@@ -97,11 +97,14 @@ def generate(
         scene: a built-in scene's name, a scene file, or a scene (which workers must be able to unpickle).
         output: created; with ``resume`` its complete shards are kept and the missing ones made.
         settings: how one example is made.
+        examples: how many, in all shards together.
         seed: seeds from ``TEST_SEED_START`` up are for testing and need ``test``, which refuses smaller ones.
         workers: processes; the files do not depend on their number. More than one needs a main module that can be
             imported (``if __name__ == "__main__":``).
         shard: ``(i, n)`` makes every n-th file from the i-th on, to share the work between machines; they may all
             write to one directory.
+        resume: go on with a dataset of the same settings that is there; without it that is an error.
+        test: make a test set, whose seed training refuses.
 
     Raises:
         ValueError: a number or setting out of its range, a seed of the wrong kind, ``resume`` with other settings.
@@ -117,7 +120,7 @@ def generate(
         _Shard(output / f"shard-{n:05d}.safetensors", n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
         for n in range(shard[0], -(-examples // SHARD_SIZE), shard[1])
     ]
-    _claim_directory(output, manifest, shards, resume, alone=shard[1] == 1)
+    _claim(output, manifest, shards, resume, alone=shard[1] == 1)
     if not (output / TEMPLATE).exists():
         with atomic_file(output / TEMPLATE) as temporary:
             temporary.write_bytes(save({"distance": rest_distances(loaded.rest)}))
@@ -156,7 +159,7 @@ def _check_request(examples: int, seed: int, workers: int, shard: tuple[int, int
 
 
 def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: int) -> dict[str, Any]:
-    """Everything that decides the dataset, and what training needs to know of the scene, as JSON values."""
+    """Manifest of a dataset as JSON values: all that decides it, and what training needs to know of the scene."""
     digest = hashlib.sha256()
     for segment in scene.rest.segments:
         for array, dtype in ((segment.vertices, "<f8"), (segment.faces, "<i8")):
@@ -184,45 +187,33 @@ def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: i
 
 
 def example_bytes(settings: GenerateConfig, segments: int) -> int:
-    """Size of one example, on disk and in memory."""
+    """Size of one example in bytes, on disk and in memory."""
     per_point, per_query, once = 12, 12 + 1 + 4 + 6 + 6, 4 + 24 + 8
     return per_point * settings.points + per_query * settings.sampling.total(segments) + once
 
 
-def _claim_directory(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> None:
+def _claim(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> None:
     """Create the directory with its manifest, or check that it is this very dataset; other machines' shards may come.
 
     What a killed run was writing is removed, of this part's shards only.
     """
-    path = output / MANIFEST
-    if output.exists() and not output.is_dir():
-        raise FileExistsError(f"{output} is a file; a dataset is a directory: choose another --output")
-    if path.is_file():
+    before = claim_directory(output, MANIFEST, manifest, "a dataset")
+    if before is not None:
         if not resume and (alone or any(item.path.exists() for item in shards)):
             raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
-        _check_same(path, manifest)
-    elif output.is_dir() and any(not file.name.startswith(".") for file in output.iterdir()):
-        raise FileExistsError(f"{output} is not empty and holds no {MANIFEST}; choose another --output")
-    else:
-        write_json(path, manifest)
+        _check_same(output, before, manifest)
     for item in shards:
         for leftover in output.glob(f".{item.path.stem}.*.partial*"):
             leftover.unlink(missing_ok=True)
 
 
-def _check_same(path: Path, manifest: dict[str, Any]) -> None:
-    try:
-        before = json.loads(path.read_text("utf-8"))
-    except ValueError:
-        before = None
-    if not isinstance(before, dict):
-        raise ValueError(f"{path} is not a manifest; it cannot be resumed: choose another --output")
+def _check_same(output: Path, before: dict[str, Any], manifest: dict[str, Any]) -> None:
     # a manifest of an older version may not state everything; settings it lacks were as their defaults are
     before = _flat({"settings": asdict(GenerateConfig())}) | _flat(before)
     for key, now in _flat(manifest).items():
         if before.get(key, now) != now:
             raise ValueError(
-                f"{path.parent} was made with {key} = {before[key]!r}, not {now!r}; resuming needs equal settings: "
+                f"{output} was made with {key} = {before[key]!r}, not {now!r}; resuming needs equal settings: "
                 "use them, or choose another --output"
             )
 
@@ -240,7 +231,7 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _make_shard(work: _Work, shard: _Shard, cancelled: Callable[[], bool]) -> bytes:
-    """The shard's file content; nothing when cancelled, which is asked before every example."""
+    """Content of the shard's file; nothing when cancelled, which is asked before every example."""
     loaded = load_scene(work.scene) if isinstance(work.scene, str) else work.scene
     scene = loaded.for_seed(work.seed)
     rows = []
@@ -252,7 +243,7 @@ def _make_shard(work: _Work, shard: _Shard, cancelled: Callable[[], bool]) -> by
 
 
 def pack(example: Example, points: int) -> dict[str, np.ndarray]:
-    """One row of each tensor of a shard; clouds with fewer points repeat theirs from the front."""
+    """Row of each tensor of a shard for one example; clouds with fewer points repeat theirs from the front."""
     count, queries = len(example.cloud), example.queries
     return {
         "cloud": example.cloud[np.arange(points) % count].astype(np.float32),

@@ -1,4 +1,4 @@
-"""A function applied to many items in several processes that stop at once when asked to, whoever asks.
+"""Work in several processes that stop at once when asked to, whoever asks: a function applied to many items.
 
 Ctrl-C, an error in the consumer, a killed worker, a killed parent: in every case no process is left behind.
 """
@@ -29,7 +29,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 def in_processes(
     function: Function[Item, Result], items: Sequence[Item], workers: int
 ) -> Generator[tuple[Item, Result], None, None]:
-    """Apply ``function`` to every item; yields each with its result as it is finished, in any order.
+    """Apply ``function`` to every item in several processes; yields each item with its result, in any order.
 
     With one worker, or one item, everything happens in this process, in order. Close the generator to stop early.
 

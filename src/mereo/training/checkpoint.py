@@ -15,7 +15,7 @@ NAME = "checkpoint.safetensors"
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """The objects whose state makes a run resumable; loading fills them in place."""
+    """Objects whose state makes a run resumable; loading fills them in place."""
 
     step: int
     network: nn.Module
@@ -24,7 +24,7 @@ class Checkpoint:
 
 
 def save_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> None:
-    """Write atomically, so that a killed run keeps its previous checkpoint."""
+    """Write a checkpoint atomically, so that a killed run keeps its previous one."""
     tensors: dict[str, Tensor] = {}
     for prefix, module in (("network", checkpoint.network), ("average", checkpoint.average)):
         tensors |= {f"{prefix}/{name}": value.contiguous() for name, value in module.state_dict().items()}

@@ -1,19 +1,19 @@
-"""Settings of training, and the presets; light, so that the command line may import them.
+"""Settings of a training: recipe, augmentation, and the presets as one table.
+
+Light, so that the command line may import them.
 
 Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise.
 """
 
-from dataclasses import dataclass, field, replace
-from typing import Literal, TypedDict
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, get_args
 
-from mereo.models.config import NetworkConfig, Precision
-
-Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
+from mereo.models.config import Loss, NetworkConfig, Precision, Supervision
 
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """Changes made to each training cloud as it is read; all off in the paper's recipe.
+    """Settings of the changes made to each training cloud as it is read; all off in the paper's recipe.
 
     Attributes:
         keep_points: each point survives with a probability drawn from this range.
@@ -32,7 +32,7 @@ class AugmentConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """The training recipe; defaults are the paper's.
+    """Settings of a training, its recipe; defaults are the paper's.
 
     Attributes:
         network: the architecture.
@@ -79,93 +79,80 @@ class TrainConfig:
     compile: Literal["auto", "on", "off"] = "auto"
     seed: int = 0
 
+    @property
+    def supervision(self) -> Supervision:
+        """Supervision by the loss."""
+        return Supervision.of(self.loss)
 
-_MODERN = AugmentConfig(keep_points=(0.5, 1.0), hole_probability=0.4, jitter_std=0.005, roll=True)
+    def to_dict(self) -> dict[str, Any]:
+        """All settings as files hold them: the network's side by side, without its parts."""
+        return asdict(self) | {"network": self.network.to_dict()}
 
-_HALF = NetworkConfig(
-    neighbors=24,
-    ratio1=0.25,
-    mlp1=(32, 32, 64),
-    mlp2=(64, 64, 128),
-    mlp_global=(128, 256, 512),
-    width=256,
-    local_neighbors=6,
-    local_width=64,
-    sight_neighbors=4,
-    align_points=256,
-    rest_template=True,
-)
-
-
-class _Recipe(TypedDict):
-    loss: Loss
-    l1_weight: float
-    queries: int
-    learning_rate: float
-    weight_decay: float
-    schedule: Literal["constant", "cosine"]
-    warmup: float
-    clip_norm: float
-    ema_decay: float
-    augment: AugmentConfig
-    offset_examples: int
-
-
-_MODERN_RECIPE = _Recipe(
-    loss="ce+l1+cd",
-    l1_weight=10.0,
-    queries=384,
-    learning_rate=2e-3,
-    weight_decay=0.01,
-    schedule="cosine",
-    warmup=0.05,
-    clip_norm=1.0,
-    ema_decay=0.999,
-    augment=_MODERN,
-    offset_examples=1000,
-)
 
 PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
+"""Recipes to start from.
 
-PRESETS: dict[str, TrainConfig] = {
-    # as published
-    "paper": TrainConfig(),
-    # the same for the autodecoder, whose hyperparameters the paper lists apart (appendix B)
-    "paper-autodecoder": TrainConfig(network=NetworkConfig(encoder="autodecoder", dropout=0.2), batch=64, epochs=1000),
-    # what to train for real, also on a CPU: the paper's network at half its widths, local features at the query, a
-    # modern schedule, and many small steps (docs/design/0002-learning.md)
-    "base": replace(TrainConfig(network=_HALF, batch=6, epochs=10, **_MODERN_RECIPE), learning_rate=3e-3),
-    # the same with the paper's widths and larger steps, for a GPU
-    "large": TrainConfig(
-        network=NetworkConfig(
-            points=1024, neighbors=32, local_neighbors=6, sight_neighbors=4, align_points=256, rest_template=True
-        ),
-        epochs=100,
-        **_MODERN_RECIPE,
-    ),
-    # two minutes on two CPU cores: for tests and for a first look at one's own object
-    "tiny": replace(
-        TrainConfig(
-            network=NetworkConfig(
-                points=256,
-                neighbors=16,
-                mlp1=(32, 32, 64),
-                mlp2=(64, 64, 128),
-                mlp_global=(128, 256),
-                width=128,
-                local_neighbors=4,
-                local_width=64,
-                sight_neighbors=4,
-                align_points=128,
-                rest_template=True,
-            ),
-            batch=32,
-            epochs=10,
-            holdout=32,
-            **_MODERN_RECIPE,
-        ),
-        queries=256,
-        learning_rate=4e-3,
-        ema_decay=0.99,
-    ),
+    paper              as published
+    paper-autodecoder  the same for the autodecoder, whose hyperparameters the paper lists apart (appendix B)
+    base               what to train for real, also on a CPU: the paper's network at half its widths, local features at
+                       the query, a modern schedule, and many small steps (docs/design/0002-learning.md)
+    large              the same with the paper's widths and larger steps, for a GPU
+    tiny               two minutes on two CPU cores: for tests and for a first look at one's own object
+"""
+
+Table = dict[str, tuple[Any, ...]]
+"""Settings with one value for each preset; what no table names is at its default everywhere."""
+
+# fmt: off
+_NETWORK: Table = {
+    #                    paper             paper-autodecoder base              large             tiny
+    "encoder":          ("pointnet2",      "autodecoder",    "pointnet2",      "pointnet2",      "pointnet2"),
+    "points":           (1024,             1024,             1024,             1024,             256),
+    "neighbors":        (64,               64,               24,               32,               16),
+    "ratio1":           (0.5,              0.5,              0.25,             0.5,              0.5),
+    "mlp1":             ((64, 64, 128),    (64, 64, 128),    (32, 32, 64),     (64, 64, 128),    (32, 32, 64)),
+    "mlp2":             ((128, 128, 256),  (128, 128, 256),  (64, 64, 128),    (128, 128, 256),  (64, 64, 128)),
+    "mlp_global":       ((256, 512, 1024), (256, 512, 1024), (128, 256, 512),  (256, 512, 1024), (128, 256)),
+    "width":            (512,              512,              256,              512,              128),
+    "dropout":          (0.0,              0.2,              0.0,              0.0,              0.0),
+    "local_neighbors":  (0,                0,                6,                6,                4),
+    "local_width":      (128,              128,              64,               128,              64),
+    "sight_neighbors":  (0,                0,                4,                4,                4),
+    "align_points":     (0,                0,                256,              256,              128),
+    "rest_template":    (False,            False,            True,             True,             True),
 }
+_RECIPE: Table = {
+    #                    paper             paper-autodecoder base              large             tiny
+    "loss":             ("ce+l1",          "ce+l1",          "ce+l1+cd",       "ce+l1+cd",       "ce+l1+cd"),
+    "l1_weight":        (100.0,            100.0,            10.0,             10.0,             10.0),
+    "batch":            (40,               64,               6,                40,               32),
+    "queries":          (0,                0,                384,              384,              256),
+    "epochs":           (300.0,            1000,             10,               100,              10),
+    "learning_rate":    (5e-4,             5e-4,             3e-3,             2e-3,             4e-3),
+    "weight_decay":     (0.0,              0.0,              0.01,             0.01,             0.01),
+    "schedule":         ("constant",       "constant",       "cosine",         "cosine",         "cosine"),
+    "warmup":           (0.0,              0.0,              0.05,             0.05,             0.05),
+    "clip_norm":        (0.0,              0.0,              1.0,              1.0,              1.0),
+    "ema_decay":        (0.0,              0.0,              0.999,            0.999,            0.99),
+    "offset_examples":  (0,                0,                1000,             1000,             1000),
+    "holdout":          (128,              128,              128,              128,              32),
+}
+_AUGMENT: Table = {
+    #                    paper             paper-autodecoder base              large             tiny
+    "keep_points":      ((1.0, 1.0),       (1.0, 1.0),       (0.5, 1.0),       (0.5, 1.0),       (0.5, 1.0)),
+    "hole_probability": (0.0,              0.0,              0.4,              0.4,              0.4),
+    "jitter_std":       (0.0,              0.0,              0.005,            0.005,            0.005),
+    "roll":             (False,            False,            True,             True,             True),
+}
+# fmt: on
+
+
+def _preset(column: int) -> TrainConfig:
+    """The recipe of one column."""
+    network, recipe, augment = (
+        {name: values[column] for name, values in table.items()} for table in (_NETWORK, _RECIPE, _AUGMENT)
+    )
+    return TrainConfig(network=NetworkConfig.from_dict(network), augment=AugmentConfig(**augment), **recipe)
+
+
+PRESETS: dict[str, TrainConfig] = {name: _preset(column) for column, name in enumerate(get_args(PresetName))}

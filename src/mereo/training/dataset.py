@@ -21,10 +21,10 @@ from mereo.training.config import AugmentConfig
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What one training step reads; all normalized by the (augmented) cloud.
+    """Examples that one training step reads, normalized by the (augmented) cloud.
 
-    ``index`` says which of the dataset's examples they are; ``rest`` are rest-pose coordinates
-    (``synthesis.LabelledPoints``), NaN outside.
+    ``index`` says which of the dataset's examples they are; ``rest`` are rest coordinates
+    (``synthesis.examples.LabelledPoints``), NaN outside.
     """
 
     index: Int[Tensor, " b"]
@@ -39,13 +39,13 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """All examples of a directory written by ``mereo generate``.
+    """Examples of a directory written by ``mereo generate``, all of them in memory.
 
     Attributes:
         cloud: observed points in farthest-point order; only the first ``count`` of each are real.
         viewpoint: the camera's position in normalized coordinates.
         manifest: how the dataset was made.
-        template: signed distances to the segments at rest (``rest_pose.rest_distances``); None in older datasets.
+        template: signed distances to the segments at rest (``scenes.rest_pose``); None in older datasets.
         visible_m: least and greatest longest side of the visible part's box in metres; None where the unit is unknown.
     """
 
@@ -66,7 +66,7 @@ class Dataset:
 
     @classmethod
     def load(cls, directory: Path, device: torch.device | str = "cpu") -> "Dataset":
-        """Read every shard; ``ValueError`` or ``FileNotFoundError`` when the directory is not a whole dataset."""
+        """Dataset of a directory; ``ValueError`` or ``FileNotFoundError`` when that is not a whole dataset."""
         manifest = read_manifest(directory)
         shards = sorted(directory.glob("shard-*.safetensors"))
         parts = [_read_shard(path) for path in shards]
@@ -93,7 +93,7 @@ class Dataset:
 
     @property
     def uniform_queries(self) -> int:
-        """How many queries of an example, its last ones, are uniform in the joint box."""
+        """Number of queries of an example, its last ones, that are uniform in the joint box."""
         near: int = self.manifest["settings"]["sampling"]["per_segment"] * len(self.manifest["segments"])
         return self.positions.shape[1] - near
 
@@ -116,7 +116,7 @@ class Dataset:
         augment: AugmentConfig,
         rng: torch.Generator,
     ) -> Batch:
-        """Examples ``index`` with ``points`` cloud points and a random ``queries`` of their queries (0: all).
+        """Batch of the examples ``index``: ``points`` cloud points, a random ``queries`` of their queries (0: all).
 
         The random numbers come from ``rng`` (on the CPU), so a batch depends on nothing else.
         """
@@ -145,7 +145,7 @@ class Dataset:
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
-    """The dataset's manifest; one sentence on what is wrong otherwise."""
+    """Manifest of a dataset; ``FileNotFoundError`` or ``ValueError`` with one sentence on what is wrong otherwise."""
     path = directory / "manifest.json"
     if not path.is_file():
         raise FileNotFoundError(f"{directory} has no manifest.json; a dataset is a directory made by mereo generate")
@@ -164,7 +164,7 @@ def _read_shard(path: Path) -> dict[str, Tensor]:
 
 
 def _visible_m(scale: Float[Tensor, " e"], unit_m: float | None) -> tuple[float, float] | None:
-    """From the normalizers' scales, which are one over half the longest side."""
+    """Least and greatest visible size, from the normalizers' scales, which are one over half the longest side."""
     return None if unit_m is None else (2 * unit_m / float(scale.max()), 2 * unit_m / float(scale.min()))
 
 
@@ -180,7 +180,7 @@ def choose_points(
     augment: AugmentConfig,
     rng: torch.Generator,
 ) -> Float[Tensor, "b n 3"]:
-    """The first ``points`` real points of each cloud that survive dropping, repeated from the front where too few.
+    """First ``points`` real points of each cloud that survive dropping, repeated from the front where too few.
 
     What remains of a farthest-point order is still in order, and nearly a farthest-point order of what remains.
     """
@@ -206,7 +206,7 @@ def choose_points(
 
 
 def augment_batch(batch: Batch, augment: AugmentConfig, rng: torch.Generator) -> Batch:
-    """Jitter along the view, roll about the optical axis, and normalize again by the changed cloud.
+    """Batch with jitter along the view and a roll about the optical axis, normalized again by the changed cloud.
 
     The optical axis passes through the viewpoint, so rolling about it is a rotation about z around the viewpoint.
     """

@@ -1,12 +1,12 @@
-"""The paper's losses (section 3.1, equation 1) and their ablations."""
+"""Losses of the paper (section 3.1, equation 1) and their ablations."""
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mereo.models.config import Supervision
 from mereo.models.decoder import Prediction
-from mereo.training.config import Loss
 
 
 def occupancy_loss(
@@ -14,19 +14,19 @@ def occupancy_loss(
     labels: Int[Tensor, "b q"],
     distances: Float[Tensor, "b q"],
     directions: Float[Tensor, "b q 3"],
-    loss: Loss,
+    supervision: Supervision,
     l1_weight: float,
 ) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
-    """``CE + l1_weight * L1 - mean cosine``, or the terms that ``loss`` names; also each term by name.
+    """Loss ``CE + l1_weight * L1 - mean cosine`` of the terms that ``supervision`` asks for; also each term by name.
 
     Distances are signed and normalized, directions unit vectors to the nearest surface in the camera frame.
     """
     terms: dict[str, Float[Tensor, ""]] = {}
-    if "ce" in loss:
+    if supervision.labels:
         terms["ce"] = F.cross_entropy(prediction.logits.flatten(0, 1), labels.flatten())
-    if "l1" in loss:
+    if supervision.distances:
         terms["l1"] = F.l1_loss(prediction.distance, distances)
-    if "cd" in loss:
+    if supervision.directions:
         terms["cd"] = -F.cosine_similarity(prediction.direction, directions, dim=-1).mean()
     weights = {"ce": 1.0, "l1": l1_weight, "cd": 1.0}
     total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()

@@ -1,4 +1,4 @@
-"""The record of a training run: metrics.csv, curves.png, and TensorBoard events where the extra is installed."""
+"""Record of a training run: metrics.csv, curves.png, and TensorBoard events where the extra is installed."""
 
 import csv
 import io
@@ -13,7 +13,7 @@ Row = dict[str, float]
 
 
 class MetricsLog:
-    """One row per step in memory; ``write`` puts all of them on disk.
+    """Record of a training run: one row per step in memory; ``write`` puts all of them on disk.
 
     Rows up to the checkpoint are read back when a run continues, so the file equals that of an uninterrupted run.
     """
@@ -24,11 +24,11 @@ class MetricsLog:
         self.board = _tensorboard(run_dir)
 
     def add_step(self, step: int, rate: float, losses: dict[str, float]) -> None:
-        """``losses`` are the total under "loss" and its terms."""
+        """Add the row of a step; ``losses`` are the total under "loss" and its terms."""
         self._add({"step": step, "rate": rate, **losses})
 
     def add_validation(self, step: int, iou: float, miou: float) -> None:
-        """Validation of the state after ``step``: joins the row of that step. An undefined mIoU (NaN) is left out."""
+        """Add scores of the state after ``step`` to the row of that step; an undefined mIoU (NaN) is left out."""
         scores = {name: value for name, value in (("val_iou", iou), ("val_miou", miou)) if not math.isnan(value)}
         self.rows[-1] |= scores
         self._to_board({"step": step, **scores})
@@ -43,12 +43,12 @@ class MetricsLog:
                 self.board.add_scalar(name, value, int(row["step"]))
 
     def summary(self) -> str:
-        """The latest numbers in one line."""
+        """Latest numbers in one line."""
         shown = {k: v for k, v in self.rows[-1].items() if k not in ("step", "rate")}
         return "  ".join(f"{name} {value:.4f}" for name, value in shown.items())
 
     def write(self) -> None:
-        """metrics.csv and curves.png, each atomically."""
+        """Write metrics.csv and curves.png, each atomically."""
         text = io.StringIO()
         writer = csv.DictWriter(text, FIELDS, restval="", lineterminator="\n")
         writer.writeheader()
@@ -82,7 +82,7 @@ def _tensorboard(run_dir: Path) -> Any:
 
 
 def draw_curves(rows: list[Row], path: Path) -> None:
-    """Loss terms (running median, logarithmic) and validation scores against the step."""
+    """Draw loss terms (running median, logarithmic) and validation scores against the step."""
     import matplotlib
 
     matplotlib.use("Agg")

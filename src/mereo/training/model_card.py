@@ -1,4 +1,4 @@
-"""``mereo release``: weights to hand on, at half the size, with a card that says what they know and how well.
+"""Released weights, at half the size, with a card that says what they know and how well (``mereo release``).
 
 The card follows Mitchell et al., "Model cards for model reporting" (FAT* 2019), as far as it can be written from what
 the weights and their tests say themselves.
@@ -6,7 +6,7 @@ the weights and their tests say themselves.
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,8 @@ import torch
 
 from mereo.evaluation.metrics import format_score
 from mereo.io.atomic_files import new_directory
+from mereo.models.config import NetworkConfig
 from mereo.models.model import Model
-from mereo.models.network import config_from_dict
 from mereo.models.weights import load_model, save_model
 from mereo.training.config import PRESETS
 
@@ -53,7 +53,7 @@ def release(
 
 
 def card(name: str, model: Model, tests: Sequence[dict[str, Any]], content: bytes) -> str:
-    """The model card as Markdown; ``content`` is the weights' file."""
+    """Model card as Markdown; ``content`` is the weights' file."""
     size, digest = f"{len(content) / 2**20:.1f} MB", sha256(content).hexdigest()
     parts = [
         f"# {name}\n",
@@ -79,8 +79,9 @@ def _object(model: Model) -> str:
     sizes = provenance.get("visible_m")
     if isinstance(sizes, list | tuple):
         lines.append(f"- longest side of the visible part in training: {sizes[0]:.3g} to {sizes[1]:.3g} m")
-    answers = {"ce": "labels", "l1": "signed distances", "cd": "directions"}
-    known = [word for term, word in answers.items() if term in model.loss.split("+")]
+    taught = model.supervision
+    answers = {"labels": taught.labels, "signed distances": taught.distances, "directions": taught.directions}
+    known = [answer for answer, is_taught in answers.items() if is_taught]
     return "\n".join([*lines, f"- answers: {', '.join(known)}", ""])
 
 
@@ -102,12 +103,11 @@ def _training(provenance: dict[str, object]) -> str:
 
 
 def _nearest_preset(recipe: dict[str, Any]) -> str:
-    """The preset whose network it is, else of which most settings are."""
-
-    network = config_from_dict(recipe["network"])  # what older recipes do not state is at its default
+    """Name of the preset whose network it is, else of which most settings are."""
+    network = NetworkConfig.from_dict(recipe["network"])  # what older recipes do not state is at its default
 
     def agreement(preset: str) -> tuple[bool, int]:
-        known = json.loads(json.dumps(asdict(PRESETS[preset])))
+        known = json.loads(json.dumps(PRESETS[preset].to_dict()))
         return PRESETS[preset].network == network, sum(known[key] == recipe.get(key) for key in known)
 
     return max(PRESETS, key=agreement)

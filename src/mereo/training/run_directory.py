@@ -1,8 +1,8 @@
-"""A training run's processes, settings and directory."""
+"""Processes, settings and directory of a training run."""
 
 import json
 import os
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from mereo.io.atomic_files import write_json
+from mereo.io.atomic_files import claim_directory
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
@@ -22,18 +22,19 @@ from mereo.training.dataset import Dataset
 
 @dataclass(frozen=True)
 class Process:
-    """This process's place among those that train together."""
+    """Place of this process among those that train together."""
 
     rank: int = 0
     world: int = 1
 
     @property
     def is_main(self) -> bool:
+        """Whether this process is the one that writes and prints."""
         return self.rank == 0
 
 
 def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
-    """Settings that the dataset decides: how much can be held out, and whether a roll keeps a view plausible.
+    """Recipe with what the dataset decides: how much can be held out, whether a roll keeps a view plausible.
 
     Raises ``ValueError`` for settings with which an autodecoder cannot be trained.
     """
@@ -45,7 +46,7 @@ def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
 
 
 def _check_autodecoder(config: TrainConfig) -> None:
-    if "l1" not in config.loss:
+    if not config.supervision.distances:
         raise ValueError(
             f"the loss is {config.loss!r}, but an autodecoder finds the code of a cloud by its distances, which only "
             "the L1 term trains; take --loss l1, ce+l1 or ce+l1+cd"
@@ -58,7 +59,7 @@ def _check_autodecoder(config: TrainConfig) -> None:
 
 
 def start_network(config: TrainConfig, data: Dataset) -> Network:
-    """A network to train: random from the seed, or with the weights that ``config.init`` names.
+    """Network to train: random from the seed, or with the weights that ``config.init`` names.
 
     Weights that know other segments give all that is not about segments (docs/design/0002-learning.md). An
     autodecoder gets a random code for each example that is not held out. Raises ``ValueError`` when the weights are of
@@ -88,15 +89,16 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
 
 
 COUNTS = ("points", "neighbors", "ratio1", "ratio2", "local_neighbors", "sight_neighbors", "align_points")
-"""Network settings that say how many points are looked at: weights trained with one number run with another."""
+"""Settings of a network that say how many points are looked at: weights trained with one number run with another."""
 
 
 def _check_architecture(start: NetworkConfig, config: TrainConfig) -> None:
-    """Only the template lookup, which begins as nothing, may be new, and counts differ that both have."""
-    ours = config.network
-    counts = {name: getattr(ours, name) for name in COUNTS if getattr(start, name) and getattr(ours, name)}
-    known = replace(start, rest_template=start.rest_template or ours.rest_template, **counts)
-    odd = [f.name for f in fields(known) if getattr(known, f.name) != getattr(ours, f.name)]
+    """Raise ``ValueError`` where weights differ in more than an added template lookup and counts that both have."""
+    given, ours = start.to_dict(), config.network.to_dict()
+    free = {name for name in COUNTS if given[name] and ours[name]}
+    if ours["rest_template"]:
+        free.add("rest_template")
+    odd = [name for name, value in ours.items() if value != given[name] and name not in free]
     if odd:
         raise ValueError(
             f"the weights {config.init} have another network setting {odd[0]}; continuing needs the same "
@@ -117,7 +119,7 @@ def _without_segments(given: dict[str, Tensor], network: Network) -> dict[str, T
 
 
 def join_processes() -> Process:
-    """Join the group that torchrun started, if any."""
+    """Join the group that torchrun started, if any; returns this process's place."""
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if world == 1:
         return Process()
@@ -138,31 +140,24 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
         )
     if process.is_main:
         dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
-        _claim_directory(run_dir, json.loads(json.dumps({"dataset": dataset, "train": asdict(config)})))
+        _claim(run_dir, json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()})))
     if process.world > 1:
         dist.barrier()
 
 
-def _claim_directory(run_dir: Path, settings: dict[str, Any]) -> None:
-    path = run_dir / "config.json"
-    if path.is_file():
-        before = _with_defaults(json.loads(path.read_text()))
-        if before != settings:
-            odd = _first_difference(before, settings)
-            raise ValueError(
-                f"{run_dir} holds a run with another {odd}; continuing needs equal settings: "
-                "use them, or another --output"
-            )
-    elif run_dir.exists() and any(run_dir.iterdir()):
-        raise FileExistsError(f"{run_dir} exists and is not a training run; choose another --output")
-    else:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        write_json(path, settings)
+def _claim(run_dir: Path, settings: dict[str, Any]) -> None:
+    found = claim_directory(run_dir, "config.json", settings, "a training run")
+    before = settings if found is None else _with_defaults(found)
+    if before != settings:
+        odd = _first_difference(before, settings)
+        raise ValueError(
+            f"{run_dir} holds a run with another {odd}; continuing needs equal settings: use them, or another --output"
+        )
 
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """A run's settings; those that an older mereo did not have are as they were then, which is their default."""
-    default = json.loads(json.dumps(asdict(TrainConfig())))
+    default = json.loads(json.dumps(TrainConfig().to_dict()))
     train = default | settings.get("train", {})
     return settings | {"train": train | {"network": default["network"] | train["network"]}}
 

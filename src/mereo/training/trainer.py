@@ -1,4 +1,4 @@
-"""Training: a plain loop over batches. Running the same command again continues where it stopped.
+"""Loop of training, plain over batches; running the same command again continues where it stopped.
 
 Everything random in step t is drawn from (seed, t), so a resumed run repeats an uninterrupted one exactly. Under
 ``torchrun`` each process takes its share of every batch; process 0 writes.
@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from mereo.models.decoder import Prediction
 from mereo.models.device import compiling_pays, keep_freed_memory, pick_device, pick_precision
 from mereo.models.encoders.autodecoder import CODES, Autodecoder
 from mereo.models.model import Model
@@ -68,7 +66,7 @@ REPORT_EVERY = 20
 
 
 class Trainer:
-    """The mutable state of a run: network, optimizer, averaged weights, step."""
+    """Run of a training, with its mutable state: network, optimizer, averaged weights, step."""
 
     def __init__(
         self,
@@ -98,11 +96,12 @@ class Trainer:
         self.started, self.first_step = time.monotonic(), 0
 
     def say(self, text: str) -> None:
+        """Print a line, in process 0 only."""
         if self.process.is_main:
             print(text, flush=True)
 
     def agree(self, wish: bool) -> bool:
-        """Process 0 decides for all: clocks differ, and validation is collective."""
+        """Wish of process 0, which decides for all: clocks differ, and validation is collective."""
         if self.process.world == 1:
             return wish
         flag = torch.tensor([float(wish)], device=self.device)
@@ -110,7 +109,7 @@ class Trainer:
         return bool(flag.item())
 
     def batches(self) -> Iterator[Batch]:
-        """This process's share of every remaining batch."""
+        """Share of this process in every remaining batch."""
         per_process = self.config.batch // self.process.world
         while self.step < self.total:
             index = self._batch_index(self.step)[self.process.rank * per_process :][:per_process]
@@ -132,7 +131,7 @@ class Trainer:
         return self.orders[number]
 
     def train_step(self, batch: Batch) -> None:
-        """One optimizer step."""
+        """Take one optimizer step."""
         self.network.train()
         part = self._schedule()
         for group in self.optimizer.param_groups:
@@ -152,15 +151,15 @@ class Trainer:
                 self._report_progress()
 
     def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of a batch, and its terms by name for the record."""
         with torch.autocast(self.device.type, self.autocast) if self.autocast else nullcontext():
-            *outputs, coarse = self.module(batch.cloud, batch.viewpoint, batch.positions, batch.index)
-        prediction = Prediction(*outputs)
+            prediction, coarse = self.module(batch.cloud, batch.viewpoint, batch.positions, batch.index)
         loss, terms = occupancy_loss(
             prediction,
             batch.labels,
             batch.distances,
             batch.directions,
-            self.config.loss,
+            self.config.supervision,
             self.config.l1_weight,
         )
         if coarse is not None:
@@ -232,7 +231,7 @@ class Trainer:
             dist.barrier()
 
     def model(self, offsets: Tensor | None = None) -> Model:
-        """The averaged network, class offsets in its last bias, with the header that travels with its weights."""
+        """Model of the averaged network, class offsets in its last bias, with the header of its weights."""
         manifest = self.data.manifest
         network = self.average
         if offsets is not None:
@@ -249,7 +248,7 @@ class Trainer:
             "mereo": manifest["version"],
             "visible_m": self.data.visible_m,
             "class_offsets": None if offsets is None else offsets.tolist(),
-            "recipe": asdict(self.config),
+            "recipe": self.config.to_dict(),
         }
         return Model(
             network=network,
@@ -262,7 +261,7 @@ class Trainer:
         )
 
     def resume(self) -> bool:
-        """Load the checkpoint when there is one."""
+        """Load the checkpoint when there is one; returns whether there was."""
         step = load_checkpoint(self.run_dir, Checkpoint(0, self.network, self.average, self.optimizer))
         if step is None:
             return False

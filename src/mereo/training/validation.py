@@ -1,4 +1,4 @@
-"""What a network in training answers on stored examples: its held-out scores, and class offsets when it is finished.
+"""Answers of a network in training on stored examples: held-out scores, and class offsets when it is finished.
 
 Notation: n points, c classes.
 """
@@ -20,7 +20,7 @@ SEARCHED = 16
 
 
 def held_out(data: Dataset, config: TrainConfig) -> range:
-    """The examples of the validation curve, none of which is trained on."""
+    """Examples of the validation curve, none of which is trained on."""
     first = len(data) - config.holdout
     count = min(config.holdout, SEARCHED) if config.network.encoder == "autodecoder" else config.holdout
     return range(first, first + count)
@@ -29,7 +29,7 @@ def held_out(data: Dataset, config: TrainConfig) -> range:
 @torch.no_grad()
 def validate(network: Network, data: Dataset, config: TrainConfig) -> Scores:
     """IoU and mIoU on the held-out examples' queries (not the paper's grid metric)."""
-    segmented = "ce" in config.loss
+    segmented = config.supervision.labels
     classes = network.segments + 1 if segmented else 2
     total = torch.zeros(classes, classes, dtype=torch.long)
     for batch, logits, distance in _answers(network, data, config, held_out(data, config)):
@@ -41,9 +41,9 @@ def validate(network: Network, data: Dataset, config: TrainConfig) -> Scores:
 
 @torch.no_grad()
 def choose_offsets(network: Network, data: Dataset, config: TrainConfig) -> Float[Tensor, " c"] | None:
-    """Class offsets (``calibration``) from the first training examples; None when off."""
+    """Class offsets (``logit_adjustment``) from the first training examples; None when off."""
     count, uniform = min(config.offset_examples, len(data) - config.holdout), data.uniform_queries
-    if not (count and uniform and "ce" in config.loss):
+    if not (count and uniform and config.supervision.labels):
         return None
     answers = _answers(network, data, config, range(count))
     found = [(logits[:, -uniform:], batch.labels[:, -uniform:]) for batch, logits, _ in answers]

@@ -5,9 +5,9 @@ from dataclasses import replace
 from mereo.experiments.paper.result import Claim, Result, Row, better, published
 from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
-from mereo.models.config import Encoder
+from mereo.models.config import Encoder, Loss
 from mereo.synthesis.config import GenerateConfig
-from mereo.training.config import PRESETS, Loss, TrainConfig
+from mereo.training.config import PRESETS, TrainConfig
 
 OBJECTS = ("rope", "shapes", "robot", "lizard", "human")
 """Scenes of the paper's comparison."""
@@ -27,10 +27,9 @@ def recipe(base: TrainConfig, encoder: Encoder, loss: Loss) -> TrainConfig | Non
     if loss == "ce":
         return None
     own = PRESETS["paper-autodecoder"]
-    network = replace(
-        base.network,
+    network = base.network.changed(
         encoder=encoder,
-        dropout=own.network.dropout,
+        dropout=own.network.decoder.dropout,
         local_neighbors=0,
         sight_neighbors=0,
         align_points=0,

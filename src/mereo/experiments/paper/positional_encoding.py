@@ -18,7 +18,7 @@ def run(store: Store, scale: ExperimentScale) -> Result:
         dataset = store.dataset(scene, GenerateConfig(), scale.examples)
         scores = {}
         for variant, encode in (("on", True), ("off", False)):
-            recipe = replace(scale.recipe, network=replace(scale.recipe.network, encode_positions=encode))
+            recipe = replace(scale.recipe, network=scale.recipe.network.changed(encode_positions=encode))
             weights = store.run(dataset, recipe)
             scores[variant] = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
             rows.append(Row(scene, variant, scores[variant], paper.get(variant)))

@@ -54,7 +54,7 @@ _TINY, _PAPER = PRESETS["tiny"], PRESETS["paper"]
 # each variant of the paper can be switched on its own in it, and it learns in minutes what the paper's network does not
 # learn in hours (docs/design/0002-learning.md).
 _SHORT = replace(
-    _TINY, network=replace(_TINY.network, points=512, align_points=0, rest_template=False), epochs=8, holdout=32
+    _TINY, network=_TINY.network.changed(points=512, align_points=0, rest_template=False), epochs=8, holdout=32
 )
 
 _ALL = (

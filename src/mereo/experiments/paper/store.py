@@ -70,7 +70,7 @@ class Store:
 
     def run(self, dataset: Path, config: TrainConfig) -> Path:
         """Weights' file of a training run, made, continued or found."""
-        path = self.root / "runs" / f"{_scene_of(dataset)}-{content_key([dataset.name, asdict(config)])}"
+        path = self.root / "runs" / f"{_scene_of(dataset)}-{content_key([dataset.name, config.to_dict()])}"
         weights = path / "weights.safetensors"
         _say("run", path)
         if not (path / FINISHED).exists():

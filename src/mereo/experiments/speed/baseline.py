@@ -46,7 +46,7 @@ class Rival:
         return torch.cat(chunks).numpy()
 
     def _predict(self, network: Network, queries: Float[Tensor, "1 q 3"]) -> Prediction:
-        count = int(self.cloud.shape[1] * network.config.ratio1)
+        count = int(self.cloud.shape[1] * network.config.pointnet2.ratio1)
         first = farthest_points(self.cloud[0], count)
         rest = torch.ones(self.cloud.shape[1], dtype=torch.bool, device=first.device)
         rest[first] = False
@@ -70,20 +70,20 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, " m
 
 def decode(decoder: Decoder, code: Code, latent: Float[Tensor, "1 z"], queries: Float[Tensor, "1 q 3"]) -> Prediction:
     """Prediction as of ``Decoder.forward``, with the latent vector at every query; the layers are the decoder's own."""
-    config = decoder.config
+    layers, added = decoder.config.decoder, decoder.config.additions
     everywhere = latent[:, None].expand(-1, queries.shape[1], -1)
     placed = queries if code.alignment is None else code.alignment.apply(queries)
-    encoded = decoder.encode(placed) if config.encode_positions else placed
+    encoded = decoder.encode(placed) if layers.encode_positions else placed
     rows = [everywhere, encoded]
-    if config.local_neighbors:
+    if added.local_neighbors:
         rows += [layer(level, placed) for layer, level in zip(decoder.local, code.levels, strict=True)]
-    if config.sight_neighbors:
-        rows.append(line_of_sight(queries, code.cloud, code.viewpoint, config.sight_neighbors))
+    if added.sight_neighbors:
+        rows.append(line_of_sight(queries, code.cloud, code.viewpoint, added.sight_neighbors))
     hidden = encoded
     for number, norm in enumerate(decoder.norms):
         if number > 0:
             rows = [hidden]
-        if number == config.skip_after:
+        if number == layers.skip_after:
             rows += [everywhere, encoded]
             if decoder.lookup is not None:
                 rows.append(decoder.lookup(hidden, placed)[1])

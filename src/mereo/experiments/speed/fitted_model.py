@@ -26,7 +26,7 @@ def fitted_model(preset: str, view: SampleView) -> Model:
     """
     grid, kept = view.truth.grid, view.truth.kept
     torch.manual_seed(0)
-    network = Network(replace(PRESETS[preset].network, dropout=0.0), len(grid.names))
+    network = Network(PRESETS[preset].network.changed(dropout=0.0), len(grid.names))
     model = Model(network, grid.names, tuple(PALETTE[i % len(PALETTE)] for i in range(len(grid.names))))
     cloud, normalizer = model.normalized_cloud(view.depth.to_points())
     model = replace(model, domain=_domain(grid, normalizer))
@@ -45,7 +45,7 @@ def fitted_model(preset: str, view: SampleView) -> Model:
         network.aligner.eval()  # one view teaches no alignment: any that stays the same will do
     for _ in range(STEPS):
         queries, labels = draw()
-        loss = nn.functional.cross_entropy(network(cloud, viewpoint, queries)[0][0], labels)
+        loss = nn.functional.cross_entropy(network(cloud, viewpoint, queries).prediction.logits[0], labels)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

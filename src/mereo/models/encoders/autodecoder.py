@@ -1,4 +1,4 @@
-"""The autodecoder of DeepSDF (Park et al., CVPR 2019), extended to segments by the decoder behind it.
+"""Autodecoder of DeepSDF (Park et al., CVPR 2019), extended to segments by the decoder behind it.
 
 There is no encoder network. Each training example has a code of its own, trained like the weights. The code of a new
 cloud is searched for: "the input point cloud is reinterpreted as the locus of points where the signed distance should
@@ -14,30 +14,30 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mereo.models.config import NetworkConfig
+from mereo.models.config import AutodecoderConfig
 
 CODES = "encoder.codes"
 """Name of the training examples' codes among a network's parameters."""
 
 
 class Autodecoder(nn.Module):
-    """The codes of the training examples, and the search for the code of a new cloud.
+    """Codes of the training examples, and the search for the code of a new cloud.
 
     Attributes:
         codes: of the training examples; None in a network that is only used.
         mean: their mean, from which a search starts.
     """
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: AutodecoderConfig, latent: int) -> None:
         super().__init__()
         self.steps, self.rate, self.penalty = config.search_steps, config.search_rate, config.code_penalty
         self.codes: nn.Parameter | None
         self.register_parameter("codes", None)
         self.mean: Tensor
-        self.register_buffer("mean", torch.zeros(config.latent))
+        self.register_buffer("mean", torch.zeros(latent))
 
     def add_codes(self, examples: int) -> None:
-        """Random codes for training, about one away from the mean (which is zero in a new network)."""
+        """Make random codes for training, about one away from the mean (which is zero in a new network)."""
         width = len(self.mean)
         self.codes = nn.Parameter(self.mean + torch.randn(examples, width) / math.sqrt(width))
 
@@ -48,18 +48,18 @@ class Autodecoder(nn.Module):
             self.mean.copy_(self.codes.mean(dim=0))
 
     def code(self, index: Int[Tensor, " b"]) -> Float[Tensor, "b z"]:
-        """The trained codes of training examples."""
+        """Trained codes of training examples."""
         assert self.codes is not None, "weights hold no codes of training examples"
         return nn.functional.embedding(index, self.codes)
 
     def length_penalty(self, code: Float[Tensor, "b z"]) -> Float[Tensor, " b"]:
-        """The Gaussian prior on codes, relative to a mean distance (DeepSDF, equations 9 and 10)."""
+        """Gaussian prior on codes, relative to a mean distance (DeepSDF, equations 9 and 10)."""
         return self.penalty * code.square().sum(dim=1)
 
     def search(
         self, distance: Callable[[Float[Tensor, "b z"]], Float[Tensor, "b n"]], clouds: int
     ) -> Float[Tensor, "b z"]:
-        """The codes under which the observed points are nearest to a surface.
+        """Codes under which the observed points are nearest to a surface.
 
         ``distance`` answers with the signed distance at each cloud's observed points. Deterministic, and the clouds of
         a batch do not influence each other. Gradients are taken for the codes only, whatever the caller's mode.

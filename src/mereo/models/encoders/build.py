@@ -1,4 +1,4 @@
-"""Point cloud encoders: each maps a normalized cloud to an ``Encoding``."""
+"""The encoder that a network's settings ask for, once they are checked."""
 
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders.autodecoder import Autodecoder
@@ -7,26 +7,35 @@ from mereo.models.encoders.pointnet2 import PointNet2
 
 
 def make_encoder(config: NetworkConfig) -> PointNet2 | PointTransformer | Autodecoder:
-    """The encoder that the settings name; ``ValueError`` where they do not go together or are out of range."""
-    for name in ("transformer_neighbors", "search_steps"):
-        if getattr(config, name) < 1:
-            raise ValueError(f"{name} is {getattr(config, name)}; it must be at least 1: leave it out for the paper's")
-    if not 0 <= config.dropout < 1:
-        raise ValueError(
-            f"dropout is {config.dropout}; it is a share from 0 to below 1: the paper's autodecoder has 0.2"
-        )
+    """Encoder that the settings name; ``ValueError`` where they do not go together or are out of range."""
+    _check(config)
     if config.encoder == "autodecoder":
-        if config.local_neighbors:
-            raise ValueError(
-                f"local_neighbors is {config.local_neighbors}, but an autodecoder has no features at points to attend "
-                "to; train with --network.local-neighbors 0, or with the preset paper-autodecoder"
-            )
-        return Autodecoder(config)
-    if config.encoder == "pointnet2":
-        return PointNet2(config)
-    if len(config.transformer_widths) < 3:
+        return Autodecoder(config.autodecoder, config.latent)
+    if config.encoder == "point-transformer":
+        return PointTransformer(config.transformer, config.latent)
+    return PointNet2(config.pointnet2)
+
+
+def _check(config: NetworkConfig) -> None:
+    """Raise ``ValueError`` naming the setting, its rule and the cure."""
+    counts = {
+        "transformer_neighbors": config.transformer.transformer_neighbors,
+        "search_steps": config.autodecoder.search_steps,
+    }
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"{name} is {count}; it must be at least 1: leave it out for the paper's")
+    dropout, neighbors = config.decoder.dropout, config.additions.local_neighbors
+    if not 0 <= dropout < 1:
+        raise ValueError(f"dropout is {dropout}; it is a share from 0 to below 1: the paper's autodecoder has 0.2")
+    if config.encoder == "autodecoder" and neighbors:
         raise ValueError(
-            f"transformer_widths are {config.transformer_widths}; a Point Transformer needs at least three: the paper "
-            "has 32 64 128 256 512"
+            f"local_neighbors is {neighbors}, but an autodecoder has no features at points to attend to; train with "
+            "--network.local-neighbors 0, or with the preset paper-autodecoder"
         )
-    return PointTransformer(config)
+    widths = config.transformer.transformer_widths
+    if config.encoder == "point-transformer" and len(widths) < 3:
+        raise ValueError(
+            f"transformer_widths are {widths}; a Point Transformer needs at least three: the paper has "
+            "32 64 128 256 512"
+        )

@@ -1,4 +1,4 @@
-"""What every encoder gives, and the layer that all of them are made of.
+"""Encodings, what every encoder gives, and the layer that all of them are made of.
 
 Notation: b clouds, m points of a level, c channels, z latent channels.
 """
@@ -23,20 +23,20 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Encoding:
-    """What the encoder knows of a cloud: the paper's latent vector, and levels on the way to it for local features."""
+    """Knowledge of an encoder about a cloud: the paper's latent vector, and levels on the way for local features."""
 
     latent: Float[Tensor, "b z"]
     levels: tuple[Level, ...]
 
 
 def share(count: int, ratio: float) -> int:
-    """``max(1, int(count * ratio))``, which also works on the sizes that an exported graph leaves open."""
+    """Share of a count, ``max(1, int(count * ratio))``, also of the sizes that an exported graph leaves open."""
     found: int = torch.sym_max(1, torch.sym_int(count * ratio))
     return found
 
 
 class SharedMLP(nn.Module):
-    """Linear, batch normalization and ReLU per layer, shared by all rows."""
+    """Layers of linear map, batch normalization and ReLU, shared by all rows."""
 
     def __init__(self, widths: tuple[int, ...]) -> None:
         super().__init__()
@@ -47,6 +47,7 @@ class SharedMLP(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, rows: Float[Tensor, "*r i"]) -> Float[Tensor, "*r o"]:
+        """Outputs of the last layer for each row; the first layer computes in float32."""
         first, *rest = self.layers
         with exact(rows):  # coordinates, and pooled features, which have much in common
             hidden = first(rows.reshape(-1, rows.shape[-1]).float())

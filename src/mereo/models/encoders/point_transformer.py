@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mereo.models.config import NetworkConfig
+from mereo.models.config import PointTransformerConfig
 from mereo.models.encoders.encoding import Encoding, Level, SharedMLP
 from mereo.models.ops.neighbors import distinct_distances, gather
 
@@ -21,7 +21,9 @@ STRIDE = 4
 
 
 class VectorAttention(nn.Module):
-    """``y_i = sum_j softmax_j(gamma(phi x_i - psi x_j + d_ij)) * (alpha x_j + d_ij)`` (equation 3).
+    """Attention among neighbours with a weight for each channel (Zhao et al., equation 3).
+
+    ``y_i = sum_j softmax_j(gamma(phi x_i - psi x_j + d_ij)) * (alpha x_j + d_ij)``.
 
     j runs over the neighbours of i, the softmax is taken in each channel, and ``d_ij = theta(p_i - p_j)`` is the
     relative positional encoding (equation 4). Gamma and theta are two linear layers with a ReLU between them.
@@ -40,7 +42,7 @@ class VectorAttention(nn.Module):
     def forward(
         self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]
     ) -> Float[Tensor, "b n c"]:
-        """``index`` are each point's neighbours."""
+        """Attended features at each point; ``index`` are each point's neighbours."""
         place = self.theta(points[:, :, None] - gather(points, index))
         relation = self.phi(features)[:, :, None] - gather(self.psi(features), index) + place
         weight = self.gamma(relation).softmax(dim=2)
@@ -48,7 +50,7 @@ class VectorAttention(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """Vector attention between two linear layers, around a residual connection (figure 4a of Zhao et al.)."""
+    """Block of vector attention between two linear layers, around a residual connection (Zhao et al., figure 4a)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -61,39 +63,41 @@ class TransformerBlock(nn.Module):
     def forward(
         self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]
     ) -> Float[Tensor, "b n c"]:
+        """Features after the block; ``index`` are each point's neighbours."""
         hidden = self.attention(points, self.enter(features), index).flatten(0, 1)
         change = self.left(self.leave(torch.relu(self.attended(hidden))))
         return torch.relu(features + change.unflatten(0, features.shape[:2]))
 
 
 class TransitionDown(nn.Module):
-    """A linear layer at each point, then at each kept point the largest of its neighbours (figure 4b)."""
+    """Step to fewer points: a linear layer at each, then at each kept one the largest of its neighbours (figure 4b)."""
 
     def __init__(self, before: int, after: int) -> None:
         super().__init__()
         self.mlp = SharedMLP((before, after))
 
     def forward(self, features: Float[Tensor, "b n i"], index: Int[Tensor, "b m k"]) -> Float[Tensor, "b m o"]:
-        """``index`` are the kept points' neighbours among all."""
+        """Features at the kept points; ``index`` are their neighbours among all."""
         return gather(self.mlp(features), index).amax(dim=2)
 
 
 class PointTransformer(nn.Module):
-    """Cloud in farthest-point order -> latent vector; its second and third level serve as local features.
+    """Encoder from a cloud in farthest-point order to a latent vector; levels two and three serve as local features.
 
     The points of a level are a prefix of those before, so one matrix of distances serves all levels.
     """
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: PointTransformerConfig, latent: int) -> None:
         super().__init__()
         widths = config.transformer_widths
         self.neighbors = config.transformer_neighbors
         self.enter = SharedMLP((3, widths[0]))
         self.down = nn.ModuleList(TransitionDown(*pair) for pair in pairwise(widths))
         self.blocks = nn.ModuleList(TransformerBlock(width) for width in widths)
-        self.pool = SharedMLP((widths[-1], config.latent))
+        self.pool = SharedMLP((widths[-1], latent))
 
     def forward(self, cloud: Float[Tensor, "b n 3"]) -> Encoding:
+        """Encoding of each cloud."""
         distances = distinct_distances(cloud)
         count = cloud.shape[1]
         features = self.blocks[0](cloud, self.enter(cloud), _smallest(distances, max(1, self.neighbors // 2)))

@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mereo.models.config import NetworkConfig
+from mereo.models.config import PointNet2Config
 from mereo.models.encoders.encoding import Encoding, Level, SharedMLP, share
 from mereo.models.ops.neighbors import ball_query, gather
 
 
 class SetAbstraction(nn.Module):
-    """PointNet on the ball around each centre: ``max_j mlp([f_j, p_j - p_i])`` (PointNet++, section 3.2)."""
+    """Small PointNet on the ball around each centre: ``max_j mlp([f_j, p_j - p_i])`` (PointNet++, section 3.2)."""
 
     def __init__(self, channels: int, radius: float, neighbors: int, widths: tuple[int, ...]) -> None:
         super().__init__()
@@ -21,6 +21,7 @@ class SetAbstraction(nn.Module):
         self.mlp = SharedMLP((channels + 3, *widths))
 
     def forward(self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n c"] | None, count: int) -> Level:
+        """Level of the first ``count`` points, with features of the balls around them."""
         centers = points[:, :count]
         index = ball_query(centers, points, self.radius, self.neighbors)
         rows = gather(points, index) - centers[:, :, None]
@@ -30,9 +31,9 @@ class SetAbstraction(nn.Module):
 
 
 class PointNet2(nn.Module):
-    """Cloud in farthest-point order -> latent vector and two levels of local features."""
+    """Encoder from a cloud in farthest-point order to a latent vector and two levels of local features."""
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: PointNet2Config) -> None:
         super().__init__()
         self.ratio1, self.ratio2 = config.ratio1, config.ratio2
         self.level1 = SetAbstraction(0, config.radius1, config.neighbors, config.mlp1)
@@ -40,6 +41,7 @@ class PointNet2(nn.Module):
         self.pool = SharedMLP((config.mlp2[-1] + 3, *config.mlp_global))
 
     def forward(self, cloud: Float[Tensor, "b n 3"]) -> Encoding:
+        """Encoding of each cloud."""
         count1 = share(cloud.shape[1], self.ratio1)
         count2 = share(count1, self.ratio2)
         level1 = self.level1(cloud, None, count1)

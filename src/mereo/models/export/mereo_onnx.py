@@ -1,4 +1,4 @@
-"""Ask a network that `mereo export` has written, with numpy and onnxruntime alone: no torch, no mereo.
+"""Runner of a network that `mereo export` has written, with numpy and onnxruntime alone: no torch, no mereo.
 
     python mereo_onnx.py frame.npy --points queries.npy -o out.npz
 
@@ -23,7 +23,7 @@ QUERY_CHUNK = 16384
 
 
 class Runner:
-    """A network with its segments: ``names[k]`` and ``colors[k]`` belong to label k + 1; label 0 is empty space."""
+    """Network with its segments: ``names[k]`` and ``colors[k]`` belong to label k + 1; label 0 is empty space."""
 
     def __init__(self, folder: str = str(Path(__file__).parent), providers: tuple = ("CPUExecutionProvider",)) -> None:
         import onnxruntime
@@ -43,7 +43,7 @@ class Runner:
         return self.query(self.encode(cloud), queries)
 
     def encode(self, cloud: np.ndarray) -> tuple:
-        """All that queries need to know of a cloud; compute it once."""
+        """Code of a cloud, all that queries need to know of it; compute it once."""
         seen, center, scale = prepare(cloud, self.settings)
         given = {"cloud": seen[None], "viewpoint": (-center * scale)[None].astype(np.float32)}
         names = [output.name for output in self._encoder.get_outputs()]
@@ -51,7 +51,7 @@ class Runner:
         return {**code, **given}, center, scale
 
     def query(self, code: tuple, queries: np.ndarray) -> tuple:
-        """Answers for an encoded cloud."""
+        """Answers at points for an encoded cloud, as ``__call__`` gives them."""
         tensors, center, scale = code
         wanted = [entry.name for entry in self._query.get_inputs() if entry.name != "points"]
         given = {name: tensors[name] for name in wanted}
@@ -65,7 +65,7 @@ class Runner:
 
 
 def prepare(cloud: np.ndarray, settings: dict) -> tuple:
-    """The points that the network sees, normalized and in farthest-point order, with center and scale."""
+    """Points that the network sees, normalized and in farthest-point order, with center and scale."""
     points = np.asarray(cloud, dtype=np.float64)
     fewest, limit = settings["fewest_points_of_a_cloud"], settings["points"]
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
@@ -105,7 +105,7 @@ def farthest_point_order(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def main() -> int:
-    """The command line; returns the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(description="Ask an exported mereo network about points.")
     parser.add_argument("cloud", help=".npy, [n, 3], camera frame")
     parser.add_argument("--points", required=True, help=".npy, [q, 3], same frame and unit")

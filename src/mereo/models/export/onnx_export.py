@@ -39,13 +39,13 @@ FORMAT_VERSION = 1
 RUNNER = Path(__file__).with_name("mereo_onnx.py")
 
 EXAMPLE_QUERIES = 24
-"""Of the traced example; any number may follow."""
+"""Number of queries of the traced example; any other may follow."""
 
 FIXED_SIZE = ("latent1", "latent2", "rotation", "shift", "viewpoint")
 """Code tensors whose size does not depend on the number of points."""
 
 UNBOUNDED = 2.0**60
-"""torch's upper bound of an open size is infinite or the largest integer."""
+"""Upper bound from which on a size counts as open: torch's is infinite or the largest integer."""
 
 ANSWERS = ("logits", "distance", "direction")
 
@@ -54,31 +54,33 @@ Open = Dim.DYNAMIC
 
 
 class EncoderGraph(nn.Module):
-    """Cloud -> code tensors by name."""
+    """Module to trace, from a cloud to code tensors by name."""
 
     def __init__(self, network: Network) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, cloud: Float[Tensor, "1 n 3"]) -> dict[str, Tensor]:
+        """Code tensors of a normalized cloud in farthest-point order."""
         unused = torch.zeros_like(cloud[:, 0])  # the viewpoint: only queries look along lines of sight
         return code_tensors(self.network.encode(cloud, unused))
 
 
 class QueryGraph(nn.Module):
-    """Points and code tensors -> what ``Model.respond`` says."""
+    """Module to trace, from points and code tensors to what ``Model.respond`` says."""
 
     def __init__(self, model: Model) -> None:
         super().__init__()
         self.model, self.network = model, model.network
 
     def forward(self, points: Float[Tensor, "1 q 3"], code: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Answers by name at normalized points."""
         answers = self.model.respond(self.network.query(code_of(code), points), points)
         return dict(zip(ANSWERS, answers, strict=True))
 
 
 def code_tensors(code: Code) -> dict[str, Tensor]:
-    """What the encoder has computed; the cloud and the viewpoint are known without it."""
+    """Tensors by name that the encoder has computed; the cloud and the viewpoint are known without it."""
     tensors = {"latent1": code.latent1, "latent2": code.latent2}
     for number, level in enumerate(code.levels, start=1):
         tensors |= {f"centers{number}": level.centers, f"features{number}": level.features}
@@ -88,7 +90,7 @@ def code_tensors(code: Code) -> dict[str, Tensor]:
 
 
 def code_of(tensors: dict[str, Tensor]) -> Code:
-    """Inverse of ``code_tensors``. A network without lines of sight needs neither cloud nor viewpoint."""
+    """Code from its tensors, the inverse of ``code_tensors``; only lines of sight need cloud and viewpoint."""
     levels: list[Level] = []
     while (name := f"centers{len(levels) + 1}") in tensors:
         levels.append(Level(tensors[name], tensors[name.replace("centers", "features")]))
@@ -100,7 +102,7 @@ def code_of(tensors: dict[str, Tensor]) -> Code:
 
 @dataclass(frozen=True, eq=False)
 class Graphs:
-    """Both graphs as torch programs.
+    """Encoder and query of a network as torch programs.
 
     Attributes:
         encoder, query: the programs.
@@ -117,7 +119,7 @@ class Graphs:
 
 
 def export_graphs(model: Model) -> Graphs:
-    """Trace both graphs. Raises ``ValueError`` for an autodecoder."""
+    """Traced programs of a model. Raises ``ValueError`` for an autodecoder."""
     config = model.network.config
     if config.encoder == "autodecoder":
         raise ValueError(
@@ -130,7 +132,7 @@ def export_graphs(model: Model) -> Graphs:
         traced = torch.export.export(encoder, (cloud,), dynamic_shapes=({1: Open},), strict=False)
         code = encoder(cloud)
         outputs = tuple(code)
-        if config.sight_neighbors:
+        if config.additions.sight_neighbors:
             code |= {"cloud": cloud, "viewpoint": torch.tensor([[0.1, -0.2, -8.0]])}
         open_sizes = {name: None if name in FIXED_SIZE else {1: Open} for name in code}
         points = _example_points(EXAMPLE_QUERIES)
@@ -147,7 +149,7 @@ def _example_points(count: int) -> Float[Tensor, "1 n 3"]:
 
 
 def write_onnx(graphs: Graphs, directory: Path) -> None:
-    """``encoder.onnx`` and ``query.onnx``. Raises ``ImportError`` without the extra `onnx`."""
+    """Write ``encoder.onnx`` and ``query.onnx``. Raises ``ImportError`` without the extra `onnx`."""
     _require_onnx()
     from mereo.models.export.onnx_operators import DECOMPOSITIONS
 
@@ -174,7 +176,7 @@ def _require_onnx() -> None:
 
 
 def write_torch(graphs: Graphs, directory: Path) -> None:
-    """``encoder.pt2`` and ``query.pt2``, for ``torch.export.load``."""
+    """Write ``encoder.pt2`` and ``query.pt2``, for ``torch.export.load``."""
     with _quiet():
         torch.export.save(graphs.encoder, directory / "encoder.pt2")
         torch.export.save(graphs.query, directory / "query.pt2")
@@ -182,7 +184,7 @@ def write_torch(graphs: Graphs, directory: Path) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """torch warns of its own internals and of packages that nobody needs here."""
+    """Context without the warnings of torch about its own internals and packages that nobody needs here."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -195,7 +197,7 @@ def _quiet() -> Iterator[None]:
 
 
 def describe(model: Model, graphs: Graphs) -> dict[str, Any]:
-    """``model.json``: what is needed beside the graphs."""
+    """Content of ``model.json``: what is needed beside the graphs."""
     return {
         "version": FORMAT_VERSION,
         "names": model.names if model.segmented else ["object"],
@@ -216,7 +218,7 @@ def describe(model: Model, graphs: Graphs) -> dict[str, Any]:
 def export_weights(
     weights: str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", force: bool = False
 ) -> None:
-    """``mereo export``: a new directory with both graphs, ``model.json`` and, for ONNX, the runner.
+    """Write a new directory with both graphs, ``model.json`` and, for ONNX, the runner (``mereo export``).
 
     Raises ``ValueError`` for an autodecoder, ``ImportError`` without the extra `onnx`, ``FileExistsError`` for a
     directory with content unless ``force``.

@@ -1,4 +1,4 @@
-"""Two operations that ONNX has no operator for, made of those it has: the SVD of 3 x 3 matrices and 3-D sampling.
+"""Operators that ONNX lacks, made of those it has: the SVD of 3 x 3 matrices and 3-D sampling.
 
 They take the place of torch's own when a program is exported to ONNX (``torch.export``'s decompositions), with the same
 arguments and the same results to rounding.
@@ -15,9 +15,9 @@ from mereo.models.ops.svd import svd3
 
 
 def trilinear(volume: Tensor, grid: Tensor, interpolation_mode: int, padding_mode: int, align_corners: bool) -> Tensor:
-    """``grid_sample`` of a volume [1, c, d, h, w] at places [1, i, j, k, 3] in [-1, 1]: [1, c, i, j, k].
+    """Trilinear ``grid_sample`` of a volume [1, c, d, h, w] at [1, i, j, k, 3] in [-1, 1]: [1, c, i, j, k].
 
-    Only as ``template.RestLookup`` asks for it: linear (0), the border's value beyond it (1), corners aligned.
+    Only as ``template_lookup.RestLookup`` asks for it: linear (0), the border's value beyond it (1), corners aligned.
     """
     assert (interpolation_mode, padding_mode, align_corners) == (0, 1, True), "another sampling than the template's"
     channels, sizes = volume.shape[1], volume.shape[2:]
@@ -46,4 +46,4 @@ DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     torch.ops.aten.grid_sampler.default: trilinear,
     torch.ops.aten.grid_sampler_3d.default: trilinear,
 }
-"""For ``ExportedProgram.run_decompositions``."""
+"""Replacements of torch's operators, for ``ExportedProgram.run_decompositions``."""

@@ -20,7 +20,7 @@ from torch import Tensor
 is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
 
 THREADED_QUERIES = 1024
-"""Below that a k-d tree's threads cost more than they save."""
+"""Number of queries below which a k-d tree's threads cost more than they save."""
 
 
 @torch.no_grad()
@@ -41,7 +41,7 @@ def ball_query(
 def _by_rank(
     centers: Float[Tensor, "b m 3"], points: Float[Tensor, "b n 3"], radius: float, limit: int
 ) -> Int[Tensor, "b m k"]:
-    """Without sizes that depend on the values: for GPUs and for graphs."""
+    """Ball query without sizes that depend on the values: for GPUs and for graphs."""
     count = points.shape[1]
     near = squared_distances(centers, points) <= radius * radius
     rank = near.cumsum(dim=-1, dtype=torch.int32)
@@ -55,7 +55,7 @@ def _by_rank(
 
 @torch.library.custom_op("mereo::ball_query", mutates_args=())
 def _by_pairs(centers: Tensor, points: Tensor, radius: float, limit: int) -> Tensor:
-    """The pairs that are near, listed: most are not. An operator of its own, so that a compiled network can call it."""
+    """Ball query by the list of near pairs: most are not. An operator, so that a compiled network can call it."""
     clouds = zip(centers.numpy().astype(np.float64), points.numpy().astype(np.float64), strict=True)
     return torch.from_numpy(np.stack([_first_in_ball(c, p, radius, limit) for c, p in clouds]))
 
@@ -87,7 +87,7 @@ def nearest(queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], cou
     """Indices of the ``count`` nearest points to each query, nearest first; ties in any order.
 
     On a CPU by a k-d tree per cloud, which is exact and six times faster than all distances and a selection; on a
-    GPU by a kernel that never writes the distances (``gpu.kernels``); in exported graphs, by those.
+    GPU by a kernel that never writes the distances (``triton_kernels``); in exported graphs, by those.
     """
     count = min(count, points.shape[1])
     if queries.is_cuda and not torch.compiler.is_compiling():
@@ -102,13 +102,13 @@ def nearest(queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], cou
 
 @cache
 def gpu_kernels() -> ModuleType | None:
-    """``mereo.models.ops.triton_kernels``; None without Triton, which PyTorch's CUDA builds for Linux bring."""
+    """Module ``mereo.models.ops.triton_kernels``; None without Triton, which PyTorch's CUDA builds for Linux bring."""
     return import_module("mereo.models.ops.triton_kernels") if find_spec("triton") is not None else None
 
 
 @torch.library.custom_op("mereo::nearest", mutates_args=())
 def _by_trees(queries: Tensor, points: Tensor, count: int) -> Tensor:
-    """An operator of its own, so that a compiled network can call it."""
+    """Nearest neighbours by k-d trees. An operator, so that a compiled network can call it."""
     return torch.from_numpy(
         np.stack([_by_tree(q, p, count) for q, p in zip(queries.numpy(), points.numpy(), strict=True)])
     )
@@ -127,7 +127,7 @@ def _by_tree(queries: Float[np.ndarray, "q d"], points: Float[np.ndarray, "n d"]
 
 
 def squared_distances(a: Float[Tensor, "b m d"], b: Float[Tensor, "b n d"]) -> Float[Tensor, "b m n"]:
-    """All pairwise squared distances, by summed squares: the expanded product loses digits where they matter."""
+    """Squared distances of all pairs, by summed squares: the expanded product loses digits where they matter."""
     total = (a[:, :, None, 0] - b[:, None, :, 0]).square()
     for axis in range(1, a.shape[-1]):
         total = total + (a[:, :, None, axis] - b[:, None, :, axis]).square()
@@ -135,7 +135,7 @@ def squared_distances(a: Float[Tensor, "b m d"], b: Float[Tensor, "b n d"]) -> F
 
 
 def gather(values: Float[Tensor, "b n c"], index: Int[Tensor, "b m k"]) -> Float[Tensor, "b m k c"]:
-    """``values[b, index[b, m, k]]``."""
+    """Rows of each cloud's values by index, ``values[b, index[b, m, k]]``."""
     batch, count, channels = values.shape
     offset = torch.arange(batch, device=values.device).view(-1, 1, 1) * count
     flat = (index + offset).reshape(-1)

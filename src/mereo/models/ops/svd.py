@@ -1,4 +1,4 @@
-"""The singular value decomposition of 3 x 3 matrices from plain operations, for graphs that cannot hold a solver's.
+"""Singular value decomposition of 3 x 3 matrices from plain operations, for graphs that cannot hold a solver's.
 
 ONNX has no operator for it, and a CUDA graph cannot hold torch's, which looks at its own result on the host.
 """
@@ -7,13 +7,15 @@ import torch
 from torch import Tensor
 
 SWEEPS = 5
-"""Convergence is quadratic; four sweeps reach double precision on 3 x 3 matrices, and one is to spare."""
+"""Number of rounds of rotations: convergence is quadratic, four reach double precision, and one is to spare."""
 
 TINY = 1e-300
 
 
 def svd3(matrix: Tensor, full_matrices: bool = True, driver: str | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """U [b, 3, 3], S [b, 3], V^T [b, 3, 3] of ``torch.linalg.svd`` by one-sided Jacobi rotations, in double precision.
+    """Singular value decomposition of 3 x 3 matrices by one-sided Jacobi rotations, in double precision.
+
+    U [b, 3, 3], S [b, 3], V^T [b, 3, 3], arguments and results as of ``torch.linalg.svd``.
 
     Columns of A are turned in pairs until they are orthogonal, A V = U S (Hestenes, 1958). The third column of U is the
     cross product of the others, so that U is orthogonal even where the smallest singular value is 0.

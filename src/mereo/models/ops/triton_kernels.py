@@ -19,13 +19,13 @@ from torch import Tensor
 from mereo.models.config import MOST_ORDERED
 
 MOST_COMPARED = 2048
-"""Points that a query may be compared with."""
+"""Number of points that a query may be compared with."""
 
 QUERIES = 16
-"""Of one program."""
+"""Number of queries of one program."""
 
 DISTANCES_PER_WARP = 2048
-"""64 in each thread, which has room for twice as many numbers."""
+"""Distances of one warp: 64 in each thread, which has room for twice as many numbers."""
 
 
 @triton.jit
@@ -73,7 +73,7 @@ def _nearest(
 
 
 def farthest_points(points: Float[Tensor, "b n 3"], valid: Bool[Tensor, "b n"], count: int) -> Int[Tensor, "b m"]:
-    """The first ``count`` valid points in farthest-point order, from the one farthest from the origin on.
+    """Rows of the first ``count`` valid points in farthest-point order, from the one farthest from the origin on.
 
     Ties go to the earlier row. Where fewer are valid, what follows the last of them means nothing.
     Raises ``ValueError`` for clouds that one program cannot hold.

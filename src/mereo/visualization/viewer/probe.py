@@ -1,4 +1,4 @@
-"""A reconstruction to be asked: what the model says at a place, and which place a look meets. In the input's frame."""
+"""Probe of a reconstruction, in the input's frame: what the model says at a place, and which place a look meets."""
 
 from dataclasses import dataclass, replace
 
@@ -19,7 +19,8 @@ class Inspection:
     """Cloud that was seen, what was made of it, and the model that knows more.
 
     Attributes:
-        cloud, result: in the input's frame.
+        cloud: what was seen, in the input's frame.
+        result: its reconstruction, in the same frame.
         model: what made the result, and is asked for more.
     """
 
