@@ -4,13 +4,14 @@ from itertools import combinations
 
 import igl
 import numpy as np
-from manifold3d import Manifold, Mesh64
+from manifold3d import Manifold
 
+from mereo.geometry.manifold import solid_of
 from mereo.geometry.mesh import Segment, SegmentedMesh
 
 
 def solid(segment: Segment) -> Manifold:
-    return Manifold(Mesh64(segment.vertices, segment.faces.astype(np.uint64)))
+    return solid_of(segment.vertices, segment.faces)
 
 
 def overlapping_pairs(mesh: SegmentedMesh) -> list[tuple[str, str]]:

@@ -266,3 +266,14 @@ def test_every_number_that_a_scene_draws_has_a_name_of_its_own(scene: Scene, see
     # the same sliders keep their names when one of them moves
     moved = {f.key: f.name for f in parameters(set_value(scene, played, found[0], found[0].value))}
     assert moved == {f.key: f.name for f in found}
+
+
+# --- shared arrays ----------------------------------------------------------------------------------------------------
+
+
+def test_nobody_changes_the_rest_pose_or_a_state_in_place(scene: Scene) -> None:
+    for segment in (*scene.rest.segments, *scene.sample_state(np.random.default_rng(0)).mesh.segments):
+        with pytest.raises(ValueError, match="read-only"):
+            segment.vertices += 1.0
+        with pytest.raises(ValueError, match="read-only"):
+            segment.faces[:] = 0

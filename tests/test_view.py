@@ -91,7 +91,8 @@ def test_the_laboratory_follows_its_sliders_in_a_browser(tmp_path: Path, server:
     with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (1200, 760)) as browser:  # type: ignore[attr-defined]
         until(lambda: "points seen" in browser.text())
         browser.still()
-        assert {"Camera", "Deformation", "tilt (°)", "lift", "Random state"} <= set(browser.text().split("\n"))
+        words = set(browser.text().split("\n"))
+        assert {"Camera", "Deformation", "tilt (°)", "shear x", "ball", "Random state"} <= words  # "ball" is a folder
         before, picture = page.moment, page._picture.image.copy()
         assert before is not None
         browser.evaluate("[...document.querySelectorAll('button')].find(b => b.innerText == 'Random state').click()")

@@ -16,7 +16,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class DrawName:
-    """What one call of a generator draws.
+    """Name of what one call of a generator draws.
 
     Attributes:
         parts: the parts of the object that it belongs to, the outermost first; () is the whole object.
@@ -30,7 +30,7 @@ class DrawName:
 
 
 class NamedGenerator(np.random.Generator):
-    """A generator that is told what its next draw is called.
+    """Generator that is told what its next draw is called.
 
     Attributes:
         parts: those whose numbers are being drawn, the outermost first.
@@ -41,13 +41,13 @@ class NamedGenerator(np.random.Generator):
     next_name: tuple[str | tuple[str, ...], str] = ("", "")
 
     def take_name(self) -> DrawName:
-        """The name of the draw that is being made; the one after it has none until it is told."""
+        """Name of the draw that is being made; the one after it has none until it is told."""
         (name, unit), self.next_name = self.next_name, ("", "")
         return DrawName(self.parts, name, unit)
 
 
 def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "") -> np.random.Generator:
-    """The generator ``rng``, told what the numbers of its next draw are called.
+    """Generator ``rng`` itself, told what the numbers of its next draw are called.
 
     Args:
         rng: any generator.
@@ -61,7 +61,7 @@ def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "")
 
 @contextmanager
 def part(rng: np.random.Generator, name: str) -> Iterator[None]:
-    """Within this block all draws of ``rng`` belong to a part of the object, or to a part of the part around it."""
+    """Block of code whose draws all belong to a part of the object, or to a part of the part around it."""
     if not isinstance(rng, NamedGenerator):
         yield
         return

@@ -27,14 +27,16 @@ LEAST_DETERMINANT = 0.02
 
 @runtime_checkable
 class Deformation(Protocol):
-    """A map of space, for any number of points at once, each moved independently of the others."""
+    """Map of space, for any number of points at once, each moved independently of the others."""
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]: ...
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, in the points' unit."""
+        ...
 
 
 @runtime_checkable
 class Invertible(Protocol):
-    """A deformation that can undo itself better than Newton's method: exactly, or where finite differences mislead."""
+    """Deformation that can undo itself better than Newton's method: exactly, or where finite differences mislead."""
 
     def rest_points(
         self, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
@@ -45,32 +47,35 @@ class Invertible(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Identity:
-    """Leaves every point where it is."""
+    """Deformation that leaves every point where it is."""
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """The points themselves."""
         return points
 
 
 @dataclass(frozen=True, eq=False)
 class Rigid:
-    """Turns about ``center`` by ``rotation_vector`` (axis times radians), then shifts by ``translation``."""
+    """Rigid motion: a turn about ``center`` by ``rotation_vector`` (axis times radians), then ``translation``."""
 
     rotation_vector: Float[np.ndarray, "3"]
     translation: Float[np.ndarray, "3"]
     center: Float[np.ndarray, "3"]
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points after the turn and the shift."""
         matrix = Rotation.from_rotvec(self.rotation_vector).as_matrix()
         return (points - self.center) @ matrix.T + (self.center + self.translation)
 
 
 @dataclass(frozen=True, eq=False)
 class Compose:
-    """Several deformations one after the other, the first of ``parts`` first; the Jacobians multiply."""
+    """Chain of deformations, the first of ``parts`` applied first; the Jacobians multiply."""
 
     parts: tuple[Deformation, ...]
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points after all parts."""
         for part in self.parts:
             points = part(points)
         return points
@@ -78,7 +83,7 @@ class Compose:
 
 @dataclass(frozen=True, eq=False)
 class Localized:
-    """Applies ``inner`` within ``inner_radius`` of ``center``, nothing beyond ``outer_radius``, and blends between.
+    """Deformation that is ``inner`` within ``inner_radius`` of ``center``, fades, and is none beyond ``outer_radius``.
 
     ``x + w(|x - center|) u(x)`` with the quintic step w. Its Jacobian is that of ``inner`` blended towards 1 plus
     ``u * grad w``: positive while |u| stays well below the width of the blend. That is checked when the object is made,
@@ -104,19 +109,20 @@ class Localized:
         check_positive(self, self.center + grid)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points after the part of ``inner`` that reaches them."""
         distance = np.linalg.norm(points - self.center, axis=1, keepdims=True)
         weight = 1.0 - smooth_step((distance - self.inner_radius) / (self.outer_radius - self.inner_radius))
         return points + weight * (self.inner(points) - points)
 
 
 def smooth_step(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Quintic from 0 (t <= 0) to 1 (t >= 1) with two continuous derivatives; its slope is at most 15/8."""
+    """Quintic step from 0 (t <= 0) to 1 (t >= 1) with two continuous derivatives; its slope is at most 15/8."""
     t = np.clip(t, 0.0, 1.0)
     return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
 
 
 def unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """The direction of ``vector``. Raises ``ValueError`` when it has none."""
+    """Unit vector along ``vector``. Raises ``ValueError`` when it has no direction."""
     length = float(np.linalg.norm(vector))
     if not (np.isfinite(length) and length > 0):
         raise ValueError(f"the direction {vector.tolist()} has no finite length above 0: give a vector that points")
@@ -129,7 +135,7 @@ def turn(
     axis: Float[np.ndarray, "3"],
     angle_rad: np.ndarray,
 ) -> Float[np.ndarray, "n 3"]:
-    """Each point turned about the line through ``center`` along the unit ``axis`` by its own angle ("n").
+    """Points turned about the line through ``center`` along the unit ``axis``, each by its own angle ("n").
 
     Rodrigues' formula; one axis for all makes it several times faster than a rotation object for each point.
     """
@@ -142,7 +148,10 @@ def turn(
 def jacobian(
     deformation: Deformation, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
-    """``f(x)`` and ``J[:, i, j] = df_i / dx_j`` by forward differences, from one call with four times the points."""
+    """Images ``f(x)`` and Jacobians ``J[:, i, j] = df_i / dx_j`` of a map, by forward differences.
+
+    One call of the map with four times the points.
+    """
     step = STEP * _magnitude(points)
     shifts = np.concatenate([np.zeros((1, 3)), step * np.eye(3)])
     value = deformation((shifts[:, None] + points).reshape(-1, 3)).reshape(4, -1, 3)
@@ -150,7 +159,7 @@ def jacobian(
 
 
 def jacobian_determinant(deformation: Deformation, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """By how much volume grows at each point: 1 is rigid or volume preserving, 0 or less folds space over."""
+    """Growth of volume at each point: 1 is rigid or volume preserving, 0 or less folds space over."""
     return np.linalg.det(jacobian(deformation, points)[1])
 
 
@@ -174,6 +183,7 @@ def invert(
     """Rest points whose image is ``points``: by the deformation itself where it is ``Invertible``, else by ``newton``.
 
     Args:
+        deformation: the map to be undone.
         points: deformed positions.
         guess: starting rest positions, for example the rest position of the nearest deformed vertex.
 
@@ -189,7 +199,7 @@ def invert(
 def newton(
     deformation: Deformation, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """``invert`` by damped Newton's method with finite differences, all points at once.
+    """Rest points found by damped Newton's method with finite differences, all points at once; see ``invert``.
 
     A step is kept where the distance to the target falls by at least half of what the linear model promises; elsewhere
     half of the step is tried, and so on, so that guesses from which the plain method overshoots still converge.

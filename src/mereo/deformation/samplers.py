@@ -33,39 +33,43 @@ FOLD_SHARE = 0.9
 
 @runtime_checkable
 class DeformationSampler(Protocol):
-    """The bounds of one deformation."""
+    """Bounds of one deformation, from which a random one is drawn."""
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation: ...
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        """A random deformation; ``surface`` is what it is to move, as the maps before have left it."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
 class LatticeSampler:
-    """A free-form lattice over a box; the control points move by at most ``strength`` of what is injective."""
+    """Free-form lattices over a box; the control points move by at most ``strength`` of what is injective."""
 
     bounds: Float[np.ndarray, "2 3"]
     cells: tuple[int, int, int]
     strength: float
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        """A random lattice."""
         return FreeFormLattice.sample(rng, self.bounds, self.cells, self.strength)
 
 
 @dataclass(frozen=True)
 class WavesSampler:
-    """A smooth field whose gradient is at most ``strength``, which is uniform up to the bound."""
+    """Smooth fields whose gradient is at most ``strength``, which is uniform up to the bound."""
 
     wavelength: Range
     strength: float
     modes: int
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        """A random field of waves."""
         strength = named(rng, "strength").uniform(0.0, self.strength)
         return SmoothField.sample(rng, strength, self.wavelength, self.modes)
 
 
 @dataclass(frozen=True, eq=False)
 class BendSampler:
-    """A bend about an axis, to a random side where ``toward`` is None."""
+    """Bends about an axis, to a random side where ``toward`` is None."""
 
     origin: Vector
     axis: Vector
@@ -74,6 +78,7 @@ class BendSampler:
     toward: Vector | None
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        """A random bend that does not fold what the maps before have made of the object."""
         toward = named(rng, "toward").normal(size=3) if self.toward is None else self.toward
         radius = distance_from_line(surface()[0], self.origin, self.axis)
         most = FOLD_SHARE * self.length / max(radius, 1e-12)
@@ -83,7 +88,7 @@ class BendSampler:
 
 @dataclass(frozen=True, eq=False)
 class TwistSampler:
-    """A twist about an axis, any angle of which preserves volume."""
+    """Twists about an axis, any angle of which preserves volume."""
 
     origin: Vector
     axis: Vector
@@ -91,12 +96,13 @@ class TwistSampler:
     angle_rad: Range
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        """A random twist."""
         return Twist(self.origin, self.axis, self.length, named(rng, "angle", "rad").uniform(*self.angle_rad))
 
 
 @dataclass(frozen=True, eq=False)
 class TaperSampler:
-    """Factors are uniform in their logarithm, so that a half is as likely as a double."""
+    """Tapers by factors uniform in their logarithm, so that a half is as likely as a double."""
 
     origin: Vector
     axis: Vector
@@ -104,25 +110,27 @@ class TaperSampler:
     factor: Range
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        """A random taper."""
         return Taper(self.origin, self.axis, self.length, _factor(rng, self.factor))
 
 
 @dataclass(frozen=True, eq=False)
 class SquashSampler:
-    """Along a random axis where ``axis`` is None; factors are uniform in their logarithm."""
+    """Squashes along a random axis where ``axis`` is None; factors are uniform in their logarithm."""
 
     center: Vector
     axis: Vector | None
     factor: Range
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        """A random squash."""
         axis = named(rng, "axis").normal(size=3) if self.axis is None else self.axis
         return Squash(self.center, axis, _factor(rng, self.factor))
 
 
 @dataclass(frozen=True, eq=False)
 class JointSampler:
-    """A rigid motion: a turn about an axis, a slide along it, and a shift of at most ``shift`` along x, y, z."""
+    """Rigid motions: a turn about an axis, a slide along it, and a shift of at most ``shift`` along x, y, z."""
 
     pivot: Vector
     axis: Vector
@@ -131,6 +139,7 @@ class JointSampler:
     shift: Vector
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        """A random rigid motion."""
         axis = unit(self.axis)
         rotation = axis * named(rng, "angle", "rad").uniform(*self.angle_rad)
         slide = axis * named(rng, "slide").uniform(*self.slide)
@@ -139,7 +148,7 @@ class JointSampler:
 
 @dataclass(frozen=True)
 class PushSampler:
-    """An instrument moves the tissue around a random vertex, within 30 degrees or so of its normal.
+    """Pushes by an instrument at a random vertex, within 30 degrees or so of its normal.
 
     The map's Jacobian is at least 1 - 15/8 |distance| / (reach - tip), which the schema keeps above 0.05.
     """
@@ -149,6 +158,7 @@ class PushSampler:
     reach: float
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+        """A random push of the surface as the maps before have left it."""
         vertices, normals = surface()
         index = named(rng, "vertex").integers(len(vertices))
         direction = unit(normals[index] + 0.35 * named(rng, "slant").normal(size=3))
@@ -158,7 +168,7 @@ class PushSampler:
 
 @dataclass(frozen=True, eq=False)
 class RandomMotion:
-    """``Scene.sample_deformations`` of a scene file: steps one after the other, each for some segments.
+    """Random deformations of a scene file: steps one after the other, each for some segments.
 
     Attributes:
         rest: the segments at rest.
@@ -171,6 +181,7 @@ class RandomMotion:
     steps: tuple[tuple[DeformationSampler, tuple[int, ...]], ...]
 
     def __call__(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
+        """One deformation for each segment, as ``Scene.sample_deformations`` draws them."""
         chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
         for number, (sampler, members) in enumerate(self.steps, start=1):
 

@@ -22,6 +22,7 @@ from scipy.spatial.distance import cdist
 from mereo.deformation.maps import smooth_step
 from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.geometry.mesh import barycentric
+from mereo.geometry.read_only import read_only, read_only_view
 
 CONTROLS = 100
 """Vertices that the spline goes through: more cost time in proportion, fewer leave more to the closest point."""
@@ -31,18 +32,18 @@ REACH = 3.0
 
 
 class Surface:
-    """A closed surface at rest with its search tree and the spline's system, which all of its states share."""
+    """Closed surface at rest with its search tree and the spline's system, which all of its states share."""
 
     def __init__(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
-        self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
+        self.vertices = read_only_view(np.ascontiguousarray(vertices, dtype=np.float64))
+        self.faces = read_only_view(np.ascontiguousarray(faces, dtype=np.int64))
         self.center = vertices.mean(axis=0)
         self.controls = farthest_point_order(self.vertices, CONTROLS)
         knots = self.vertices[self.controls]
         self.reach = REACH * float(np.median(np.sort(cdist(knots, knots), axis=1)[:, 1]))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the search tree, which cannot be pickled; it is built again on first use."""
+        """State without the search tree, which cannot be pickled; it is built again on first use."""
         return {key: value for key, value in self.__dict__.items() if key != "_tree"}
 
     @cached_property
@@ -63,8 +64,8 @@ class Surface:
 
     @cached_property
     def vertex_basis(self) -> Float[np.ndarray, "v k"]:
-        """The basis at all vertices at rest."""
-        return self._basis(self.vertices)
+        """Basis of the spline at all vertices at rest."""
+        return read_only(self._basis(self.vertices))
 
     def _basis(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p k"]:
         local = points - self.center
@@ -72,11 +73,11 @@ class Surface:
         return np.concatenate([radial, np.ones((len(points), 1)), local], axis=1)
 
     def coefficients(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "k 3"]:
-        """The spline that takes the controls to where they are in ``vertices``."""
+        """Coefficients of the spline that takes the controls to where they are in ``vertices``."""
         return self._solver @ vertices[self.controls]
 
     def spline(self, coefficients: Float[np.ndarray, "k 3"], points: Float[np.ndarray, "p 3"]) -> np.ndarray:
-        """Values [p, 3] of a spline."""
+        """Values [p, 3] of a spline at points."""
         return self._basis(points) @ coefficients
 
     def carry(self, values: Float[np.ndarray, "v 3"], points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
@@ -92,7 +93,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMap:
-    """One state of a surface as a map of space; satisfies ``Deformation``.
+    """Map of space that one state of a surface gives; satisfies ``Deformation``.
 
     Attributes:
         rest: the surface at rest.
@@ -111,4 +112,5 @@ class SurfaceMap:
         return self.vertices - self.rest.vertex_basis @ self._coefficients
 
     def __call__(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+        """Images of points: exact on the surface, estimated inside."""
         return self.rest.spline(self._coefficients, points) + self.rest.carry(self._error, points)

@@ -19,10 +19,11 @@ from scipy.sparse import coo_array, csr_array
 
 from mereo.deformation.maps import newton
 from mereo.geometry.mesh import barycentric
+from mereo.geometry.read_only import read_only, read_only_view
 
 
 class Tetrahedra:
-    """A tetrahedral mesh at rest with its search trees, which all of its states share.
+    """Tetrahedral mesh at rest with its search trees, which all of its states share.
 
     Args:
         nodes: positions, any unit.
@@ -41,8 +42,8 @@ class Tetrahedra:
                 f"a tetrahedron refers to node {int(elements.max() if elements.min() >= 0 else elements.min())}, but "
                 f"there are {len(nodes)}; indices run from 0: subtract 1 where they were counted from 1"
             )
-        self.nodes = np.ascontiguousarray(nodes, dtype=np.float64)
-        self.elements = np.ascontiguousarray(elements, dtype=np.int64)
+        self.nodes = read_only_view(np.ascontiguousarray(nodes, dtype=np.float64))
+        self.elements = read_only_view(np.ascontiguousarray(elements, dtype=np.int64))
         edges = _edges(self.nodes, self.elements)
         self.volumes = np.linalg.det(edges) / 6
         size = float(np.ptp(self.nodes, axis=0).max())
@@ -53,7 +54,7 @@ class Tetrahedra:
         self._rest_inverse = np.linalg.inv(edges)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the search trees, which cannot be pickled; they are built again on first use."""
+        """State without the search trees, which cannot be pickled; they are built again on first use."""
         return {key: value for key, value in self.__dict__.items() if key not in ("_tree", "_surface_tree")}
 
     @cached_property
@@ -62,9 +63,9 @@ class Tetrahedra:
 
     @cached_property
     def surface(self) -> Int[np.ndarray, "f 3"]:
-        """The faces that one tetrahedron has alone, counter-clockwise from outside."""
+        """Faces that one tetrahedron has alone, counter-clockwise from outside."""
         outward = np.where((self.volumes < 0)[:, None], self.elements[:, [1, 0, 2, 3]], self.elements)
-        return np.ascontiguousarray(igl.boundary_facets(outward)[0].astype(np.int64))
+        return read_only(np.ascontiguousarray(igl.boundary_facets(outward)[0].astype(np.int64)))
 
     @cached_property
     def _surface_tree(self) -> igl.AABB:
@@ -79,11 +80,11 @@ class Tetrahedra:
         return coo_array((weight / total[rows], (rows, columns)), (len(self.nodes), len(self.elements))).tocsr()
 
     def volume_ratios(self, nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
-        """Each tetrahedron's volume at other node positions, of that at rest; 0 or less where it is inverted."""
+        """Volume of each tetrahedron at other node positions, of that at rest; 0 or less where it is inverted."""
         return np.linalg.det(_edges(nodes, self.elements)) / (6 * self.volumes)
 
     def gradients(self, nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3 3"]:
-        """Deformation gradients A."""
+        """Deformation gradients A of all tetrahedra at other node positions."""
         return _edges(nodes, self.elements) @ self._rest_inverse
 
     def node_gradients(self, gradients: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "n 3 3"]:
@@ -92,7 +93,7 @@ class Tetrahedra:
         return mean.reshape(-1, 3, 3)
 
     def locate(self, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, " p"]:
-        """The tetrahedron around each point at rest, -1 outside."""
+        """Tetrahedron around each point at rest, -1 outside."""
         return _locate(self._tree, self.nodes, self.elements, points)
 
     def closest(
@@ -106,7 +107,7 @@ class Tetrahedra:
 
 @dataclass(frozen=True, eq=False)
 class TetrahedralMap:
-    """One state of a tetrahedral mesh as a map of space; satisfies ``Deformation`` and ``Invertible``.
+    """Map of space that one state of a tetrahedral mesh gives; satisfies ``Deformation`` and ``Invertible``.
 
     Inside the mesh it is piecewise affine, so the Jacobian's determinant is a tetrahedron's ratio of volumes. Outside
     it goes on from the closest surface point c along the gradient averaged there, ``f(p) = f(c) + A(c) (p - c)``: a
@@ -129,6 +130,7 @@ class TetrahedralMap:
         return self.rest.node_gradients(self._gradients)
 
     def __call__(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+        """Images of points: affine in each tetrahedron, and continued outside of them."""
         element = self.rest.locate(points)
         moved = np.empty_like(points, dtype=np.float64)
         inside = element >= 0
@@ -148,7 +150,7 @@ class TetrahedralMap:
     def rest_points(
         self, points: Float[np.ndarray, "p 3"], guess: Float[np.ndarray, "p 3"]
     ) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, " p"]]:
-        """Exact for points in a deformed tetrahedron: the affine map undone; Newton's method for those outside.
+        """Rest points of deformed ones: exact in a tetrahedron, by Newton's method outside.
 
         Where the deformed mesh overlaps itself one of the answers is given.
         """

@@ -2,7 +2,7 @@
 
 Each states the bound under which its Jacobian is positive and refuses parameters beyond it (``ValueError``), so that
 what can be made can be used. Global deformations after Barr, "Global and local deformations of solid primitives",
-SIGGRAPH 1984. Lengths share one unit, angles are in radians; notation as in ``deformation``.
+SIGGRAPH 1984. Lengths share one unit, angles are in radians; notation as in ``maps``.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ LATTICE_LIMIT = 1 / 2.48
 
 @dataclass(frozen=True, eq=False)
 class Bend:
-    """Bends a straight axis into a circular arc; before and beyond it space moves rigidly (Barr 1984).
+    """Bend of a straight axis into a circular arc; before and beyond it space moves rigidly (Barr 1984).
 
     Attributes:
         origin, axis: where the arc starts, and its direction there.
@@ -43,6 +43,7 @@ class Bend:
         _check_curvature(abs(self.angle_rad) / self.length, self.radius)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, in the points' unit."""
         axis = unit(self.axis)
         side = unit(self.toward - (self.toward @ axis) * axis)
         local = points - self.origin
@@ -60,7 +61,7 @@ class Bend:
 
 @dataclass(frozen=True, eq=False)
 class Twist:
-    """Turns cross-sections about an axis by an angle that grows smoothly from 0 to ``angle_rad`` over ``length``.
+    """Turn of cross-sections about an axis by an angle that grows smoothly from 0 to ``angle_rad`` over ``length``.
 
     Preserves volume exactly, whatever the angle: the Jacobian is 1 (Barr 1984).
     """
@@ -71,6 +72,7 @@ class Twist:
     angle_rad: float
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, in the points' unit."""
         axis = unit(self.axis)
         weight = smooth_step((points - self.origin) @ axis / self.length)
         return turn(points, self.origin, axis, self.angle_rad * weight)
@@ -78,7 +80,7 @@ class Twist:
 
 @dataclass(frozen=True, eq=False)
 class Taper:
-    """Scales cross-sections by a factor that goes smoothly from 1 to ``factor`` > 0 over ``length`` (Barr 1984).
+    """Scaling of cross-sections by a factor that goes smoothly from 1 to ``factor`` > 0 over ``length`` (Barr 1984).
 
     The Jacobian is the square of the local factor.
     """
@@ -92,6 +94,7 @@ class Taper:
         _check_factor(self.factor)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, in the points' unit."""
         axis = unit(self.axis)
         local = points - self.origin
         along = local @ axis
@@ -101,7 +104,7 @@ class Taper:
 
 @dataclass(frozen=True, eq=False)
 class Squash:
-    """Scales by ``factor`` > 0 along ``axis`` and by its inverse square root across: volume is preserved."""
+    """Scaling by ``factor`` > 0 along ``axis`` and by its inverse square root across: volume is preserved."""
 
     center: Float[np.ndarray, "3"]
     axis: Float[np.ndarray, "3"]
@@ -111,6 +114,7 @@ class Squash:
         _check_factor(self.factor)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, in the points' unit."""
         axis, across = unit(self.axis), self.factor**-0.5
         matrix = across * np.eye(3) + (self.factor - across) * np.outer(axis, axis)
         return self.center + (points - self.center) @ matrix
@@ -118,7 +122,7 @@ class Squash:
 
 @dataclass(frozen=True, eq=False)
 class SmoothField:
-    """Random smooth waves: ``x + sum_k a_k sin(b_k . x + c_k)``.
+    """Field of random smooth waves: ``x + sum_k a_k sin(b_k . x + c_k)``.
 
     The displacement's gradient has norm at most ``g = sum_k |a_k| |b_k|``. For g < 1, which is required, the map is a
     diffeomorphism of all space: distances change by a factor in [1 - g, 1 + g].
@@ -142,7 +146,7 @@ class SmoothField:
 
     @property
     def gradient_bound(self) -> float:
-        """g, from 0 to below 1."""
+        """Bound g of the displacement's gradient, from 0 to below 1."""
         lengths = [np.linalg.norm(vectors, axis=1) for vectors in (self.amplitudes, self.frequencies)]
         return float(lengths[0] @ lengths[1])
 
@@ -150,7 +154,7 @@ class SmoothField:
     def sample(
         cls, rng: np.random.Generator, strength: float, wavelength: tuple[float, float], modes: int = 4
     ) -> "SmoothField":
-        """``modes`` waves in random directions, wavelengths uniform in a range, with gradient bound ``strength``."""
+        """Field of ``modes`` random waves, wavelengths uniform in a range, with gradient bound ``strength``."""
         directions, amplitudes = named(rng, "pattern").normal(size=(2, modes, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         frequencies = directions * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
@@ -159,12 +163,13 @@ class SmoothField:
         return cls(amplitudes * (strength / shares), frequencies, phases)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, in the points' unit."""
         return points + np.sin(points @ self.frequencies.T + self.phases) @ self.amplitudes
 
 
 @dataclass(frozen=True, eq=False)
 class FreeFormLattice:
-    """Displaces space by a uniform cubic B-spline lattice; two spacings beyond the control points nothing moves.
+    """Uniform cubic B-spline lattice that displaces space; two spacings beyond the control points nothing moves.
 
     Each component of a control point's displacement must stay below ``spacing / 2.48``, under which the map is
     injective with a positive Jacobian (Choi & Lee 2000).
@@ -198,6 +203,7 @@ class FreeFormLattice:
         return cls(bounds[0] - spacing, spacing, named(rng, "control points").uniform(-limit, limit, size=shape))
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, in the points' unit."""
         at = ((points - self.origin) / self.spacing).T
         moves = [
             map_coordinates(
@@ -210,7 +216,7 @@ class FreeFormLattice:
 
 @dataclass(frozen=True, eq=False)
 class CurveSweep:
-    """Moves the x axis onto a curve: ``(x, y, z) -> c(x) + y n(x) + z b(x)``; straight before and beyond its ends.
+    """Sweep of the x axis onto a curve: ``(x, y, z) -> c(x) + y n(x) + z b(x)``; straight beyond its ends.
 
     The Jacobian is the curve's speed times one minus curvature times the offset towards the centre of curvature:
     positive within ``radius`` of the axis while curvature times radius is below one. Make it with ``through``.
@@ -231,7 +237,7 @@ class CurveSweep:
         normal: Float[np.ndarray, "3"],
         radius: float,
     ) -> "CurveSweep":
-        """The sweep onto a smooth curve, its frame free of twist.
+        """Sweep onto a smooth curve, its frame free of twist.
 
         Args:
             nodes: ascending arc lengths at which the curve is given.
@@ -251,6 +257,7 @@ class CurveSweep:
         return cls(curve, (float(nodes[0]), float(nodes[-1])))
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, in the points' unit."""
         s = np.clip(points[:, 0], *self.ends)
         values = self.curve(s)
         center, normal, binormal = values[:, :3], values[:, 3:6], values[:, 6:]
@@ -262,8 +269,10 @@ class CurveSweep:
 
 
 def transport_frames(tangents: Float[np.ndarray, "m 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "m 3 3"]:
-    """Rows tangent, normal, binormal along a curve, by parallel transport: from one tangent to the next the frame turns
-    by the smallest rotation, so it never twists about the curve (Bergou et al., "Discrete elastic rods", 2008).
+    """Frames along a curve, rows tangent, normal, binormal, by parallel transport.
+
+    From one tangent to the next the frame turns by the smallest rotation, so it never twists about the curve (Bergou
+    et al., "Discrete elastic rods", 2008).
     """
     a, b = tangents[:-1], tangents[1:]
     cross, cosine = np.cross(a, b), np.einsum("ni,ni->n", a, b)

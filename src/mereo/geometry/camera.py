@@ -40,12 +40,12 @@ class Camera:
 
     @classmethod
     def from_fov(cls, width: int, height: int, fov_rad: float) -> "Camera":
-        """Square pixels, principal point in the middle, ``fov_rad`` the full horizontal angle of view."""
+        """Camera of square pixels, principal point in the middle, ``fov_rad`` the full horizontal angle of view."""
         focal_px = 0.5 * width / float(np.tan(0.5 * fov_rad))
         return cls(width, height, focal_px, focal_px, 0.5 * width, 0.5 * height)
 
     def directions(self) -> Float[np.ndarray, "h w 3"]:
-        """Ray through each pixel centre, scaled to z = 1, so that depth times direction is the point."""
+        """Rays through the pixel centres, scaled to z = 1, so that depth times direction is the point."""
         x = (np.arange(self.width) + 0.5 - self.center_x_px) / self.focal_x_px
         y = (np.arange(self.height) + 0.5 - self.center_y_px) / self.focal_y_px
         grid_y, grid_x = np.meshgrid(y, x, indexing="ij")
@@ -81,7 +81,7 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """Depth along z for each pixel; 0 means no measurement.
+    """Image of depths along z; 0 means no measurement.
 
     Attributes:
         depth: in the sensor's units, finite and not negative.
@@ -103,10 +103,11 @@ class DepthImage:
 
     @property
     def valid(self) -> Bool[np.ndarray, "h w"]:
+        """Pixels with a measurement."""
         return self.depth > 0
 
     def to_points(self, mask: Bool[np.ndarray, "h w"] | None = None) -> PointCloud:
-        """Unproject every measured pixel (inside ``mask`` when given), row by row."""
+        """Point cloud of every measured pixel (inside ``mask`` when given), row by row."""
         keep = self.valid if mask is None else self.valid & mask
         points = self.camera.directions()[keep] * self.depth[keep][:, None]
         return PointCloud(points.astype(np.float64))

@@ -41,7 +41,7 @@ class LabelGrid:
 
 @dataclass(frozen=True, eq=False)
 class SegmentedCloud:
-    """The observed points and the segment that each lies on.
+    """Observed points and the segment that each lies on.
 
     Attributes:
         points: in the input's frame and units.

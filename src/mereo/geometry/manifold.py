@@ -9,10 +9,9 @@ Faces = Int[np.ndarray, "_ 3"]
 
 
 def solid_of(vertices: Vertices, faces: Faces) -> manifold3d.Manifold:
-    """A closed mesh as a solid; raises ``ValueError`` where manifold3d does not accept it."""
-    mesh = manifold3d.Mesh64(
-        np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.uint64)
-    )
+    """Solid of a closed mesh; raises ``ValueError`` where manifold3d does not accept it."""
+    # copies, because manifold3d takes no array that is read-only
+    mesh = manifold3d.Mesh64(np.array(vertices, np.float64, order="C"), np.array(faces, np.uint64, order="C"))
     solid = manifold3d.Manifold(mesh)
     if solid.status() != manifold3d.Error.NoError:
         raise ValueError(f"a mesh of {len(faces)} faces is no solid ({solid.status().name}); it must be closed")

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from mereo.geometry.read_only import read_only_view
+
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
 
@@ -32,7 +34,7 @@ PALETTE: tuple[Color, ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """One closed part of an object.
+    """Closed part of an object, as a named and coloured triangle mesh.
 
     Attributes:
         name: stable identifier, unique in its mesh.
@@ -49,6 +51,11 @@ class Segment:
     faces: Int[np.ndarray, "f 3"]
     solid: bool = True
 
+    def __post_init__(self) -> None:
+        # segments are shared by scenes, states and results: a change of one would be a change of all
+        for name in ("vertices", "faces"):
+            object.__setattr__(self, name, read_only_view(getattr(self, name)))
+
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """Lower and upper corner of the axis-aligned box."""
@@ -61,7 +68,7 @@ class Segment:
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
     def edge_imbalance(self) -> tuple[int, int]:
-        """``(open, misoriented)`` edge counts: both zero exactly when the mesh is closed and coherently oriented."""
+        """Numbers of open and of misoriented edges: both zero exactly when the mesh is closed and oriented alike."""
         directed = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
         low, high = directed.min(axis=1), directed.max(axis=1)
         key = low * (len(self.vertices) + 1) + high
@@ -73,7 +80,7 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class SegmentedMesh:
-    """An object: closed segments that touch but do not overlap, except that one may lie inside another.
+    """Object as closed segments that touch but do not overlap, except that one may lie inside another.
 
     Attributes:
         segments: in label order.
@@ -108,10 +115,12 @@ class SegmentedMesh:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the segments, in label order."""
         return tuple(segment.name for segment in self.segments)
 
     @property
     def colors(self) -> tuple[Color, ...]:
+        """Colours of the segments, in label order."""
         return tuple(segment.color for segment in self.segments)
 
     @property
@@ -122,7 +131,7 @@ class SegmentedMesh:
 
     @property
     def nesting(self) -> tuple[tuple[int, int], ...]:
-        """``nested`` as indices of segments, with what follows: a in b and b in c puts a in c."""
+        """Pairs (inner, outer) of segments' indices, with what follows: a in b and b in c puts a in c."""
         index = {name: i for i, name in enumerate(self.names)}
         pairs = {(index[inner], index[outer]) for inner, outer in self.nested}
         while more := {(a, d) for a, b in pairs for c, d in pairs if b == c} - pairs:
@@ -131,25 +140,25 @@ class SegmentedMesh:
 
     @property
     def opaque(self) -> tuple[bool, ...]:
-        """For each segment whether to draw it opaque: it hides no segment that has faces."""
+        """Whether to draw each segment opaque: it hides no segment that has faces."""
         hiding = {outer for inner, outer in self.nesting if len(self.segments[inner].faces)}
         return tuple(index not in hiding for index in range(len(self.segments)))
 
     @property
     def owned_volumes(self) -> Float[np.ndarray, " s"]:
-        """The volume that belongs to each segment: its mesh's without that of the segments nested in it."""
+        """Volume that belongs to each segment: its mesh's without that of the segments nested in it."""
         volumes = np.array([segment.volume for segment in self.segments])
         for outer in (i for i, s in enumerate(self.segments) if len(s.faces)):  # the inner ones come first and are done
             volumes[outer] -= sum(volumes[inner] for inner, other in self.nesting if other == outer)
         return volumes
 
     def with_vertices(self, vertices: Sequence[Float[np.ndarray, "_ 3"]]) -> "SegmentedMesh":
-        """The same segments at other positions; ``vertices[i]`` belongs to ``segments[i]``."""
+        """Mesh of the same segments at other positions; ``vertices[i]`` belongs to ``segments[i]``."""
         moved = tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True))
         return replace(self, segments=moved)
 
     def transformed(self, transform: Float[np.ndarray, "4 4"]) -> "SegmentedMesh":
-        """All vertices mapped by a homogeneous transform."""
+        """Mesh with all vertices mapped by a homogeneous transform."""
         rotation, translation = transform[:3, :3], transform[:3, 3]
         return self.with_vertices([s.vertices @ rotation.T + translation for s in self.segments])
 
@@ -214,7 +223,7 @@ def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray,
 
 
 def vertex_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
-    """Unit normals, outward, weighted by the area of the faces around."""
+    """Unit normals of a segment's vertices, outward, weighted by the area of the faces around."""
     a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
     normals = np.zeros_like(segment.vertices)
     for k in range(3):

@@ -23,7 +23,7 @@ MOST_BACKWARDS = 0.05
 
 @dataclass(frozen=True)
 class Health:
-    """What is wrong with one segment, as parts of a sentence that starts with its name.
+    """Faults of one segment, as parts of a sentence that starts with its name.
 
     Attributes:
         dirty: faults that the winding number copes with.
@@ -35,11 +35,12 @@ class Health:
 
     @property
     def sound(self) -> bool:
+        """Whether the segment has no fault."""
         return not (self.dirty or self.hopeless)
 
 
 def examine(segment: Segment) -> Health:
-    """The faults of a mesh: missing or broken data, open edges, faces that disagree, face inwards or are buried.
+    """Faults of a mesh: missing or broken data, open edges, faces that disagree, face inwards or are buried.
 
     Across a face the winding number rises by one from its front to its back. In front of it, it is 0 on a solid's
     surface, 1 where the face lies within the mesh itself (a self-intersection), and -1 where it faces inwards.
@@ -91,7 +92,7 @@ def _wrong_shares(segment: Segment) -> tuple[float, float]:
 
 
 def likely_unit(bounds: Float[np.ndarray, "2 3"]) -> str:
-    """A guess from the longest side: CAD and scanners write millimetres, robots and glTF metres."""
+    """Guess of a mesh's unit from its longest side: CAD and scanners write millimetres, robots and glTF metres."""
     longest = float((bounds[1] - bounds[0]).max())
     return "m" if longest < 3 else "mm"
 

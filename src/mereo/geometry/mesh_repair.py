@@ -39,14 +39,14 @@ REMESH_CELLS = 128
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """A mesh and what was done to it, each as a phrase; none where it was sound."""
+    """Mended mesh and what was done to it, each as a phrase; none where it was sound."""
 
     segment: Segment
     changes: tuple[str, ...]
 
 
 def repaired(segment: Segment) -> Repair:
-    """The segment as a closed solid that faces outwards and does not intersect itself.
+    """Segment mended to a closed solid that faces outwards and does not intersect itself.
 
     Raises ``ValueError`` where nothing is left to work with.
     """
@@ -135,7 +135,7 @@ def _orient(vertices: Vertices, faces: Faces) -> Step:
 
 
 def _signed_volume(vertices: Vertices, faces: Faces) -> float:
-    """About the middle of the patch, so that holes matter little."""
+    """Volume about the middle of the patch, so that holes matter little."""
     a, b, c = (vertices[faces[:, k]] - vertices[faces].mean(axis=(0, 1)) for k in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c)))
 
@@ -202,7 +202,7 @@ def _near_squared(
 
 
 def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list[str]]]:
-    """The mesh with each overlap cut from the larger segment, and what was done to which segment.
+    """Mesh with each overlap cut from the larger segment, and what was done to which segment.
 
     What sticks out of a segment that it is nested in is cut off. All segments must be solids.
     """
@@ -226,7 +226,7 @@ def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list
 
 
 def _without_flecks(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
-    """Without pieces of hardly any volume: Booleans of meshes that nearly touch leave them."""
+    """Mesh without pieces of hardly any volume: Booleans of meshes that nearly touch leave them."""
     piece = pieces(faces, len(vertices))
     a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
     volume = np.abs(np.bincount(piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c))))
@@ -238,7 +238,7 @@ def _without_flecks(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
 
 
 def pieces(faces: Faces, vertices: int) -> Int[np.ndarray, " f"]:
-    """For each face the number of its piece: faces that are connected over edges which exactly two of them share."""
+    """Number of the piece of each face; a piece is connected over edges which exactly two of its faces share."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1) @ [vertices, 1]
     order = np.argsort(edges, kind="stable")
     _, first, uses = np.unique(edges[order], return_index=True, return_counts=True)
@@ -248,7 +248,7 @@ def pieces(faces: Faces, vertices: int) -> Int[np.ndarray, " f"]:
 
 
 def largest_piece(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
-    """The piece of the most faces; unused vertices are left out."""
+    """Piece of the most faces; unused vertices are left out."""
     piece = pieces(faces, len(vertices))
     used, kept = np.unique(faces[piece == np.bincount(piece).argmax()], return_inverse=True)
     return vertices[used], kept.reshape(-1, 3)
@@ -262,7 +262,7 @@ def open_edges(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "_ 2"]:
 
 
 def close_holes(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
-    """Close every open loop by a fan around the mean of its vertices; a closed mesh stays as it is."""
+    """Mesh whose open loops are closed by fans around the mean of their vertices; a closed mesh stays as it is."""
     rim = open_edges(vertices, faces)
     graph = coo_array((np.ones(len(rim)), rim.reshape(-1, 2).T), shape=(len(vertices),) * 2)
     _, group = connected_components(graph, directed=False)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 @dataclass(frozen=True, eq=False)
 class Normalizer:
-    """``normalized = (points - center) * scale``, from the observed point cloud only.
+    """Map to normalized coordinates, ``(points - center) * scale``, from the observed point cloud only.
 
     Attributes:
         center: middle of the cloud's bounding box, in the camera frame (the paper's -t).
@@ -23,7 +23,7 @@ class Normalizer:
 
     @classmethod
     def fit(cls, points: Float[np.ndarray, "n 3"]) -> "Normalizer":
-        """The paper's t and s. Raises ``ValueError`` when the cloud has no extent."""
+        """Normalizer of a cloud, the paper's t and s. Raises ``ValueError`` when the cloud has no extent."""
         if len(points) == 0:
             raise ValueError("the point cloud is empty; it needs points on the object: check the mask and the units")
         low, high = points.min(axis=0), points.max(axis=0)
@@ -33,12 +33,14 @@ class Normalizer:
         return cls((low + high) / 2, 1.0 / half)
 
     def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points in normalized coordinates."""
         return (points - self.center) * self.scale
 
     def invert(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points in the cloud's frame and unit, from normalized coordinates."""
         return points / self.scale + self.center
 
     @property
     def viewpoint(self) -> Float[np.ndarray, "3"]:
-        """The camera's position (the origin of the camera frame) in normalized coordinates."""
+        """Position of the camera (the origin of the camera frame) in normalized coordinates."""
         return -self.center * self.scale

@@ -68,7 +68,7 @@ def _box_volume(segment: Segment) -> float:
 
 
 def grid_volume(segment: Segment, cells: int = CELLS) -> float:
-    """The volume inside a mesh, also of one with holes, measured on a grid: within a percent or so."""
+    """Volume inside a mesh, also of one with holes, measured on a grid: within a percent or so."""
     return _Filled(segment, cells).volume
 
 

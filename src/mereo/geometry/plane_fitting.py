@@ -19,7 +19,7 @@ REFINEMENTS = 3
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Points x with ``normal @ x == offset``.
+    """Plane of points x with ``normal @ x == offset``.
 
     Attributes:
         normal: unit length.
@@ -30,14 +30,14 @@ class Plane:
     offset: float
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Without sign."""
+        """Distance of points from the plane, without sign."""
         return np.abs(points @ self.normal - self.offset)
 
 
 def largest_plane(
     points: Float[np.ndarray, "n 3"], tolerance: Float[np.ndarray, " n"], rng: np.random.Generator
 ) -> Plane | None:
-    """The plane with the most points within ``tolerance``; None where no three points span one.
+    """Plane with the most points within ``tolerance``; None where no three points span one.
 
     Args:
         points: any unit.

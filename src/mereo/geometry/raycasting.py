@@ -19,7 +19,7 @@ _MARGIN = 1e-4
 
 
 class Hits(NamedTuple):
-    """Where rays first meet a surface.
+    """First meetings of rays with a surface.
 
     Attributes:
         distance: t; infinite where nothing is hit.
@@ -31,11 +31,11 @@ class Hits(NamedTuple):
 
     @classmethod
     def none(cls, count: int) -> "Hits":
-        """Rays that hit nothing (yet)."""
+        """Hits of rays that meet nothing (yet)."""
         return cls(np.full(count, np.inf), np.zeros((count, 3)))
 
     def nearer(self, rows: Int[np.ndarray, " m"], others: "Hits") -> Int[np.ndarray, " k"]:
-        """Which of ``rows`` the ``others`` meet something nearer on; these hits take it over, in place."""
+        """Rows of ``rows`` on which the ``others`` meet something nearer, which these hits take over, in place."""
         better = others.distance < self.distance[rows]
         kept = rows[better]
         self.distance[kept], self.normal[kept] = others.distance[better], others.normal[better]
@@ -43,7 +43,7 @@ class Hits(NamedTuple):
 
 
 def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> EmbreeScene:
-    """An Embree scene of one triangle mesh. It works in single precision: keep coordinates near the origin."""
+    """Embree scene of one triangle mesh. It works in single precision: keep coordinates near the origin."""
     scene = EmbreeScene(_DEVICE)
     TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
     return scene
@@ -52,7 +52,7 @@ def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"])
 def first_hits(
     scene: EmbreeScene, center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, " m"], Hits]:
-    """The rays that hit a scene whose coordinates are relative to ``center``, and their hits."""
+    """Rays that hit a scene whose coordinates are relative to ``center``, and their hits."""
     single = np.ascontiguousarray(directions, dtype=np.float32)
     origins = np.broadcast_to(-center.astype(np.float32), single.shape).copy()
     found = scene.run(origins, single, output=True)

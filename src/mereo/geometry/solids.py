@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.raycasting import Hits, first_hits, ray_scene, toward
+from mereo.geometry.read_only import read_only
 from mereo.geometry.winding_number import winding_grid
 
-_DIRECTIONS = np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32)
+_DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32))
 """Two generic directions: not along any axis, face diagonal or each other."""
 
 
@@ -92,7 +93,7 @@ class _Solid:
 
 
 class Nearest(NamedTuple):
-    """The closest surface point of each query point.
+    """Closest surface point of each query point.
 
     For a point of a nested segment, or of the one around it, the surface of all that is nearest bounds what its owner
     owns: the way out of the inner segment meets the inner surface first, the way in from empty space the outer one.
@@ -111,7 +112,7 @@ class Nearest(NamedTuple):
 
 
 class Solids:
-    """Queries on all segments of an object. Satisfies ``ownership.Shape``.
+    """Queries on all segments of an object. Satisfies ``synthesis.label_rules.Shape``.
 
     Points are [n, 3] in the mesh's frame; distances are in its units.
     """
@@ -127,7 +128,7 @@ class Solids:
         return self.mesh.merged()
 
     def boxes(self) -> Float[np.ndarray, "s 2 3"]:
-        """Axis-aligned box of each segment."""
+        """Axis-aligned boxes of the segments."""
         return np.stack([[solid.low, solid.high] for solid in self._solids])
 
     def inside(self, index: int, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -138,7 +139,7 @@ class Solids:
         return result
 
     def label(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-        """0 in empty space, else index + 1; where segments overlap the first one owns the point (so a nested one)."""
+        """Labels of points: 0 in empty space, else index + 1; of overlapping segments the first (so a nested one)."""
         labels = np.zeros(len(points), dtype=np.uint8)
         for index, solid in enumerate(self._solids):
             candidates = np.flatnonzero((labels == 0) & solid.in_box(points))
@@ -146,11 +147,11 @@ class Solids:
         return labels
 
     def segment_distance(self, index: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Unsigned distance to segment ``index``'s surface."""
+        """Distance of points, without sign, to the surface of segment ``index``."""
         return np.sqrt(self._solids[index].closest(points)[0])
 
     def nearest(self, points: Float[np.ndarray, "n 3"]) -> Nearest:
-        """The closest point over the surfaces of all segments."""
+        """Closest points over the surfaces of all segments."""
         bounds = np.stack([solid.squared_distance_to_box(points) for solid in self._solids])
         likely = bounds.argmin(axis=0)
         squared, place = np.full(len(points), np.inf), np.empty_like(points)
@@ -168,7 +169,7 @@ class Solids:
         return Nearest(np.sqrt(squared), place, face, owner)
 
     def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> Hits:
-        """Where rays ``t * direction`` from the origin first meet any surface, t > 0; directions have z = 1."""
+        """First meetings of rays ``t * direction`` from the origin with any surface, t > 0; directions have z = 1."""
         hits = Hits.none(len(directions))
         for solid in self._solids:
             hits.nearer(*solid.first_hit(directions))
@@ -206,8 +207,8 @@ def label_grid(
 ) -> UInt8[np.ndarray, "nx ny nz"]:
     """Exact labels on the product grid of three ascending coordinate arrays; the first segment wins an overlap.
 
-    Signed crossings are counted along columns instead of testing every node, see ``winding``: a closed segment has no
-    cracks, and a node exactly on a surface has the label of the node just above it.
+    Signed crossings are counted along columns instead of testing every node, see ``winding_number``: a closed segment
+    has no cracks, and a node exactly on a surface has the label of the node just above it.
     """
     labels = np.zeros((len(x), len(y), len(z)), dtype=np.uint8)
     for index, segment in enumerate(mesh.segments):

@@ -20,12 +20,12 @@ def inverse_rigid(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4
 def transform_points(
     transform: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*n 3"]
 ) -> Float[np.ndarray, "*n 3"]:
-    """Map points by a homogeneous transform."""
+    """Points mapped by a homogeneous transform."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
 def rotation_along(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """A rotation whose third column is ``axis``."""
+    """Rotation whose third column is along ``axis``."""
     z = axis / np.linalg.norm(axis)
     helper = np.eye(3)[np.argmin(np.abs(z))]
     x = np.cross(helper, z)
@@ -36,7 +36,7 @@ def rotation_along(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 def look_at(
     eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"], roll_rad: float = 0.0
 ) -> Float[np.ndarray, "4 4"]:
-    """``T_world_camera`` at ``eye``, optical axis through ``target``, image up along ``up`` before the roll."""
+    """Pose ``T_world_camera`` at ``eye``, optical axis through ``target``, image up along ``up`` before the roll."""
     z = target - eye
     z = z / np.linalg.norm(z)
     x = np.cross(z, up)

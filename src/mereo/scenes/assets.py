@@ -21,12 +21,12 @@ STALL_SECONDS = 20.0
 
 
 class AssetUnavailable(OSError):
-    """The file is in neither mirror nor cache and could not be downloaded; the text says how to get it."""
+    """Error of a file that no mirror, cache or download gives; the text says how to get it."""
 
 
 @dataclass(frozen=True)
 class Asset:
-    """One downloadable file.
+    """Downloadable file with its origin, hash and licence.
 
     Attributes:
         name: path below the mirror and the cache, for example ``bunny/bunny.off``.
@@ -175,7 +175,7 @@ def get(name: str) -> Path:
 
 
 def location(name: str) -> Path | None:
-    """Where ``get`` would find the asset without a download (not yet checked), or None."""
+    """Path where ``get`` would find the asset without a download (not yet checked), or None."""
     candidates = [Path(folder) / name for folder in (os.environ.get(MIRROR_VARIABLE), _cache()) if folder]
     return next((path for path in candidates if path.is_file()), None)
 

@@ -36,12 +36,12 @@ SMALLEST_SHARE = 1e-9
 
 
 class OutOfDraws(Exception):
-    """More was drawn than allowed: the scene refuses what it is given and draws again."""
+    """Error of a scene that draws more than allowed: it refuses what it is given and draws again."""
 
 
 @dataclass(frozen=True, eq=False)
 class Call:
-    """One call of the generator.
+    """One call of the generator, as it was recorded.
 
     Attributes:
         key, trail: where it came from.
@@ -66,24 +66,25 @@ class Call:
 
 
 class Recorder(NamedGenerator):
-    """A generator that records its draws, and takes those that it is given.
+    """Generator that records its draws, and takes those that it is given.
 
     Methods that are not here (``gamma``, ``spawn``, ...), choices without replacement and draws into an array that is
     given work, and depend on the seed alone; they get no slider.
     """
 
     def __init__(self, seed: int, given: Mapping[Key, Shares], most: int | None = None) -> None:
-        """``most`` is the largest number of calls before ``OutOfDraws``."""
+        """Recorder of one run; ``most`` is the largest number of calls before ``OutOfDraws``."""
         super().__init__(np.random.PCG64([seed, 1]))
         self.calls: list[Call] = []
         self._given, self._most = given, most
         self._fresh = np.random.default_rng([seed, 0])
         self._seen: Counter[Place] = Counter()
+        self._ends: Any = None
 
     def __reduce__(self) -> Any:
         raise TypeError("a Recorder belongs to one run of a scene and cannot be copied")
 
-    def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any, ends: Any = None) -> Shares:
+    def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any) -> Shares:
         if self._most is not None and len(self.calls) >= self._most:
             raise OutOfDraws
         trail, name = _trail(), self.take_name()
@@ -97,10 +98,12 @@ class Recorder(NamedGenerator):
             shares = self._fresh.random(size)
         shares = np.clip(shares, SMALLEST_SHARE, 1 - SMALLEST_SHARE)
         bounds = [np.broadcast_to(np.asarray(bound, dtype=float), shape).ravel() for bound in (low, high)]
-        self.calls.append(Call(key, trail, name, kind, shares, bounds[0], bounds[1], shape, ends))
+        self.calls.append(Call(key, trail, name, kind, shares, bounds[0], bounds[1], shape, self._ends))
+        self._ends = None
         return shares
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
+        """Uniform numbers between two bounds, which may be given in either order; recorded."""
         shape = _shape(size, low, high)
         # numpy takes the bounds in either order; a share counts from the lower one, as a slider does
         low, high = np.minimum(low, high), np.maximum(low, high)
@@ -108,22 +111,26 @@ class Recorder(NamedGenerator):
         return _plain(np.asarray(low, dtype=float) + shares * (np.asarray(high, dtype=float) - low))
 
     def random(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
+        """Uniform numbers in 0..1; recorded, unless they are drawn into ``out``."""
         if out is not None:
             return super().random(size, dtype, out)
         shape = _shape(size)
         return _plain(self._take("uniform", shape, 0.0, 1.0).reshape(shape).astype(dtype))
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
+        """Normal numbers of mean ``loc`` and standard deviation ``scale``; recorded."""
         shape = _shape(size, loc, scale)
         return _plain(loc + scale * ndtri(self._take("normal", shape, -np.inf, np.inf)).reshape(shape))
 
     def standard_normal(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
+        """Standard normal numbers; recorded, unless they are drawn into ``out``."""
         if out is not None:
             return super().standard_normal(size, dtype, out)
         shape = _shape(size)
         return _plain(ndtri(self._take("normal", shape, -np.inf, np.inf)).reshape(shape).astype(dtype))
 
     def triangular(self, left: Any, mode: Any, right: Any, size: Any = None) -> Any:
+        """Numbers of the triangular distribution; recorded."""
         shape = _shape(size, left, mode, right)
         shares = self._take("triangular", shape, left, right).reshape(shape)
         left, mode, right = (np.asarray(value, dtype=float) for value in (left, mode, right))
@@ -134,6 +141,7 @@ class Recorder(NamedGenerator):
     def integers(
         self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False
     ) -> Any:
+        """Whole numbers from ``low`` to below ``high``; recorded."""
         low, high = (0, low) if high is None else (low, high)
         high = np.asarray(high) + endpoint
         shape = _shape(size, low, high)
@@ -143,17 +151,19 @@ class Recorder(NamedGenerator):
     def choice(
         self, a: Any, size: Any = None, replace: bool = True, p: Any = None, axis: int = 0, shuffle: bool = True
     ) -> Any:
+        """Random elements of ``a``; recorded, unless they are drawn without replacement."""
         if not replace and size is not None:
             return super().choice(a, size, replace, p, axis, shuffle)
         options = np.arange(a) if np.ndim(a) == 0 else np.asarray(a)
         count, shape = options.shape[axis], _shape(size)
-        ends = np.cumsum(np.full(count, 1 / count) if p is None else p)
-        shares = self._take("choice", shape, 0, count, ends).reshape(shape)
+        self._ends = ends = np.cumsum(np.full(count, 1 / count) if p is None else p)
+        shares = self._take("choice", shape, 0, count).reshape(shape)
         index = np.minimum(np.searchsorted(ends, shares, side="right"), count - 1)
         chosen = np.take(options, index, axis=axis)
         return _plain(chosen)
 
     def permutation(self, x: Any, axis: int = 0) -> Any:
+        """The elements of ``x`` in random order; recorded as sort keys."""
         items = np.arange(x) if np.ndim(x) == 0 else np.asarray(x)
         order = np.argsort(self._take("permutation", (items.shape[axis],), 0.0, 1.0), kind="stable")
         return np.take(items, order, axis=axis)

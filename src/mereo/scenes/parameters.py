@@ -35,12 +35,12 @@ WITNESSES = 40
 
 
 class Refused(ValueError):
-    """A scene does not allow this state, for example because its parts would touch."""
+    """Error of a state that a scene does not allow, for example because its parts would touch."""
 
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """One state of a scene, and the draws that lead to it.
+    """State of a scene, and the draws that lead to it.
 
     Attributes:
         seed: of all that is not given.
@@ -58,13 +58,13 @@ class Played:
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """Which sliders there are; the same keys mean the same sliders."""
+        """Keys of the draws: the same keys mean the same sliders."""
         return tuple(call.key for call in self.calls)
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One degree of freedom.
+    """Degree of freedom of a scene, as a slider shows it.
 
     Attributes:
         key, index: which draw, and which of its numbers; None for all of them together.
@@ -89,14 +89,14 @@ class Parameter:
 
 
 def random_state(scene: Scene, seed: int) -> Played:
-    """The state of a seed. Another seed, another state."""
+    """State of a seed. Another seed, another state."""
     return _played(scene, seed, {}, {}, None)
 
 
 def play(
     scene: Scene, seed: int, given: Mapping[Key, Shares], most: int | None
 ) -> tuple[Recorder, tuple[Deformation, ...]]:
-    """Let the scene draw; ``mereo.scenes.draw_recorder`` counts the calls from here on."""
+    """Recorder and deformations of one run of a scene; ``scenes.draw_recorder`` counts the calls from here on."""
     recorder = Recorder(seed, given, most)
     return recorder, scene.sample_deformations(recorder)
 
@@ -119,7 +119,7 @@ def _played(
 
 
 def _renumbered(calls: Sequence[Call]) -> tuple[Call, ...]:
-    """Keys counted anew where calls were left out."""
+    """Calls with keys counted anew where calls were left out."""
     seen: Counter[Place] = Counter()
     result = []
     for call in calls:
@@ -175,7 +175,7 @@ def _witness(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.nd
 
 
 def parameters(played: Played) -> tuple[Parameter, ...]:
-    """What can be moved in this state, in the order in which it is drawn, with names that differ within a group."""
+    """Degrees of freedom of this state, in the order in which they are drawn, with names that differ in a group."""
     found: list[Parameter] = []
     titles = [_title(call) for call in played.calls]
     repeated = Counter(titles)
@@ -237,7 +237,7 @@ def _parameter(call: Call, index: int, group: str, name: str) -> Parameter:
 
 
 def set_value(scene: Scene, played: Played, parameter: Parameter, value: float) -> Played:
-    """The state with one degree of freedom at another value, within its bounds.
+    """State with one degree of freedom at another value, within its bounds.
 
     Draws that only the new state needs are random, and those of the old one are remembered for the way back. Raises
     ``Refused`` where the scene does not take the value.
@@ -263,7 +263,7 @@ def set_value(scene: Scene, played: Played, parameter: Parameter, value: float) 
 
 
 def turned(shares: Shares, turn: float, seed: int) -> Shares:
-    """Many numbers moved at once, so that they stay as random as they were.
+    """Shares of many numbers moved at once, so that they stay as random as they were.
 
     As normal numbers z they go round a circle through other ones w: z cos + w sin has the same distribution everywhere
     on it (elliptical slice sampling, Murray et al., AISTATS 2010, walks on the same curve). 0 and 1 are the start.

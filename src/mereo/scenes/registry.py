@@ -18,9 +18,9 @@ def is_yaml(scene: "str | Path | Scene") -> bool:
 
 
 def load_scene(name: str | Path) -> Scene:
-    """A scene by its built-in name, or from a file: YAML (``scenes.files.build``), or Python
-    (``scenes.files.python``), which is run.
+    """Scene by its built-in name, or from a file, YAML or Python.
 
+    YAML files are read by ``scenes.files.build``; Python files are run, by ``scenes.files.python``.
     Raises ``ValueError`` listing what there is for an unknown name, or saying what is wrong with a file;
     ``FileNotFoundError`` where it, or a mesh that it names, does not exist.
     """

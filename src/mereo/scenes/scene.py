@@ -17,7 +17,7 @@ WHOLE_SPHERE_RAD = float(np.deg2rad(360.0))
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """Where the camera may be: a cone around ``axis`` with its tip at the object (paper, appendix B).
+    """Places where the camera may be: a cone around ``axis`` with its tip at the object (paper, appendix B).
 
     Attributes:
         aperture_rad: full opening angle of the cone; 2 pi is the whole sphere.
@@ -35,7 +35,7 @@ class Workspace:
     fov_rad: float = float(np.deg2rad(35.0))
 
     def sample(self, rng: np.random.Generator, target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-        """``T_world_camera`` of a camera aimed at ``target``, uniform in direction and in distance."""
+        """Pose ``T_world_camera`` of a camera aimed at ``target``, uniform in direction and in distance."""
         cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, np.pi)), 1.0)
         azimuth = rng.uniform(0.0, 2 * np.pi)
         distance = rng.uniform(*self.distance)
@@ -45,7 +45,7 @@ class Workspace:
     def pose(
         self, target: Float[np.ndarray, "3"], cosine: float, azimuth_rad: float, distance: float, roll_rad: float = 0.0
     ) -> Float[np.ndarray, "4 4"]:
-        """``T_world_camera`` of a camera aimed at ``target``, by its azimuth and the cosine of its tilt."""
+        """Pose ``T_world_camera`` of a camera aimed at ``target``, by its azimuth and the cosine of its tilt."""
         sine = np.sqrt(1.0 - cosine**2)
         local = np.array([sine * np.cos(azimuth_rad), sine * np.sin(azimuth_rad), cosine])
         to_camera = rotation_along(np.asarray(self.axis, dtype=float)) @ local
@@ -54,7 +54,7 @@ class Workspace:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """One random state of a scene, in the scene's own (world) frame.
+    """Random state of a scene, in the scene's own (world) frame.
 
     Attributes:
         mesh: the deformed segments.
@@ -67,7 +67,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A deformable object to learn.
+    """Deformable object to learn.
 
     Attributes:
         name: stable identifier.
@@ -98,15 +98,15 @@ class Scene:
             )
 
     def for_seed(self, seed: int) -> "Scene":
-        """What a seed draws from: one for testing (``TEST_SEED_START`` up) the held-out states, where there are any."""
+        """Scene that a seed draws from: its held-out states for testing (``TEST_SEED_START`` up), or itself."""
         return self.held_out if self.held_out is not None and seed >= TEST_SEED_START else self
 
     def sample_state(self, rng: np.random.Generator) -> State:
-        """A random deformed state within the scene's hand-made bounds."""
+        """Random deformed state within the scene's hand-made bounds."""
         return self.deform(self.sample_deformations(rng))
 
     def deform(self, deformations: tuple[Deformation, ...]) -> State:
-        """The state made by one deformation per segment; vertices shared by a common map are moved in one call."""
+        """State made by one deformation per segment; vertices shared by a common map are moved in one call."""
         groups: dict[int, list[int]] = {}
         for index, deformation in enumerate(deformations):
             groups.setdefault(id(deformation), []).append(index)

@@ -7,5 +7,5 @@ TEST_SEED_START = 1_000_000
 
 
 def example_rng(seed: int, index: int) -> np.random.Generator:
-    """The generator of example ``index``: any example can be remade alone, in any order, by any process."""
+    """Generator of example ``index``: any example can be remade alone, in any order, by any process."""
     return np.random.default_rng(np.random.SeedSequence([seed, index]))

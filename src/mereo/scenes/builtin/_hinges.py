@@ -32,7 +32,7 @@ MARGIN = 0.03
 
 @dataclass(frozen=True)
 class Knuckle:
-    """A joint about a vertical axis.
+    """Joint about a vertical axis.
 
     Attributes:
         pivot: middle of the knob.
@@ -51,11 +51,11 @@ class Knuckle:
     clearance: float = 0.18
 
     def knob_side(self) -> Manifold:
-        """The part of space that the knob's link may fill."""
+        """Part of space that the knob's link may fill."""
         return self._sector(self.sector_rad) + self._knob(0.0)
 
     def knob_room(self) -> Manifold:
-        """What has to be free of the socket's link: the knob's side, the opening and the clearance."""
+        """Room that has to be free of the socket's link: the knob's side, the opening and the clearance."""
         return self._sector(self.sector_rad + self.opening_rad) + self._knob(self.clearance)
 
     def _sector(self, half_angle_rad: float) -> Manifold:
@@ -71,7 +71,7 @@ class Knuckle:
         return revolved(np.array(profile), 14).translate(self.pivot)
 
     def share(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """1 in the knob's link, 0 in the socket's, and between them linear across the air."""
+        """Share of the knob's turn: 1 in its link, 0 in the socket's, and between them linear across the air."""
         x, y, z = (points - np.array(self.pivot)).T
         angle = np.arctan2(y, x) - self.heading_rad
         angle = np.abs((angle + np.pi) % (2 * np.pi) - np.pi)
@@ -89,7 +89,7 @@ def _polar(angle_rad: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Hinged:
-    """A chain of links, from the one that stays to the last: every knuckle turns what lies on its knob's side.
+    """Chain of links, from the one that stays to the last: every knuckle turns what lies on its knob's side.
 
     Each link moves rigidly. Rotation k is about the pivot of knuckle k at rest, as axis times radians. Where it is
     about the vertical, the Jacobian is 1 plus the angle times the share's slope around the pivot, so that it is
@@ -100,6 +100,7 @@ class Hinged:
     rotation_vectors: Float[np.ndarray, "k 3"]
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points in a link, or in the air between two."""
         shares = [knuckle.share(points) for knuckle in self.knuckles]
         chain = list(zip(self.knuckles, shares, self.rotation_vectors, strict=True))
         for knuckle, share, vector in reversed(chain):
@@ -111,7 +112,7 @@ class Hinged:
 def follow(
     before: Float[np.ndarray, "4 4"], knuckle: Knuckle, rotation_vector: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """The motion of a knob's link from rest, given that of its socket's."""
+    """Motion of a knob's link from rest, given that of its socket's."""
     rotation, pivot = Rotation.from_rotvec(rotation_vector).as_matrix(), np.array(knuckle.pivot)
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = rotation, pivot - rotation @ pivot
@@ -119,5 +120,5 @@ def follow(
 
 
 def rigid_map(motion: Float[np.ndarray, "4 4"]) -> Rigid:
-    """A homogeneous rigid transform as a deformation."""
+    """Deformation of a homogeneous rigid transform."""
     return Rigid(Rotation.from_matrix(motion[:3, :3]).as_rotvec(), motion[:3, 3], np.zeros(3))

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin._human_parts import joints
 
 Turns = tuple[tuple[str, float, float], ...]
@@ -17,7 +18,7 @@ Turns = tuple[tuple[str, float, float], ...]
 
 @dataclass(frozen=True)
 class BodyJoint:
-    """What turns about one point.
+    """Joint of the body: what turns about one point.
 
     Attributes:
         name: of the part it moves.
@@ -38,12 +39,12 @@ class BodyJoint:
 
     @property
     def head(self) -> Float[np.ndarray, "3"]:
-        """The joint's place."""
+        """Place of the joint, in scene coordinates."""
         return joints()[f"{self.bone}____head"]
 
     @property
     def direction(self) -> Float[np.ndarray, "3"]:
-        """Of the part, a unit vector."""
+        """Direction of the part, a unit vector."""
         along = joints()[self.tip] - self.head
         unit: Float[np.ndarray, "3"] = along / np.linalg.norm(along)
         return unit
@@ -63,7 +64,7 @@ def _trunk() -> Iterator[BodyJoint]:
 
 
 def _limbs(side: str) -> Iterator[BodyJoint]:
-    """Of one side, `L` or `R`; the limits are those of the left side and mirrored for the right one."""
+    """Joints of one side, `L` or `R`; the limits are those of the left side and mirrored for the right one."""
 
     def limb(
         name: str, parent: str, bone: str, tip: str, skin: tuple[str, ...], softness: float, turns: Turns
@@ -93,12 +94,12 @@ PARENTS = tuple(NAMES.index(joint.parent) if joint.parent else -1 for joint in J
 
 @cache
 def turn_axes() -> Float[np.ndarray, "j 3 3"]:
-    """For each joint its axes in the rest pose, in the order of its turns; zero where it has fewer than three."""
+    """Axes of each joint in the rest pose, in the order of its turns; zero where it has fewer than three."""
     axes = np.zeros((len(JOINTS), 3, 3))
     for index, joint in enumerate(JOINTS):
         for place, (name, _, _) in enumerate(joint.turns):
             axes[index, place] = _axis(joint, name)
-    return axes
+    return read_only(axes)
 
 
 @cache
@@ -107,7 +108,7 @@ def turn_limits() -> Float[np.ndarray, "2 j 3"]:
     limits = np.zeros((2, len(JOINTS), 3))
     for index, joint in enumerate(JOINTS):
         limits[:, index, : len(joint.turns)] = np.deg2rad([turn[1:] for turn in joint.turns]).T
-    return limits
+    return read_only(limits)
 
 
 @cache
@@ -139,14 +140,14 @@ def _axis(joint: BodyJoint, name: str) -> Float[np.ndarray, "3"]:
 
 @cache
 def part_axes() -> tuple[Float[np.ndarray, "j 3 3"], Float[np.ndarray, "j 3"]]:
-    """For each part the projection across its axis, and the joint at which it begins."""
+    """Projection across the axis of each part, and the joint at which it begins."""
     directions = np.stack([joint.direction for joint in JOINTS])
     projections = np.eye(3) - directions[:, :, None] * directions[:, None]
-    return projections, np.stack([joint.head for joint in JOINTS])
+    return read_only(projections), read_only(np.stack([joint.head for joint in JOINTS]))
 
 
 def rotations(angles_rad: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3"]:
-    """Axis times angle of every joint whose turns have these angles."""
+    """Rotations of joints whose turns have these angles, as axis times angle."""
     first, second, third = (
         Rotation.from_rotvec(angles_rad[:, place, None] * turn_axes()[:, place]) for place in range(3)
     )

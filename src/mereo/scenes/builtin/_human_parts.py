@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes import assets
 from mereo.scenes.builtin._real_meshes import simplified
 from mereo.scenes.builtin._solids import Vector, segment_of
@@ -38,16 +39,16 @@ EYE, EYE_RADIUS = (0.308, 7.284, 1.245), 0.146
 
 @dataclass(frozen=True)
 class Wedge:
-    """What is on the positive side of every plane (a point, a normal); model coordinates."""
+    """Part of space on the positive side of every plane (a point, a normal); model coordinates."""
 
     planes: tuple[tuple[Vector, Vector], ...]
 
     def mirrored(self) -> "Wedge":
-        """The same on the other side of the body."""
+        """Wedge on the other side of the body."""
         return Wedge(tuple(((-p[0], p[1], p[2]), (-n[0], n[1], n[2])) for p, n in self.planes))
 
     def solid(self) -> manifold3d.Manifold:
-        """As much of it as holds any part of the body, in scene coordinates."""
+        """Solid of the wedge, as much of it as holds any part of the body, in scene coordinates."""
         solid = manifold3d.Manifold.cube((200.0, 200.0, 200.0), True)
         for point, normal in self.planes:
             origin = to_scene(np.array([point]))[0]
@@ -80,7 +81,7 @@ class Base:
 
 @cache
 def base() -> Base:
-    """The asset `human/makehuman_base.obj`."""
+    """Base mesh of the asset `human/makehuman_base.obj`."""
     rows: list[list[float]] = []
     quads: list[list[int]] = []
     group = ""
@@ -93,7 +94,8 @@ def base() -> Base:
         elif kind == "f" and group == "body":
             quads.append([int(word.partition("/")[0]) - 1 for word in rest.split()])
     corners = np.array(quads, dtype=np.int64)
-    return Base(np.array(rows), np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]))
+    faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+    return Base(read_only(np.array(rows)), read_only(faces))
 
 
 @cache
@@ -101,11 +103,11 @@ def _model_center() -> Float[np.ndarray, "3"]:
     """Middle of the body's box."""
     body = base().vertices[base().faces.ravel()]
     center: Float[np.ndarray, "3"] = (body.min(axis=0) + body.max(axis=0)) / 2
-    return center
+    return read_only(center)
 
 
 def to_scene(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Model to scene coordinates."""
+    """Points from model to scene coordinates."""
     return (points - _model_center()) * SCALE
 
 
@@ -114,22 +116,24 @@ def joints() -> Mapping[str, Float[np.ndarray, "3"]]:
     """Heads and tails of the bones by MakeHuman's names (``upperarm01.L____head``), in scene coordinates."""
     skeleton = json.loads(assets.get("human/makehuman_default.mhskel").read_text())
     places: dict[str, list[int]] = skeleton["joints"]
-    return {name: to_scene(base().vertices[rows].mean(axis=0, keepdims=True))[0] for name, rows in places.items()}
+    middles = {name: base().vertices[rows].mean(axis=0, keepdims=True) for name, rows in places.items()}
+    return {name: read_only(to_scene(middle)[0]) for name, middle in middles.items()}
 
 
 @cache
 def skin_weights() -> Mapping[str, tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]]:
-    """For each bone the base vertices it moves, and its share in each."""
+    """Base vertices that each bone moves, and its share in each."""
     stored: dict[str, list[Any]] = json.loads(assets.get("human/makehuman_default_weights.mhw").read_text())["weights"]
-    return {
-        bone: (np.array([row for row, _ in pairs], dtype=np.int64), np.array([float(share) for _, share in pairs]))
-        for bone, pairs in stored.items()
-    }
+    weights = {}
+    for bone, pairs in stored.items():
+        rows, shares = zip(*pairs, strict=True)
+        weights[bone] = read_only(np.array(rows, dtype=np.int64)), read_only(np.array(shares, dtype=np.float64))
+    return weights
 
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The body as MakeHuman stores it: standing, arms away from the body, in ten segments."""
+    """Body as MakeHuman stores it: standing, arms away from the body, in ten segments."""
     head, torso = _body().split(HEAD.solid())
     limbs: dict[str, manifold3d.Manifold] = {}
     for side in ("left", "right"):

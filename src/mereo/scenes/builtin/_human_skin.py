@@ -15,6 +15,7 @@ from scipy.sparse import csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from mereo.geometry.read_only import read_only
 from mereo.geometry.solids import label_grid
 from mereo.scenes.builtin._human_joints import JOINTS, PARENTS, part_axes
 from mereo.scenes.builtin._human_parts import base, rest_mesh, skin_weights, to_scene
@@ -30,7 +31,7 @@ STEPS = 3
 
 @dataclass(frozen=True, eq=False)
 class ShareField:
-    """How much of every joint's turn a point takes part in: trilinear between the nodes of a grid.
+    """Field of each joint's share in a point: trilinear between the nodes of a grid.
 
     Attributes:
         origin: of the grid.
@@ -43,6 +44,7 @@ class ShareField:
     table: Float[np.ndarray, "r j"]
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n j"]:
+        """Shares of all joints in points."""
         at = np.clip((points - self.origin) / SPACING, 0.0, np.array(self.row.shape) - 1.001)
         cell = at.astype(np.int64)
         strides = np.array([self.row.shape[1] * self.row.shape[2], self.row.shape[2], 1])
@@ -60,7 +62,7 @@ class ShareField:
 
 @cache
 def share_field() -> ShareField:
-    """Of the body at rest."""
+    """Share field of the body at rest."""
     rest = rest_mesh()
     low, high = rest.bounds
     first, last = np.floor(low / SPACING - SHELL), np.ceil(high / SPACING + SHELL)
@@ -135,7 +137,7 @@ def _extended(shares: Float[np.ndarray, "r j"], number: Int[np.ndarray, "x y z"]
 
 @dataclass(frozen=True, eq=False)
 class PosedBody:
-    """The body's shape, then its pose: every joint turns each point by the point's share of the joint's angle.
+    """Map of the body's shape, then its pose: every joint turns each point by the point's share of its angle.
 
     Angles are blended, not matrices, so every step stays a rotation and limbs do not collapse (cf. Kavan & Zara,
     "Spherical blend skinning", 2005). Joints turn from the leaves to the root, in rest coordinates.
@@ -151,6 +153,7 @@ class PosedBody:
     stretch: float
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, shaped and posed."""
         shares = share_field()(points)
         moved = self._shaped(points, shares)
         heads, angles = self.heads(), np.linalg.norm(self.rotations, axis=1)
@@ -164,7 +167,7 @@ class PosedBody:
         return moved
 
     def heads(self) -> Float[np.ndarray, "j 3"]:
-        """The joints of the shaped body, before it is posed; girth leaves a part's axis where it is."""
+        """Places of the joints in the shaped body, before it is posed; girth leaves a part's axis where it is."""
         return part_axes()[1] * self._scale()
 
     def _scale(self) -> Float[np.ndarray, "3"]:
@@ -186,4 +189,4 @@ def _own_shares() -> Float[np.ndarray, "j j"]:
     for child, parent in enumerate(PARENTS):
         if parent >= 0:
             own[child, parent] = -1.0
-    return own
+    return read_only(own)

@@ -17,6 +17,7 @@ from mereo.deformation.warps import Bend, FreeFormLattice, Squash, Twist
 from mereo.geometry.manifold import Faces, Vertices, solid_of
 from mereo.geometry.mesh import PALETTE, Segment, vertex_normals
 from mereo.geometry.mesh_repair import close_holes, largest_piece
+from mereo.geometry.read_only import read_only
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes import assets
 from mereo.scenes.builtin._real_meshes import main_part, simplified
@@ -45,13 +46,13 @@ WORKSPACE = Workspace(axis=(-0.05, -0.6, -0.8), fov_rad=float(np.deg2rad(22.0)))
 
 
 def repaired_liver() -> tuple[Vertices, Faces]:
-    """The liver's largest piece with its open loop closed, millimetres: 28,560 faces, 1,762 cubic centimetres."""
+    """Largest piece of the liver with its open loop closed, millimetres: 28,560 faces, 1,762 cubic centimetres."""
     raw = read_segmented_mesh(assets.get("liver/lapgym_liver_visual.stl")).segments[0]
     return close_holes(*largest_piece(raw.vertices, raw.faces))
 
 
 def to_scene(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """From the source's frame in millimetres to the scene's."""
+    """Points from the source's frame in millimetres to the scene's."""
     return (points_mm - np.array(CENTER_MM)) * MM
 
 
@@ -73,7 +74,7 @@ def _segment(name: str, color: int, solid: manifold3d.Manifold) -> Segment:
 
 
 class Instrument(NamedTuple):
-    """What an instrument does to the tissue around its tip.
+    """Instrument and what it does to the tissue around its tip.
 
     Attributes:
         shift_mm: least and most displacement of the tip; along the outward normal, or against it where negative.
@@ -86,7 +87,7 @@ class Instrument(NamedTuple):
     reach_mm: float
 
     def sample(self, rng: np.random.Generator, tip: Vertices, normal: Vertices) -> Localized:
-        """At one of the given places, within 30 degrees of its normal or so."""
+        """Random pull at one of the given places, within 30 degrees of its normal or so."""
         index = named(rng, "place").integers(len(tip))
         direction = normal[index] + 0.35 * named(rng, "slant").normal(size=3)
         direction *= named(rng, "shift", "mm").uniform(*self.shift_mm) * MM / np.linalg.norm(direction)
@@ -110,9 +111,9 @@ EDGE_SHARE = 0.12
 
 @cache
 def _places() -> dict[str, tuple[Vertices, Vertices]]:
-    """Where each kind of instrument may be, with outward normals."""
+    """Places where each kind of instrument may be, with outward normals."""
     liver, gallbladder = organs()
-    normals = [vertex_normals(part) for part in (liver, gallbladder)]
+    normals = [read_only(vertex_normals(part)) for part in (liver, gallbladder)]
     tree = cKDTree(liver.vertices)
     around = tree.query_ball_point(liver.vertices, 25.0 * MM)
     mean = np.stack([liver.vertices[rows].mean(axis=0) for rows in around])
@@ -120,14 +121,14 @@ def _places() -> dict[str, tuple[Vertices, Vertices]]:
     height = np.einsum("ni,ni->n", normals[0], liver.vertices - mean)
     edge = height > np.quantile(height, 1 - EDGE_SHARE)
     return {
-        "edge": (liver.vertices[edge], normals[0][edge]),
+        "edge": (read_only(liver.vertices[edge]), read_only(normals[0][edge])),
         "gallbladder": (gallbladder.vertices, normals[1]),
         "surface": (liver.vertices, normals[0]),
     }
 
 
 def sample_field(rng: np.random.Generator) -> Compose:
-    """One random deformation of all tissue: instruments first, then posture and breathing."""
+    """Random deformation of all tissue: instruments first, then posture and breathing."""
     places = _places()
     names = tuple(INSTRUMENTS)
     order = named(rng, tuple(f"order of the {name}" for name in names)).permutation(3)

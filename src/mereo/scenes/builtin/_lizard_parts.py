@@ -31,12 +31,12 @@ _HEIGHTS = (3.6, 4.2, 4.5, 5.0, 5.4, 5.8, 6.0, 5.8, 5.3, 4.7, 4.2, 3.6, 3.0, 2.5
 
 
 def half_width(station: float) -> float:
-    """Of trunk and tail, without scales."""
+    """Half of the width of trunk and tail at stations, without scales."""
     return float(np.interp(station, _STATIONS, _WIDTHS))
 
 
 def height(station: float) -> float:
-    """Of trunk and tail, without scales."""
+    """Height of trunk and tail at stations, without scales."""
     return float(np.interp(station, _STATIONS, _HEIGHTS))
 
 
@@ -52,7 +52,7 @@ SPINE = tuple(_spine_knuckle(number) for number in range(len(HINGES)))
 
 @dataclass(frozen=True)
 class LegPlan:
-    """A left leg seen from above; right legs are its mirror images.
+    """Plan of a left leg seen from above; right legs are its mirror images.
 
     Attributes:
         root: station and y of the knuckle on the trunk.
@@ -76,7 +76,7 @@ REAR_LEG = LegPlan((38.3, 4.2), (2.0, 4.6), (-1.6, 7.9), 1.75, (2.0, 1.7, 1.3), 
 
 @dataclass(frozen=True)
 class Leg:
-    """A leg's knuckles and solids: ``upper`` from the trunk to the ankle, ``foot`` beyond it."""
+    """Knuckles and solids of a leg: ``upper`` from the trunk to the ankle, ``foot`` beyond it."""
 
     root: Knuckle
     ankle: Knuckle
@@ -86,7 +86,7 @@ class Leg:
 
 @cache
 def leg(plan: LegPlan, side: int) -> Leg:
-    """One leg, ``side`` +1 for left and -1 for right."""
+    """Leg of a plan, ``side`` +1 for left and -1 for right."""
     x, y = NOSE - plan.root[0], plan.root[1]
     root, knee, ankle = (x, y), (x + plan.knee[0], y + plan.knee[1]), (x + plan.ankle[0], y + plan.ankle[1])
     shank_rad = float(np.arctan2(ankle[1] - knee[1], ankle[0] - knee[0]))
@@ -142,7 +142,7 @@ def _on_the_ground(part: Manifold) -> Manifold:
 
 
 def _largest(part: Manifold) -> Manifold:
-    """Without the crumbs that a cut leaves of a scale."""
+    """Largest part of a solid, without the crumbs that a cut leaves of a scale."""
     return max(part.decompose(), key=lambda piece: float(piece.volume()))
 
 
@@ -232,7 +232,7 @@ def _head() -> Manifold:
 
 @cache
 def spine_links() -> tuple[Manifold, ...]:
-    """Head, five of the trunk and seven of the tail: one solid for each link, with air between."""
+    """Links of head, trunk (five) and tail (seven): one solid for each, with air between."""
     body = _on_the_ground(union(_trunk_and_tail(), _head(), *_scales()))
     carried = {SHOULDER_LINK: FRONT_LEG, HIP_LINK: REAR_LEG}
     links = []

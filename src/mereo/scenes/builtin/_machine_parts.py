@@ -33,14 +33,14 @@ Outline = Sequence[tuple[float, float]]
 
 
 def along(axis: Axis, part: Manifold) -> Manifold:
-    """A part made along z, turned to ``axis``."""
+    """Part made along z, turned to ``axis``."""
     shift = {"x": 1, "y": 2, "z": 0}[axis]
     turn = np.roll(np.eye(3), shift, axis=0)
     return part.transform(np.column_stack([turn, np.zeros(3)]))
 
 
 def box(low: Vector, high: Vector, chamfer: float = 0.0) -> Manifold:
-    """A block between two corners, its twelve edges cut off by ``chamfer``."""
+    """Block between two corners, its twelve edges cut off by ``chamfer``."""
     lower, upper = np.array(low), np.array(high)
     if chamfer == 0.0:
         return Manifold.cube(tuple(upper - lower)).translate(low)
@@ -55,7 +55,7 @@ def box(low: Vector, high: Vector, chamfer: float = 0.0) -> Manifold:
 def shaft(
     axis: Axis, start: Vector, length: float, radius: float, end_radius: float = -1.0, sides: int = 24
 ) -> Manifold:
-    """A cylinder or cone from ``start`` along ``axis``; a negative ``length`` goes the other way."""
+    """Cylinder or cone from ``start`` along ``axis``; a negative ``length`` goes the other way."""
     part = Manifold.cylinder(abs(length), radius, end_radius, sides)
     if length < 0:
         part = part.rotate((180.0, 0.0, 0.0))
@@ -63,13 +63,13 @@ def shaft(
 
 
 def turned(axis: Axis, center: Vector, profile: Outline, sides: int = 24) -> Manifold:
-    """A lathe part: ``profile`` lists (position along the axis, radius), both ends are closed towards the axis."""
+    """Lathe part: ``profile`` lists (position along the axis, radius), both ends are closed towards the axis."""
     outline = [(0.0, profile[0][0]), *((radius, height) for height, radius in profile), (0.0, profile[-1][0])]
     return along(axis, Manifold.revolve(_section(outline), sides)).translate(center)
 
 
 def plate(axis: Axis, outline: Outline, low: float, high: float) -> Manifold:
-    """A flat part with an ``outline`` between two positions along ``axis``."""
+    """Flat part with an ``outline`` between two positions along ``axis``."""
     return along(axis, Manifold.extrude(_section(outline), high - low).translate((0.0, 0.0, low)))
 
 
@@ -79,7 +79,7 @@ def _section(outline: Outline) -> CrossSection:
 
 
 def ring_of(axis: Axis, center: Vector, radius: float, count: int, first_rad: float = 0.0) -> list[Vector]:
-    """``count`` places evenly on a circle about ``axis``; angles are counted in the outline's plane (u, v)."""
+    """Places, ``count`` of them, evenly on a circle about ``axis``; angles count in the outline's plane (u, v)."""
     angle = first_rad + 2 * np.pi * np.arange(count) / count
     circle = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)], axis=1)
     shift = {"x": 1, "y": 2, "z": 0}[axis]
@@ -99,7 +99,7 @@ def _moved(place: Vector, axis: Axis, distance: float) -> Vector:
 
 
 def toothed(axis: Axis, start: Vector, length: float, radius: float, teeth: int, depth: float) -> Manifold:
-    """A straight toothed wheel: ``radius`` over the teeth, trapezoids of ``depth``."""
+    """Straight toothed wheel: ``radius`` over the teeth, trapezoids of ``depth``."""
     pitch = 2 * np.pi / teeth
     outline = [
         (r * np.cos(tooth * pitch + share * pitch), r * np.sin(tooth * pitch + share * pitch))
@@ -111,5 +111,5 @@ def toothed(axis: Axis, start: Vector, length: float, radius: float, teeth: int,
 
 
 def without(part: Manifold, *cuts: Manifold) -> Manifold:
-    """``part`` minus all ``cuts``."""
+    """Solid ``part`` minus all ``cuts``."""
     return Manifold.batch_boolean([part, *cuts], OpType.Subtract)

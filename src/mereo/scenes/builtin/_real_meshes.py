@@ -8,12 +8,12 @@ from mereo.geometry.manifold import mesh_of, solid_of
 
 
 def main_part(solid: manifold3d.Manifold) -> manifold3d.Manifold:
-    """The largest of a solid's parts: Booleans of meshes that nearly touch leave flecks."""
+    """Largest of a solid's parts: Booleans of meshes that nearly touch leave flecks."""
     return max(solid.decompose(), key=lambda part: part.volume())
 
 
 def simplified(solid: manifold3d.Manifold, faces: int, block_intersections: bool = False) -> manifold3d.Manifold:
-    """The solid with at most ``faces`` faces: edges collapse, flattest first (Garland & Heckbert, SIGGRAPH 1997).
+    """Solid with at most ``faces`` faces: edges collapse, flattest first (Garland & Heckbert, SIGGRAPH 1997).
 
     Where the surface folds closely upon itself (lips, eyelids), ``block_intersections`` keeps it from passing through
     itself; that takes twice as long.

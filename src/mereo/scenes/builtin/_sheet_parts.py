@@ -13,10 +13,11 @@ from scipy.spatial import Delaunay, cKDTree
 
 from mereo.deformation.maps import smooth_step
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.read_only import read_only
 
 LENGTH, WIDTH = 52.0, 38.0
 COLUMNS, ROWS = 3, 2
-HALF = np.array([LENGTH / 2, WIDTH / 2])
+HALF = read_only(np.array([LENGTH / 2, WIDTH / 2]))
 CORNER = 4.0
 """Radius of the rounded corners."""
 
@@ -52,7 +53,7 @@ def _detail_centers(column: int, row: int) -> Float[np.ndarray, "k 2"]:
 
 
 def _centers(remainder: int) -> Float[np.ndarray, "k 2"]:
-    """Of the details in every second patch, like the fields of a chessboard."""
+    """Centres of the details in every second patch, like the fields of a chessboard."""
     fields = [(c, r) for c in range(COLUMNS) for r in range(ROWS) if (c + r) % 2 == remainder]
     return np.concatenate([_detail_centers(column, row) for column, row in fields])
 
@@ -84,7 +85,7 @@ def _product(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"]) -> Float[np
 def _tab_rows() -> Float[np.ndarray, " r"]:
     """The rows of the sheet's edge from which the tab goes on."""
     y = _ticks(HALF[1], ROWS)
-    return y[(y > TAB_ROWS[0]) & (y < TAB_ROWS[1])]
+    return read_only(y[(y > TAB_ROWS[0]) & (y < TAB_ROWS[1])])
 
 
 def _tab_box() -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:

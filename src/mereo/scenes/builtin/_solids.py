@@ -14,12 +14,12 @@ SIMPLIFY = 1e-3
 
 
 def segment_of(name: str, color: Color, solid: Manifold) -> Segment:
-    """A solid as it is."""
+    """Segment of a solid as it is."""
     return Segment(name, color, *mesh_of(solid))
 
 
 def segment(name: str, color: Color, part: Manifold, longest_edge: float = np.inf) -> Segment:
-    """The finished part as a segment, with no more triangles than its shape needs.
+    """Segment of a finished part, with no more triangles than its shape needs.
 
     Edges longer than ``longest_edge`` are split, so that flat faces can bend. It also helps large parts: long slivers
     have large boxes, which slow down searches among them.
@@ -29,25 +29,25 @@ def segment(name: str, color: Color, part: Manifold, longest_edge: float = np.in
 
 
 def union(*parts: Manifold) -> Manifold:
-    """All parts as one solid."""
+    """Solid of all parts together."""
     return Manifold.batch_boolean(list(parts), OpType.Add)
 
 
 def hull(*parts: Manifold) -> Manifold:
-    """The convex hull around all parts."""
+    """Convex hull around all parts."""
     return Manifold.batch_hull(list(parts))
 
 
 def ball(center: Vector, radius: float, sides: int = 12) -> Manifold:
-    """A sphere; ``sides`` around its equator."""
+    """Sphere with ``sides`` around its equator."""
     return Manifold.sphere(radius, sides).translate(center)
 
 
 def rod(start: Vector, end: Vector, start_radius: float, end_radius: float, sides: int = 12) -> Manifold:
-    """A tapering limb with round ends."""
+    """Tapering limb with round ends."""
     return hull(ball(start, start_radius, sides), ball(end, end_radius, sides))
 
 
 def revolved(profile: Float[np.ndarray, "n 2"], sides: int) -> Manifold:
-    """A lathe part about the z axis from rows (radius, height), counter-clockwise."""
+    """Lathe part about the z axis from rows (radius, height), counter-clockwise."""
     return Manifold.revolve(CrossSection([profile]), sides)

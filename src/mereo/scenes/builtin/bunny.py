@@ -20,6 +20,7 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, smooth_step, turn
 from mereo.deformation.warps import SmoothField, Squash
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes import assets
 from mereo.scenes.builtin._solids import Vector
 from mereo.scenes.scene import WHOLE_SPHERE_RAD, Scene, Workspace
@@ -31,7 +32,7 @@ LONGEST_EDGE = 1.2
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane through ``origin``; what lies beyond it along ``direction`` (within ``half``) becomes the segment."""
+    """Plane through ``origin``; what lies beyond it along ``direction`` (within ``half``) becomes the segment."""
 
     origin: Vector
     direction: Vector
@@ -47,10 +48,10 @@ TAIL = Cut((9.2, -9.3, 2.0), (0.945, -0.325, 0.0), half=5.0, length=9.0)
 
 @cache
 def model_to_scene() -> tuple[Float[np.ndarray, "3"], float]:
-    """``scene = (model - center) * scale`` takes the metres of bunny.off to scene units."""
+    """Centre and scale of ``scene = (model - center) * scale``, which takes the metres of bunny.off to scene units."""
     vertices = _load().vertices
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return (low + high) / 2, float(SHORTEST_SIDE / (high - low).min())
+    return read_only((low + high) / 2), float(SHORTEST_SIDE / (high - low).min())
 
 
 @cache
@@ -62,7 +63,7 @@ def _load() -> trimesh.Trimesh:
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The bunny at rest, cut into closed segments that share their cut faces."""
+    """Bunny at rest, cut into closed segments that share their cut faces."""
     mesh = _load()
     center, scale = model_to_scene()
     solid = manifold3d.Manifold(
@@ -108,6 +109,7 @@ class SoftJoint:
     rotation_vector: Float[np.ndarray, "3"]
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Images of points, in scene units."""
         height = (points - self.center) @ self.direction
         angle_rad = float(np.linalg.norm(self.rotation_vector))
         axis = self.rotation_vector / max(angle_rad, 1e-12)
@@ -116,7 +118,7 @@ class SoftJoint:
 
 @dataclass(frozen=True)
 class JointBounds:
-    """A joint's plane, the length of its soft zone, and its largest rotation in radians."""
+    """Bounds of a joint: its plane, the length of its soft zone, and its largest rotation in radians."""
 
     center: Vector
     direction: Vector
@@ -125,7 +127,7 @@ class JointBounds:
     bend_rad: float
 
     def sample(self, rng: np.random.Generator) -> SoftJoint:
-        """Twist about ``direction`` and bend about a random axis across it, each uniform within its bound."""
+        """Random joint: a twist about ``direction`` and a bend about a random axis across it, each within its bound."""
         direction = np.array(self.direction) / np.linalg.norm(self.direction)
         across = np.cross(direction, named(rng, "bend about").normal(size=3))
         across /= np.linalg.norm(across)
@@ -165,7 +167,7 @@ def _ear(rng: np.random.Generator, name: str, joints: dict[str, JointBounds]) ->
 
 
 def squash_and_wobble(rng: np.random.Generator) -> list[Deformation]:
-    """Squeeze along a random axis by up to 18 percent at constant volume, then smooth random waves."""
+    """Random squeeze by up to 18 percent at constant volume, then smooth random waves."""
     squash_along = named(rng, "squash along").normal(size=3)
     squash = Squash(np.zeros(3), squash_along, float(np.exp(named(rng, "squash", "log").uniform(-0.18, 0.18))))
     frequencies = named(rng, "wave directions").normal(size=(4, 3))
@@ -182,7 +184,7 @@ def squash_and_wobble(rng: np.random.Generator) -> list[Deformation]:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """One map per segment: ears, head and tail turn softly from their cuts on, then the whole body deforms.
+    """Random maps, one per segment: ears, head and tail turn softly from their cuts on, then the body deforms.
 
     A joint leaves its own plane where it is, so neighbours stay in contact along the cut.
     """
@@ -196,7 +198,7 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 
 def scene() -> Scene:
-    """The Stanford Bunny; needs the asset `bunny/bunny.off`."""
+    """Scene of the Stanford Bunny; needs the asset `bunny/bunny.off`."""
     return Scene(
         name="bunny",
         rest=rest_mesh(),

@@ -37,6 +37,7 @@ from jaxtyping import Float
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation, Identity, Rigid, smooth_step
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin import _engine_parts as parts
 from mereo.scenes.builtin._engine_block import block
 from mereo.scenes.builtin._machine_parts import segment, union
@@ -57,7 +58,7 @@ EXHAUST_PEAK_RAD = np.deg2rad(360.0 - 110.0)
 
 @dataclass(frozen=True, eq=False)
 class StepwiseShift:
-    """Shifts space along z by an amount that depends on x alone; its Jacobian is 1.
+    """Shift of space along z by an amount that depends on x alone; its Jacobian is 1.
 
     Attributes:
         borders: ascending x between neighbouring steps.
@@ -70,6 +71,7 @@ class StepwiseShift:
     width: float
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Shifted points."""
         past = smooth_step((points[:, :1] - self.borders) / self.width + 0.5)
         moved = points.copy()
         moved[:, 2] += self.shifts[0] + past @ np.diff(self.shifts)
@@ -78,7 +80,7 @@ class StepwiseShift:
 
 @cache
 def valve_places() -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
-    """Of the eight valves from front to rear: x, radius, and the crank angle at which they are open most."""
+    """Places of the eight valves from front to rear: x, radius, and the crank angle at which they are open most."""
     rows = [
         (x + at, radius, firing + peak)
         for x, firing in zip(parts.CYLINDERS, FIRING_RAD, strict=True)
@@ -87,18 +89,18 @@ def valve_places() -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"], Fl
             (parts.EXHAUST_AT, parts.EXHAUST_RADIUS, EXHAUST_PEAK_RAD),
         )
     ]
-    x, radius, peak = np.array(rows).T
+    x, radius, peak = read_only(np.array(rows)).T
     return x, radius, peak
 
 
 def valve_lifts(crank_rad: float) -> Float[np.ndarray, " v"]:
-    """How far each valve is open, in units."""
+    """Lift of each valve, in units."""
     return parts.cam_lift((crank_rad - valve_places()[2]) / 2)
 
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The engine at crank angle 0."""
+    """Engine at crank angle 0."""
     x, radius, peak = valve_places()
     valves = [
         parts.valve(r, drop).translate((at, 0, 0)) for at, r, drop in zip(x, radius, valve_lifts(0.0), strict=True)
@@ -130,7 +132,7 @@ def rod_and_piston(crank_rad: float, throw: float) -> tuple[Deformation, Deforma
 
 
 def deformations_at(crank_rad: float) -> tuple[Deformation, ...]:
-    """Every segment's motion from angle 0 to ``crank_rad``; any angle, the cycle is 4 pi long."""
+    """Motions of all segments from angle 0 to ``crank_rad``; any angle, the cycle is 4 pi long."""
     x, radius, _ = valve_places()
     crank = Rigid(np.array([crank_rad, 0.0, 0.0]), np.zeros(3), np.zeros(3))
     cam = Rigid(np.array([crank_rad / 2, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, parts.CAM_HEIGHT]))
@@ -145,12 +147,12 @@ def deformations_at(crank_rad: float) -> tuple[Deformation, ...]:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """A crank angle uniform over the cycle."""
+    """Motions at a crank angle uniform over the cycle."""
     return deformations_at(named(rng, "crank angle", "rad").uniform(0.0, CYCLE_RAD))
 
 
 def scene() -> Scene:
-    """The engine; cameras stand before the open side, rather above than below."""
+    """Scene of the engine; cameras stand before the open side, rather above than below."""
     return Scene(
         name="engine",
         rest=rest_mesh(),

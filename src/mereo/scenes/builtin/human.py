@@ -38,6 +38,7 @@ from scipy.spatial.distance import cdist
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, jacobian_determinant
 from mereo.deformation.warps import SmoothField
+from mereo.geometry.read_only import read_only
 from mereo.geometry.solids import label_grid
 from mereo.scenes.builtin._human_joints import JOINTS, NAMES, part_axes, rotations, turn_limits, turn_names
 from mereo.scenes.builtin._human_parts import SCALE, base, rest_mesh, to_scene
@@ -91,7 +92,8 @@ def balls() -> Balls:
         if (np.linalg.norm(centers - vertex, axis=1) - radii).min() > BARE:
             centers, radii = np.concatenate([centers, vertex[None]]), np.append(radii, 0.0)
     touching = radii[:, None] + radii
-    return Balls(centers, np.where(cdist(centers, centers) - touching > APART, touching + LEAST_GAP, -1.0))
+    apart = np.where(cdist(centers, centers) - touching > APART, touching + LEAST_GAP, -1.0)
+    return Balls(read_only(centers), read_only(apart))
 
 
 def is_clear(posed: Deformation) -> bool:
@@ -103,18 +105,18 @@ def is_clear(posed: Deformation) -> bool:
 
 @cache
 def critical_points() -> Float[np.ndarray, "n 3"]:
-    """The vertices at which the joints can press space most: largest angle, slope of the share and lever multiply."""
+    """Vertices at which the joints can press space most: largest angle, slope of the share and lever multiply."""
     vertices = np.concatenate([segment.vertices for segment in rest_mesh().segments])
     field, step = share_field(), 0.05 * np.eye(3)
     slope = np.stack([field(vertices + along) - field(vertices - along) for along in step], axis=2) / 0.1
     lever = np.linalg.norm(vertices[:, None] - part_axes()[1], axis=2)
     largest = np.abs(turn_limits()).max(axis=(0, 2))
     pressed = (np.linalg.norm(slope, axis=2) * lever * largest).max(axis=1)
-    return vertices[np.argsort(-pressed, kind="stable")[:CRITICAL]]
+    return read_only(vertices[np.argsort(-pressed, kind="stable")[:CRITICAL]])
 
 
 def sample_body(rng: np.random.Generator) -> PosedBody:
-    """A random shape in a random pose within the limits of each joint."""
+    """Random shape in a random pose within the limits of each joint."""
     girth = np.zeros(len(JOINTS))
     with part(rng, "shape"):
         common = named(rng, "girth").uniform(-0.1, 0.14)
@@ -128,7 +130,7 @@ def sample_body(rng: np.random.Generator) -> PosedBody:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """One map moves all segments."""
+    """Random shape, pose and waves, one map for all segments."""
     for _ in range(ATTEMPTS):
         body = sample_body(rng)
         if is_clear(body) and jacobian_determinant(body, critical_points()).min() > LEAST_DETERMINANT:
@@ -139,7 +141,7 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 
 def scene() -> Scene:
-    """The human body; needs the three assets `human/makehuman_*`."""
+    """Scene of the human body; needs the three assets `human/makehuman_*`."""
     return Scene(
         name="human",
         rest=rest_mesh(),

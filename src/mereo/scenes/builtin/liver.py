@@ -33,11 +33,11 @@ def rest_mesh() -> SegmentedMesh:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """One field for both."""
+    """Random field of tissue, the same for both organs."""
     field = sample_field(rng)
     return (field, field)
 
 
 def scene() -> Scene:
-    """Liver & Gallbladder; needs the assets `liver/lapgym_liver_visual.stl` and `lapgym_gallbladder_visual.stl`."""
+    """Scene Liver & Gallbladder; needs `liver/lapgym_liver_visual.stl` and `lapgym_gallbladder_visual.stl`."""
     return Scene("liver", rest_mesh(), sample_deformations, WORKSPACE, SOURCE, unit_m=UNIT_M)

@@ -31,7 +31,7 @@ STATES = Path(__file__).parents[2] / "states" / "liver.npz"
 
 @cache
 def scene() -> Scene:
-    """The simulated liver; needs the same assets as the scene `liver`."""
+    """Scene of the simulated liver; needs the same assets as the scene `liver`."""
     rest = SegmentedMesh(organs())
     states = load_states(STATES, rest, scale=MM)
     liver = states.scene("liver-simulated", rest, WORKSPACE, f"{SOURCE}; states simulated with MuJoCo")

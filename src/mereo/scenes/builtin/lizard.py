@@ -26,6 +26,7 @@ from jaxtyping import Float
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.scenes.builtin._hinges import Hinged, follow, rigid_map
 from mereo.scenes.builtin._lizard_parts import (
@@ -56,7 +57,7 @@ LEGS = {
 """Plan, side, and the link that carries it."""
 
 MIDDLE_LINK = 3
-SPINE_LIMIT_RAD = np.array([0.23 if number in STIFF_HINGES else 0.36 for number in range(len(SPINE))])
+SPINE_LIMIT_RAD = read_only(np.array([0.23 if number in STIFF_HINGES else 0.36 for number in range(len(SPINE))]))
 SWING_RAD, FOOT_RAD = 0.36, 0.28
 SPINE_PLAY_RAD, LEG_PLAY_RAD = 0.025, 0.05
 PLAYS = ("about x", "about y")
@@ -67,7 +68,7 @@ GAP = 0.2
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The straight lizard, symmetrical, its belly on z = 0."""
+    """Straight lizard, symmetrical, its belly on z = 0."""
     links = spine_links()
     parts = {name: union(*links[first:last]) for name, (first, last) in SPINE_SEGMENTS.items()}
     for name, (plan, side, _) in LEGS.items():
@@ -89,7 +90,7 @@ def sample_spine(rng: np.random.Generator) -> Float[np.ndarray, "h 3"]:
 
 
 def spine_motions(vectors: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "k 4 4"]:
-    """Of every link from rest, the middle one staying."""
+    """Motions of all links from rest, the middle one staying."""
     motions = [np.eye(4)]
     for knuckle, vector in zip(SPINE, vectors, strict=True):
         motions.append(follow(motions[-1], knuckle, vector))
@@ -105,7 +106,7 @@ def _spine_discs() -> tuple[tuple[int, Float[np.ndarray, "d 4"]], ...]:
     for link in range(1, len(ends) - 1):
         stations = np.arange(ends[link] + 0.7, ends[link + 1] + 1.0, 1.5)
         discs.append((link, np.array([[NOSE - s, 0.0, 2.0, half_width(s) + 0.4] for s in stations])))
-    return tuple(discs)
+    return tuple((link, read_only(covering)) for link, covering in discs)
 
 
 @cache
@@ -117,7 +118,7 @@ def _leg_discs(name: str) -> tuple[Float[np.ndarray, "u 4"], Float[np.ndarray, "
     vertices = np.array(leg(plan, side).foot.to_mesh().vert_properties[:, :3], dtype=float)
     x, y, _ = leg(plan, side).ankle.pivot
     far = vertices[np.hypot(vertices[:, 0] - x, vertices[:, 1] - y) > 1.0][::7]
-    return np.array([knee]), np.column_stack([far, np.zeros(len(far))])
+    return read_only(np.array([knee])), read_only(np.column_stack([far, np.zeros(len(far))]))
 
 
 def _moved(discs: Float[np.ndarray, "d 4"], motion: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "d 3"]:
@@ -146,7 +147,7 @@ def is_clear(spine: Float[np.ndarray, "k 4 4"], legs: dict[str, Float[np.ndarray
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """One map for each segment: its inner knuckles turn, then it follows the link that carries it."""
+    """Random maps, one for each segment: its inner knuckles turn, then it follows the link that carries it."""
     while True:
         with part(rng, "spine"):
             vectors = sample_spine(rng)
@@ -177,14 +178,14 @@ def _leg_vectors(rng: np.random.Generator, name: str) -> Float[np.ndarray, "2 3"
 def _leg_motions(
     name: str, spine: Float[np.ndarray, "k 4 4"], vectors: Float[np.ndarray, "2 3"]
 ) -> Float[np.ndarray, "2 4 4"]:
-    """Of the upper leg and of the foot, from rest."""
+    """Motions of the upper leg and of the foot, from rest."""
     plan, side, carrier = LEGS[name]
     upper = follow(spine[carrier], leg(plan, side).root, vectors[0])
     return np.stack([upper, follow(upper, leg(plan, side).ankle, vectors[1])])
 
 
 def scene() -> Scene:
-    """The lizard on its belly; the paper's camera workspace above it."""
+    """Scene of the lizard on its belly; the paper's camera workspace above it."""
     return Scene(
         name="lizard",
         rest=rest_mesh(),

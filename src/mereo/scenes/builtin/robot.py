@@ -34,13 +34,14 @@ from jaxtyping import Float
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin import _robot_parts as parts
 from mereo.scenes.builtin._solids import Vector, segment
 from mereo.scenes.scene import Scene, Workspace
 
 
 class ArmJoint(NamedTuple):
-    """A revolute joint of the rest pose: a point of its axis, the axis, and limits in degrees."""
+    """Revolute joint of the rest pose: a point of its axis, the axis, and limits in degrees."""
 
     name: str
     center: Vector
@@ -62,7 +63,7 @@ OPENING = (0.15, 2.0)
 
 
 class Bulk(NamedTuple):
-    """``spheres`` of one radius with centres from ``start`` to ``end``, which enclose a part at rest."""
+    """Row of ``spheres`` of one radius with centres from ``start`` to ``end``, which enclose a part at rest."""
 
     link: int
     start: Vector
@@ -71,6 +72,7 @@ class Bulk(NamedTuple):
     spheres: int
 
     def centers(self) -> Float[np.ndarray, "n 3"]:
+        """Centres of the spheres at rest."""
         return np.linspace(self.start, self.end, self.spheres)
 
 
@@ -90,13 +92,13 @@ COLUMN = (
 )
 UPPER_ARM = (Bulk(2, (3.5, 5.4, 19.0), (3.5, 5.4, 37.0), 4.4, 9),)
 
-FOOT = np.array([[-10.6, -10.0, -50.0], [10.0, 10.0, 10.4]])
+FOOT = read_only(np.array([[-10.6, -10.0, -50.0], [10.0, 10.0, 10.4]]))
 """A box around the base and the turntable."""
 
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The arm at rest: nine closed segments, 0.15 to 0.2 apart where they move upon each other."""
+    """Arm at rest: nine closed segments, 0.15 to 0.2 apart where they move upon each other."""
     solids = {
         "base": parts.base(),
         "column": parts.column(),
@@ -112,14 +114,14 @@ def rest_mesh() -> SegmentedMesh:
 
 
 def sample_angles(rng: np.random.Generator) -> Float[np.ndarray, "6"]:
-    """Joint angles in radians, uniform within the limits."""
+    """Random joint angles in radians, uniform within the limits."""
     limits = np.array([(joint.lower_deg, joint.upper_deg) for joint in JOINTS])
     names = tuple(joint.name for joint in JOINTS)
     return np.deg2rad(named(rng, names, "°").uniform(limits[:, 0], limits[:, 1]))
 
 
 def chain(angles_rad: Float[np.ndarray, "6"]) -> tuple[Rigid, ...]:
-    """Each joint's turn, in the rest frame; link k moves by the first k of them, the last one first."""
+    """Turns of the joints, in the rest frame; link k moves by the first k of them, the last one first."""
     return tuple(
         Rigid(angle * np.array(joint.axis), np.zeros(3), np.array(joint.center))
         for joint, angle in zip(JOINTS, angles_rad, strict=True)
@@ -150,7 +152,7 @@ def _moved(bulk: Bulk, turns: tuple[Rigid, ...]) -> Float[np.ndarray, "n 3"]:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """Random angles of all joints and a random opening; the base stays."""
+    """Motions of all segments at random angles of all joints and a random opening; the base stays."""
     turns = chain(sample_angles(rng))
     while not is_clear(turns):
         turns = chain(sample_angles(rng))
@@ -162,7 +164,7 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 
 def scene() -> Scene:
-    """The arm; the paper's camera workspace above it."""
+    """Scene of the arm; the paper's camera workspace above it."""
     return Scene(
         name="robot",
         rest=rest_mesh(),

@@ -27,6 +27,7 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation, Identity
 from mereo.deformation.warps import CurveSweep
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.scene import Scene, Workspace
 
 SEGMENTS = 8
@@ -100,11 +101,11 @@ def _base() -> Segment:
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The straight rope along +x from the base."""
+    """Straight rope along +x from the base."""
     return SegmentedMesh((_base(), *(_piece(number) for number in range(SEGMENTS))))
 
 
-NODES = np.linspace(0.0, LENGTH, 97)
+NODES = read_only(np.linspace(0.0, LENGTH, 97))
 
 COILS = 1 / 3
 """The share of ropes that coil."""
@@ -138,7 +139,7 @@ Angles = tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]
 
 
 def swing(rng: np.random.Generator) -> Angles:
-    """Random harmonics, scaled to a random share of the largest bend."""
+    """Tangent angles of a rope that swings: random harmonics, scaled to a random share of the largest bend."""
     k = np.arange(1, HARMONICS + 1)
     phases = named(rng, SWINGS, "rad").uniform(0, 2 * np.pi, size=(2, HARMONICS, 1))
     amplitudes = named(rng, "amplitudes").normal(size=(2, HARMONICS, 1)) / np.sqrt(k)[:, None]
@@ -151,7 +152,7 @@ def swing(rng: np.random.Generator) -> Angles:
 
 
 def coil(rng: np.random.Generator) -> Angles:
-    """A helix from a random place on; its axis is z and its pitch keeps the turns apart."""
+    """Tangent angles of a helix from a random place on; its axis is z and its pitch keeps the turns apart."""
     start = named(rng, "start").uniform(0.05, 0.4) * LENGTH
     rate, pitch = named(rng, "turn per unit", "rad").uniform(0.13, 0.2), named(rng, "pitch").uniform(*COIL_PITCH)
     begun = np.clip((NODES - start) / COIL_BEGINS, 0.0, 1.0)
@@ -174,7 +175,7 @@ def is_clear(center: Float[np.ndarray, "m 3"]) -> bool:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """The base stays; one sweep moves the whole rope."""
+    """Random sweep that moves the whole rope; the base stays."""
     center = sample_centerline(rng)
     while not is_clear(center):
         center = sample_centerline(rng)
@@ -183,7 +184,7 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 
 def scene() -> Scene:
-    """The rope; the paper's camera workspace above it."""
+    """Scene of the rope; the paper's camera workspace above it."""
     return Scene(
         name="rope",
         rest=rest_mesh(),

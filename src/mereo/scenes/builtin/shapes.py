@@ -30,6 +30,7 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Rigid
 from mereo.deformation.warps import Bend, SmoothField, Squash, Taper, Twist
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin import _shapes_parts as solid
 from mereo.scenes.builtin._solids import segment
 from mereo.scenes.scene import Scene, Workspace
@@ -38,7 +39,7 @@ LONGEST_EDGE = 1.15
 GAP = 0.1
 """Air between a solid and the one that it stands on."""
 
-UP = np.array([0.0, 0.0, 1.0])
+UP = read_only(np.array([0.0, 0.0, 1.0]))
 CELLS = {"box": (45.0, 20.0), "star": (135.0, 0.0), "wedge": (225.0, 80.0), "arch": (315.0, -35.0)}
 """Where each of the four around the post stands and how far it is turned at rest, in degrees."""
 
@@ -51,20 +52,20 @@ BEND_START = 5.0
 
 
 def cell_center(name: str) -> Float[np.ndarray, "3"]:
-    """The middle of a cell, on the ground."""
+    """Middle of a cell, on the ground."""
     angle = np.deg2rad(CELLS[name][0])
     return CELL_DISTANCE * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def cell_axes(name: str) -> Float[np.ndarray, "2 3"]:
-    """The x and y axes of the solid in a cell at rest."""
+    """Axes x and y of the solid in a cell at rest."""
     angle = np.deg2rad(CELLS[name][1])
     return np.array([[np.cos(angle), np.sin(angle), 0.0], [-np.sin(angle), np.cos(angle), 0.0]])
 
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The solids at rest: the ring in the middle of its way along the post, everything upright."""
+    """Solids at rest: the ring in the middle of its way along the post, everything upright."""
     parts: dict[str, Manifold] = {
         "post": solid.post(),
         "ring": solid.ring().translate((0.0, 0.0, RING_HEIGHT)),
@@ -119,7 +120,7 @@ def _curl(
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """One map for each segment: its own shape, its motion in its cell, what carries it, and the waves of all."""
+    """Random maps, one for each segment: its own shape, its motion in its cell, what carries it, and the waves."""
     with part(rng, "waves"):
         waves = SmoothField.sample(rng, named(rng, "strength").uniform(0.0, 0.15), (30.0, 60.0))
     with part(rng, "post"):
@@ -224,7 +225,7 @@ SHAPES: dict[str, Callable[[np.random.Generator], list[Deformation]]] = {
 
 
 def scene() -> Scene:
-    """The shapes on the ground; the paper's camera workspace above them."""
+    """Scene of the shapes on the ground; the paper's camera workspace above them."""
     return Scene(
         name="shapes",
         rest=rest_mesh(),

@@ -32,10 +32,11 @@ from scipy.spatial import cKDTree
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Rigid, smooth_step
 from mereo.deformation.warps import Bend, CurveSweep, SmoothField, Twist
+from mereo.geometry.read_only import read_only
 from mereo.scenes.builtin._sheet_parts import LARGEST_OFFSET, middle_points, rest_mesh
 from mereo.scenes.scene import Scene, Workspace
 
-NODES = np.linspace(-42.0, 42.0, 169)
+NODES = read_only(np.linspace(-42.0, 42.0, 169))
 """Stations along the sweep's curve; the sheet reaches 34 units from its middle."""
 
 GENTLE = 0.05
@@ -59,7 +60,7 @@ ATTEMPTS = 1000
 
 
 class Profile(NamedTuple):
-    """A curve by its curvature at ``NODES``, and the station that stays where it is, level."""
+    """Curve by its curvature at ``NODES``, and the station that stays where it is, level."""
 
     curvature: Float[np.ndarray, " m"]
     anchor: float
@@ -72,7 +73,7 @@ def _fold(start: float, length: float) -> Float[np.ndarray, " m"]:
 
 
 def sample_profile(rng: np.random.Generator, kind: str, low: float, high: float) -> Profile:
-    """Waves and, by ``kind``, folds or a roll of a sheet that reaches from station ``low`` to ``high``."""
+    """Random waves and, by ``kind``, folds or a roll of a sheet that reaches from station ``low`` to ``high``."""
     wavelengths = named(rng, "wavelength").uniform(22.0, 60.0, size=(3, 1))
     phases = named(rng, "wave phase", "rad").uniform(0, 2 * np.pi, size=(3, 1))
     sizes = named(rng, "wave").uniform(-1, 1, size=(3, 1))
@@ -123,7 +124,7 @@ def curve(profile: Profile) -> Float[np.ndarray, "m 3"]:
 
 
 def sample_corner(rng: np.random.Generator, corner: int) -> Bend:
-    """One corner of the sheet (0 to 3) lifted, or folded onto the sheet."""
+    """Random bend of one corner of the sheet (0 to 3), lifted or folded onto the sheet."""
     turn = named(rng, "direction", "rad").uniform(-0.45, 0.45)
     heading = np.arctan2(19.0, 26.0) * (-1) ** corner + np.pi * (corner // 2) + turn
     axis = np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -140,7 +141,7 @@ def _turned(heading: float) -> Rigid:
 
 @cache
 def _middle() -> Float[np.ndarray, "k 3"]:
-    return middle_points()
+    return read_only(middle_points())
 
 
 def _do_not_meet(corners: list[Bend]) -> bool:
@@ -165,7 +166,7 @@ def _sample_corners(rng: np.random.Generator) -> list[Bend]:
 
 
 def sample_deformation(rng: np.random.Generator, kind: str) -> Deformation | None:
-    """One state's map, its profile of one of ``KINDS``, or None where it is not to be used."""
+    """Random map of one state, its profile of one of ``KINDS``, or None where it is not to be used."""
     corners = _sample_corners(rng)
     heading = named(rng, "heading of the curve", "rad").uniform(0, 2 * np.pi)
     before = Compose((*corners, _turned(-heading)))
@@ -194,7 +195,7 @@ def is_clear(moved: Float[np.ndarray, "k 3"]) -> bool:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """One map moves all segments."""
+    """Random map that moves all segments."""
     # drawn once: were it drawn with every attempt, folds and rolls, which are refused more often, would be rare
     kind = str(named(rng, "kind").choice(KINDS, p=KIND_SHARES))
     for _ in range(ATTEMPTS):
@@ -205,7 +206,7 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 
 def scene() -> Scene:
-    """The sheet; the paper's camera workspace above it."""
+    """Scene of the sheet; the paper's camera workspace above it."""
     return Scene(
         name="sheet",
         rest=rest_mesh(),

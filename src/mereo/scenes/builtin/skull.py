@@ -53,13 +53,14 @@ TOOTH_FACES = 84
 
 @dataclass(frozen=True)
 class Fit:
-    """A rigid motion that was fitted once: turn about ``center`` by ``rotation_rad`` (axis times angle), then shift."""
+    """Rigid motion that was fitted once: turn about ``center`` by ``rotation_rad`` (axis times angle), then shift."""
 
     center: Vector
     rotation_rad: Vector
     shift: Vector
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points after the motion."""
         return Rigid(np.array(self.rotation_rad), np.array(self.shift), np.array(self.center))(points)
 
 
@@ -93,7 +94,7 @@ DISENGAGED_RAD = float(np.deg2rad(6.0))
 
 
 def jaw_motion(condyles: Condyles, open_rad: float, protrusion: float, lateral_rad: float) -> Compose:
-    """Opening about the hinge with its glide and a slide forward, then a turn about an upright axis in one condyle.
+    """Motion of the jaw: opening about the hinge with its glide, a slide forward, a turn about an axis in one condyle.
 
     Args:
         condyles: their places at rest.
@@ -129,7 +130,7 @@ def jaw_state(opening: float, forward: float, side: float) -> tuple[float, float
 
 
 def sample_jaw(rng: np.random.Generator) -> tuple[float, float, float]:
-    """A random ``jaw_state``; one mouth in seven is closed."""
+    """Random ``jaw_state``; one mouth in seven is closed."""
     opening = 0.0 if named(rng, "closed below 1/7").uniform() < 1 / 7 else named(rng, "opening").uniform()
     return jaw_state(opening, named(rng, "forward").uniform(), named(rng, "to its left").uniform(-1.0, 1.0))
 
@@ -161,7 +162,7 @@ def _teeth(row: str) -> manifold3d.Manifold:
 
 @cache
 def rest_mesh() -> SegmentedMesh:
-    """The skull with its mouth closed."""
+    """Skull with its mouth closed."""
     upper, cranium = _teeth("u"), _solid("skull_bone")
     lower, mandible = _moved(_teeth("l"), SEAT), _solid("jaw_bone_j")
     solids = {
@@ -186,7 +187,7 @@ def _moved(solid: manifold3d.Manifold, motion: Fit) -> manifold3d.Manifold:
 
 @cache
 def condyles() -> Condyles:
-    """The condyles, found on the mandible: of each side what is near its highest point behind the notch."""
+    """Condyles found on the mandible: of each side what is near its highest point behind the notch."""
     vertices = _source()["jaw_bone_j"].vertices
     heads = []
     for side in (1.0, -1.0):
@@ -197,13 +198,13 @@ def condyles() -> Condyles:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """The cranium stays; one rigid motion moves mandible and lower teeth."""
+    """Random rigid motion of mandible and lower teeth; the cranium stays."""
     still, jaw = Identity(), jaw_motion(condyles(), *sample_jaw(rng))
     return (still, still, jaw, jaw)
 
 
 def scene() -> Scene:
-    """The skull; needs the asset `skull/sofa_skull_and_teeth_coarse.obj`. The camera is in front of the face."""
+    """Scene of the skull; needs `skull/sofa_skull_and_teeth_coarse.obj`. The camera is in front of the face."""
     return Scene(
         name="skull",
         rest=rest_mesh(),

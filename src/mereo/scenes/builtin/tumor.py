@@ -43,13 +43,14 @@ most 4 + 0.15 * 46 mm; the Jacobian was at least 0.40 in 300 draws, and the live
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """Scales by ``factor`` > 0 about ``center``, then shifts."""
+    """Scaling by ``factor`` > 0 about ``center``, then a shift."""
 
     center: Float[np.ndarray, "3"]
     factor: float
     shift: Float[np.ndarray, "3"]
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points after the motion."""
         return self.center + self.shift + self.factor * (points - self.center)
 
 
@@ -80,7 +81,7 @@ def rest_mesh() -> SegmentedMesh:
 
 
 def sample_placement(rng: np.random.Generator) -> Localized:
-    """Another place and size of the tumour, uniform in a ball and in diameter; the liver's surface stays."""
+    """Random place and size of the tumour, uniform in a ball and in diameter; the liver's surface stays."""
     with part(rng, "tumor"):
         direction = named(rng, "shift toward").normal(size=3)
         shift = direction / np.linalg.norm(direction) * SHIFT_MM * MM * named(rng, "shift").uniform() ** (1 / 3)
@@ -89,13 +90,13 @@ def sample_placement(rng: np.random.Generator) -> Localized:
 
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """One map for all three: the tumour's placement, then the liver's field."""
+    """Random map for all three: the tumour's placement, then the liver's field."""
     placed = sample_placement(rng)
     field = Compose((placed, *sample_field(rng).parts))
     return (field, field, field)
 
 
 def scene() -> Scene:
-    """The tumour in the liver; needs the same assets as the scene `liver`."""
+    """Scene of the tumour in the liver; needs the same assets as the scene `liver`."""
     source = f"{SOURCE}; the tumour is modelled in mereo"
     return Scene("tumor", rest_mesh(), sample_deformations, WORKSPACE, source, unit_m=UNIT_M)

@@ -29,11 +29,11 @@ ELSEWHERE = {"source", "segments", "model", "parts", "labels", "names", "cells"}
 
 
 class MeshWarning(UserWarning):
-    """A mesh is no solid and is used all the same."""
+    """Warning that a mesh is no solid and is used all the same."""
 
 
 def load(path: Path) -> Scene:
-    """The scene of a YAML file.
+    """Scene of a YAML file.
 
     A mesh with holes or self-intersections is used with a ``MeshWarning``: the winding number decides what is inside.
 
@@ -45,7 +45,7 @@ def load(path: Path) -> Scene:
 
 
 def read(document: Document) -> SceneFile:
-    """What a scene file says. Its name must not be that of a built-in scene, which weights would confuse."""
+    """Validated content of a scene file. Its name must not be a built-in scene's, which weights would confuse."""
     file = document.validated(SceneFile)
     if file.name in SCENES:
         raise document.error(("name",), f"`name` is {file.name!r}, which is a built-in scene: choose another name")
@@ -53,7 +53,7 @@ def read(document: Document) -> SceneFile:
 
 
 def with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
-    """The mesh with segments that are no solids marked so, and one warning for each of them."""
+    """Mesh with segments that are no solids marked so, and one warning for each of them."""
     cure = f"repair it with `mereo scene check {document.path} --repair`"
     segments = []
     for segment in mesh.segments:
@@ -68,7 +68,7 @@ def with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
 
 
 def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
-    """The scene of a mesh in the file's unit: scaled to ``size`` and centred, with its deformations."""
+    """Scene of a mesh in the file's unit: scaled to ``size`` and centred, with its deformations."""
     placement = placed(mesh, file.size)
     rest = mesh.with_vertices([placement.apply(segment.vertices) for segment in mesh.segments])
     workspace = _workspace(document, file.camera, rest.bounds)
@@ -96,7 +96,7 @@ def _recorded(
 
 
 def _digest(path: Path) -> str:
-    """Of recorded states, a file or a directory: other states are another scene."""
+    """Digest of recorded states, a file or a directory: other states are another scene."""
     digest = hashlib.sha256()
     for file in [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file()):
         with file.open("rb") as content:
@@ -105,7 +105,7 @@ def _digest(path: Path) -> str:
 
 
 def placed(mesh: SegmentedMesh, size: float) -> Normalizer:
-    """From the file's frame to the scene's: the joint box centred, its shortest side ``size`` long."""
+    """Map from the file's frame to the scene's: the joint box centred, its shortest side ``size`` long."""
     low, high = mesh.bounds
     shortest = float((high - low).min())
     if not shortest > 0:

@@ -98,7 +98,7 @@ def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
 
 
 def _marked(mesh: SegmentedMesh, health: list[Health]) -> SegmentedMesh:
-    """With segments that are no solids marked so."""
+    """Mesh with segments that are no solids marked so."""
     marked = (replace(s, solid=found.sound) for s, found in zip(mesh.segments, health, strict=True))
     return replace(mesh, segments=tuple(marked))
 

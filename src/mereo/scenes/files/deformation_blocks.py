@@ -20,21 +20,21 @@ from mereo.scenes.files.fields import Block, Direction, Name, Point, Positive, P
 
 
 class Misfit(ValueError):
-    """A value that does not fit the object which it is to move.
+    """Error of a value that does not fit the object which it is to move.
 
     Attributes:
         key: of the block, whose value it is.
     """
 
     def __init__(self, key: str, message: str) -> None:
-        """``message`` says value, rule and cure."""
+        """Error with a ``message`` of value, rule and cure."""
         super().__init__(message)
         self.key = key
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What one deformation moves, and the way from the file's frame to the scene's.
+    """Object of one deformation, and the way from the file's frame to the scene's.
 
     Attributes:
         moved: the segments that it moves, at rest in scene units.
@@ -52,19 +52,19 @@ class Target:
         return self.placement.scale
 
     def point(self, place: Point) -> Float[np.ndarray, "3"]:
-        """A place of the file in the scene's frame."""
+        """Place of the file in the scene's frame."""
         moved: Float[np.ndarray, "3"] = self.placement.apply(np.array(place))
         return moved
 
 
 class DeformationBlock(Block, ABC):
-    """A deformation of a scene file; all have ``segments``, those that it moves, all of them where absent."""
+    """Deformation of a scene file; all have ``segments``, those that it moves, all of them where absent."""
 
     segments: Annotated[list[Name], Field(min_length=1)] | None = None
 
     @abstractmethod
     def sampler(self, target: Target) -> DeformationSampler:
-        """The sampler of this block's maps for an object. Raises ``Misfit`` where a value does not fit it."""
+        """Sampler of this block's maps for an object. Raises ``Misfit`` where a value does not fit it."""
 
 
 class LatticeBlock(DeformationBlock):
@@ -80,14 +80,14 @@ class LatticeBlock(DeformationBlock):
     strength: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5
 
     def sampler(self, target: Target) -> DeformationSampler:
-        """Lattices over the box of what is moved."""
+        """Sampler of lattices over the box of what is moved."""
         bounds = target.moved.bounds
         x, y, z = self.cells or samplers.default_cells(bounds)
         return samplers.LatticeSampler(bounds, (x, y, z), self.strength)
 
 
 class WavesBlock(DeformationBlock):
-    """A smooth random field: waves in random directions; ``strength`` bounds by how much lengths change."""
+    """Smooth random field: waves in random directions; ``strength`` bounds by how much lengths change."""
 
     type: Literal["waves"]
     wavelength: PositiveRange
@@ -95,12 +95,12 @@ class WavesBlock(DeformationBlock):
     modes: Annotated[int, Field(ge=1, le=64)] = 4
 
     def sampler(self, target: Target) -> DeformationSampler:
-        """Fields of waves, their lengths in scene units."""
+        """Sampler of waves, their lengths in scene units."""
         return samplers.WavesSampler(_lengths(self.wavelength, target), self.strength, self.modes)
 
 
 class BendBlock(DeformationBlock):
-    """Into a circular arc, from ``origin`` over ``length`` along ``axis``; to any side where ``toward`` is absent."""
+    """Bend into a circular arc, from ``origin`` over ``length`` along ``axis``, ``toward`` a side or to any."""
 
     type: Literal["bend"]
     origin: Point
@@ -110,7 +110,7 @@ class BendBlock(DeformationBlock):
     toward: Direction | None = None
 
     def sampler(self, target: Target) -> DeformationSampler:
-        """Bends; ``Misfit`` where ``toward`` is along the axis, or where the largest one would fold space over."""
+        """Sampler of bends; ``Misfit`` where ``toward`` is along the axis, or the largest one would fold space over."""
         origin, axis, length = target.point(self.origin), np.array(self.axis), self.length * target.unit
         toward = None if self.toward is None else np.array(self.toward)
         if toward is not None and np.linalg.norm(np.cross(toward, axis)) < 1e-9 * np.linalg.norm(toward):
@@ -129,7 +129,7 @@ class BendBlock(DeformationBlock):
 
 
 class TwistBlock(DeformationBlock):
-    """About ``axis``, growing from nothing at ``origin`` to ``angle`` at ``length`` beyond it."""
+    """Twist about ``axis``, growing from nothing at ``origin`` to ``angle`` at ``length`` beyond it."""
 
     type: Literal["twist"]
     origin: Point
@@ -138,13 +138,13 @@ class TwistBlock(DeformationBlock):
     angle: Range
 
     def sampler(self, target: Target) -> DeformationSampler:
-        """Twists about the axis, in scene units and radians."""
+        """Sampler of twists about the axis, in scene units and radians."""
         length = self.length * target.unit
         return samplers.TwistSampler(target.point(self.origin), np.array(self.axis), length, _radians(self.angle))
 
 
 class TaperBlock(DeformationBlock):
-    """Cross-sections scaled by a factor that goes from 1 at ``origin`` to ``factor`` at ``length`` beyond it."""
+    """Scaling of cross-sections by a factor from 1 at ``origin`` to ``factor`` at ``length`` beyond it."""
 
     type: Literal["taper"]
     origin: Point
@@ -153,13 +153,13 @@ class TaperBlock(DeformationBlock):
     factor: PositiveRange
 
     def sampler(self, target: Target) -> DeformationSampler:
-        """Tapers along the axis, in scene units."""
+        """Sampler of tapers along the axis, in scene units."""
         length = self.length * target.unit
         return samplers.TaperSampler(target.point(self.origin), np.array(self.axis), length, self.factor)
 
 
 class SquashBlock(DeformationBlock):
-    """Scaled by ``factor`` along an axis, a random one where absent, with the volume kept."""
+    """Scaling by ``factor`` along an axis, a random one where absent, with the volume kept."""
 
     type: Literal["squash"]
     factor: PositiveRange
@@ -167,7 +167,7 @@ class SquashBlock(DeformationBlock):
     center: Point | None = None
 
     def sampler(self, target: Target) -> DeformationSampler:
-        """Squashes about ``center``, the middle of the whole object where absent."""
+        """Sampler of squashes about ``center``, the middle of the whole object where absent."""
         center = target.whole.mean(axis=0) if self.center is None else target.point(self.center)
         return samplers.SquashSampler(center, None if self.axis is None else np.array(self.axis), self.factor)
 
@@ -187,14 +187,14 @@ class JointBlock(DeformationBlock):
     shift: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = Field(default=(0.0, 0.0, 0.0), min_length=3, max_length=3)
 
     def sampler(self, target: Target) -> DeformationSampler:
-        """Rigid motions about the pivot, in scene units and radians."""
+        """Sampler of rigid motions about the pivot, in scene units and radians."""
         slide, shift = _lengths(self.slide, target), np.array(self.shift) * target.unit
         axis = np.array(self.axis)
         return samplers.JointSampler(target.point(self.pivot), axis, _radians(self.angle), slide, shift)
 
 
 class PushBlock(DeformationBlock):
-    """An instrument at a random place of the surface.
+    """Push by an instrument at a random place of the surface.
 
     Attributes:
         distance: of its tip, outwards along the surface's normal or, where negative, inwards.
@@ -216,7 +216,7 @@ class PushBlock(DeformationBlock):
         return self
 
     def sampler(self, target: Target) -> DeformationSampler:
-        """Pushes of what is moved, in scene units."""
+        """Sampler of pushes of what is moved, in scene units."""
         unit = target.unit
         return samplers.PushSampler(_lengths(self.distance, target), self.tip * unit, self.reach * unit)
 

@@ -27,6 +27,6 @@ PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ascending)]
 
 
 class Block(BaseModel):
-    """A block of keys: none but its fields, and none of them changes."""
+    """Block of keys: none but its fields, and none of them changes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

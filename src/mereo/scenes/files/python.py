@@ -10,7 +10,7 @@ from mereo.scenes.scene import Scene
 
 
 def load(path: Path) -> Scene:
-    """Run the file and return what its function ``scene`` returns; the meshes must be sound.
+    """Scene that a Python file's function ``scene`` returns; the meshes must be sound.
 
     Raises ``FileNotFoundError``, and ``ValueError`` where the file fails or returns no sound scene of a new name.
     """

@@ -25,7 +25,7 @@ def _unit_m(value: object) -> object:
 
 
 class PartLook(Block):
-    """How a segment is called and shown.
+    """Name and look of a segment.
 
     Attributes:
         name: identifies the segment in datasets, weights and every result.
@@ -39,19 +39,19 @@ class PartLook(Block):
 
 
 class FilePart(PartLook):
-    """A segment from a mesh file of its own."""
+    """Segment from a mesh file of its own."""
 
     file: str
 
 
 class ModelPart(PartLook):
-    """A segment from one or more named parts of ``model``; by default the part that is called as it is."""
+    """Segment from one or more named parts of ``model``; by default the part that is called as it is."""
 
     parts: Annotated[list[str], Field(min_length=1)] | None = None
 
 
 class CameraBlock(Block):
-    """The camera's workspace, ``scenes.scene.Workspace`` in degrees."""
+    """Workspace of the camera, ``scenes.scene.Workspace`` in degrees."""
 
     aperture: Annotated[FiniteFloat, Field(gt=0, le=360)] = 140.0
     distance: PositiveRange = (100.0, 200.0)
@@ -60,7 +60,7 @@ class CameraBlock(Block):
     field_of_view: Annotated[FiniteFloat, Field(gt=0, lt=170)] = 35.0
 
     def workspace(self) -> Workspace:
-        """The workspace that this block describes, angles in radians."""
+        """Workspace that this block describes, angles in radians."""
         return Workspace(
             aperture_rad=float(np.deg2rad(self.aperture)),
             distance=self.distance,
@@ -71,7 +71,7 @@ class CameraBlock(Block):
 
 
 class SceneFile(Block):
-    """A whole scene file. Exactly one of ``segments``, ``model`` and ``labels`` says where the segments come from.
+    """Content of a scene file. Exactly one of ``segments``, ``model``, ``labels`` says where the segments come from.
 
     Attributes:
         name: identifies the scene in datasets and weights.

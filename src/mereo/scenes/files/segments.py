@@ -13,7 +13,7 @@ from mereo.scenes.files.schema import FilePart, ModelPart, PartLook, SceneFile
 
 
 def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
-    """The segments of a scene file as they are in its meshes, unchecked and unscaled.
+    """Segments of a scene file as they are in its meshes, unchecked and unscaled.
 
     Raises ``ValueError`` and ``FileNotFoundError`` with the line that names what cannot be had, ``ImportError`` naming
     the extra that a format needs.

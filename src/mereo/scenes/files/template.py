@@ -75,7 +75,7 @@ def write_scene_file(files: Sequence[Path], output: Path | None = None, units: s
 
 
 def identifier(text: str) -> str:
-    """A valid scene name that no built-in scene has."""
+    """Valid scene name, made of ``text``, that no built-in scene has."""
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-._") or "object"
     return f"my-{name}" if name in SCENES else name
 
@@ -182,7 +182,7 @@ def _color(number: int) -> str:
 
 
 def quoted(text: str) -> str:
-    """A text as a YAML value on one line: quoted unless it is a plain word."""
+    """Text as a YAML value on one line: quoted unless it is a plain word."""
     plain = re.fullmatch(r"[A-Za-z_./][\w./ -]*", text) and not text.endswith(" ")
     reserved = text.lower() in ("yes", "no", "on", "off", "true", "false", "null", "y", "n")
     return text if plain and not reserved else "'" + text.replace("'", "''") + "'"
