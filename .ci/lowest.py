@@ -1,6 +1,6 @@
 """The oldest version of every library that pyproject.toml allows, as constraints for pip.
 
-    python .ci/lowest.py > lowest.txt && mv lowest.txt constraints.txt && ./check
+    python .ci/lowest.py > lowest.txt && mv lowest.txt constraints.txt && CHECK=tests ./check -W default
 
 Tools of the extras `dev` and `docs` keep the versions of constraints.txt: another formatter formats otherwise. What
 libraries bring along is left open, because the old ones may not know today's.

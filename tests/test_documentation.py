@@ -141,6 +141,8 @@ def test_modules_and_definitions_that_pages_name_exist() -> None:
     for page in RELEASED:
         named = re.findall(rf"`(?:mereo\.)?((?:{ROOMS})(?:\.\w+)+)[(`]", page.read_text())
         assert [name for name in named if not exists(name)] == [], page
+        files = re.findall(rf"`(?:src/mereo/)?((?:{ROOMS})/[\w./]+)`", page.read_text())
+        assert [name for name in files if not (ROOT / "src" / "mereo" / name).exists()] == [], page
 
 
 def test_citation_is_of_this_version() -> None:

@@ -18,12 +18,11 @@ from mereo.evaluation.registration.placement import Start, place
 from mereo.evaluation.registration.truth_file import read_truth
 from mereo.evaluation.registration.visible_surface import moved
 from mereo.evaluation.scan_scoring import evaluate_scans
-from mereo.evaluation.scans import SCANS, bunny_posed, bunny_scan
+from mereo.evaluation.scans import BUNNY_SCAN_POSES, SCANS, bunny_posed, bunny_scan
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.models.weights import load_model
-from mereo.scenes import assets
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.visualization.result_files import evaluate_on_scans
@@ -168,7 +167,7 @@ def bunny_truth_pose(name: str) -> tuple[SegmentedMesh, np.ndarray]:
 
     T_model_scene = np.diag([bunny_scale()] * 3 + [1.0])
     T_model_scene[:3, 3] = model_to_scene()[0]
-    return load_scene("bunny").rest, np.linalg.inv(assets.BUNNY_SCAN_POSES[name]) @ T_model_scene
+    return load_scene("bunny").rest, np.linalg.inv(BUNNY_SCAN_POSES[name]) @ T_model_scene
 
 
 @pytest.mark.slow

@@ -93,7 +93,9 @@ def random_state(scene: Scene, seed: int) -> Played:
     return _played(scene, seed, {}, {}, None)
 
 
-def play(scene: Scene, seed: int, given: Mapping[Key, Shares], most: int | None) -> tuple[Recorder, tuple]:
+def play(
+    scene: Scene, seed: int, given: Mapping[Key, Shares], most: int | None
+) -> tuple[Recorder, tuple[Deformation, ...]]:
     """Recorder and deformations of one run of a scene; ``scenes.draw_recorder`` counts the calls from here on."""
     recorder = Recorder(seed, given, most)
     return recorder, scene.sample_deformations(recorder)
