@@ -63,6 +63,7 @@ class Anchors:
 
     @cached_property
     def tree(self) -> cKDTree:
+        """Search tree over the positions."""
         return cKDTree(self.position)
 
     def weights(self, points: Float[np.ndarray, "n 3"]) -> PointWeights:

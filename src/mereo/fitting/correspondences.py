@@ -65,12 +65,13 @@ class Correspondences:
 def find_correspondences(
     model: Model, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
 ) -> Correspondences | None:
-    """All that the network says about observed points and the lines of sight behind them.
+    """Correspondences: all that the network says about observed points and the lines of sight behind them.
 
     Args:
         model: the trained network.
         code: of the observed cloud.
-        center, half: of the rest frame (``rest_pose.rest_frame``), scene units.
+        center: of the rest frame (``scenes.rest_pose.rest_frame``), scene units.
+        half: of the rest frame's longest side, scene units.
 
     Returns None from a network without rest coordinates.
     """

@@ -51,10 +51,12 @@ class DrawsProblem:
 
     @property
     def model(self) -> StatisticalModel:
+        """Statistical model of the object."""
         return self.base.model
 
     @property
     def scene(self) -> Scene:
+        """Scene whose draws are played."""
         return self.states.scene
 
     @classmethod

@@ -51,6 +51,7 @@ class PairTerm:
 
     @classmethod
     def of(cls, model: StatisticalModel) -> "PairTerm":
+        """Term of the distances that a model's states keep."""
         a, b = model.pairs.first, model.pairs.second
         return cls(model.mean[a] - model.mean[b], model.modes[a] - model.modes[b], model.pairs.mean, model.pairs.std)
 

@@ -58,10 +58,12 @@ class Problem:
     def of(
         cls, model: StatisticalModel, found: Correspondences, evidence: Evidence, scale_std: float, config: FitConfig
     ) -> "Problem":
+        """Problem of one frame: what the network found, and what the frame shows."""
         return cls(model, NetworkTerm.of(model, found), evidence, scale_std, config)
 
     @cached_property
     def pairs(self) -> PairTerm:
+        """Term of the distances that the states keep."""
         return PairTerm.of(self.model)
 
     @property
@@ -71,6 +73,7 @@ class Problem:
 
     @property
     def network_sigma(self) -> float:
+        """Standard deviation of a correspondence, scene units."""
         return self.config.start_sigma * self.model.half
 
     def known(self, posed: Posed, prior: Prior, slack: float) -> NormalEquations:

@@ -53,8 +53,9 @@ def statistical_model_of(model: Model) -> StatisticalModel:
     found = model.statistical_model or built_in_model(str(model.provenance.get("scene")), model.names)
     if found is None:
         raise ValueError(
-            f"the weights of {', '.join(model.names)} carry no statistical model of their object's states; a registration "
-            "needs one: finish the dataset with `mereo generate ... --resume` and train again, or leave out --fit"
+            f"the weights of {', '.join(model.names)} carry no statistical model of their object's states; a "
+            "registration needs one: finish the dataset with `mereo generate ... --resume` and train again, or leave "
+            "out --fit"
         )
     return found
 
@@ -63,7 +64,7 @@ def _scene_name(model: Model) -> str:
     name = str(model.provenance.get("scene"))
     if name not in SCENES:
         raise ValueError(
-            f"the weights were trained on {name!r}, which is no built-in scene; --fit full plays the scene's own draws: "
+            f"the weights were trained on {name!r}, which is no built-in scene; --fit full plays the draws of one: "
             "use --fit modes"
         )
     return name

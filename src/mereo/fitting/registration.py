@@ -41,6 +41,7 @@ class SegmentMotion:
     moved: Float[np.ndarray, "m 3"]
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Positions in the frame of points at rest."""
         return self.rest.weights(points)(self.moved)
 
 
@@ -75,10 +76,12 @@ class Registration:
 
     @cached_property
     def solids(self) -> Solids:
+        """Segments in the camera frame, to be asked what is inside and how far."""
         return Solids(self.mesh)
 
     @cached_property
     def rest_solids(self) -> Solids:
+        """Segments at rest, to be asked the same."""
         return Solids(self.model.rest)
 
     def to_camera(

@@ -106,6 +106,7 @@ class NetworkTerm:
 
     @classmethod
     def of(cls, model: StatisticalModel, found: Correspondences) -> "NetworkTerm":
+        """Term of correspondences, whose rest places follow the model."""
         weights = model.weights(found.rest, found.labels)
         return cls(found.points, weights(model.mean), weights(model.modes), found.confidence)
 

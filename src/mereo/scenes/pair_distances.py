@@ -43,11 +43,12 @@ def kept_distances(
     library: Float32[np.ndarray, "n k"],
     half: float,
 ) -> PairDistances:
-    """Which distances among the ``tried`` material points the states keep; see ``LEAST_RATIO``.
+    """Distances among the ``tried`` material points that the states keep; see ``LEAST_RATIO``.
 
     Args:
         tried: material points.
-        mean, modes: the linear model.
+        mean: of the linear model.
+        modes: of the linear model.
         library: coefficients of the states.
         half: half of the rest box's longest side.
     """

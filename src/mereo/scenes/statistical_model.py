@@ -207,11 +207,12 @@ def build_model(
     states: Float32[np.ndarray, "n m 3"],
     most: int = MOST_MODES,
 ) -> StatisticalModel:
-    """The statistical model of random or recorded states.
+    """Statistical model of random or recorded states.
 
     Args:
         rest: the segments at rest.
-        nodes, node_labels: material points inside; may be none.
+        nodes: further material points, inside; may be none.
+        node_labels: their segments, 1 or more.
         states: positions of all material points in each state, in any pose.
         most: modes at most.
 
