@@ -222,11 +222,11 @@ class Reconstruct:
     weights: str
     output: Path
     resolution: int = 128
-    fit: FitChoice = "off"
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
     files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
+    fit: FitChoice = "off"
     force: bool = False
 
     def run(self) -> None:
