@@ -14,7 +14,7 @@ import pytest
 import mereo.__main__ as command_line
 from mereo.cli import commands
 from mereo.io.config import InputConfig
-from mereo.scenes.registry import SCENES
+from mereo.scenes.scene import SCENES
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.training.config import PRESETS, PresetName
 

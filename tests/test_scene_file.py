@@ -17,7 +17,8 @@ from mereo.geometry.mesh import PALETTE
 from mereo.scenes.files.deformation_blocks import AnyDeformation
 from mereo.scenes.files.schema import SceneFile
 from mereo.scenes.parameters import parameters, random_state
-from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES
 
 EVERYTHING = """
 deformations:

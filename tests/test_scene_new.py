@@ -15,7 +15,8 @@ from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.camera import Camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.scenes.files.template import identifier, write_scene_file
-from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES
 
 
 def uncommented(text: str) -> str:

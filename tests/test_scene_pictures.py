@@ -9,8 +9,7 @@ from PIL import Image
 from toy_scene import toy_scene
 
 from mereo.cli.scene_commands import ScenePreview
-from mereo.scenes.registry import SCENES
-from mereo.scenes.scene import Scene
+from mereo.scenes.scene import SCENES, Scene
 from mereo.visualization import previews
 from mereo.visualization.previews import TILE_PX, preview_all, scene_row
 

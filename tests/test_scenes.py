@@ -18,8 +18,8 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
 from mereo.scenes.parameters import parameters, random_state, set_value
-from mereo.scenes.registry import SCENES, load_scene
-from mereo.scenes.scene import Scene, State, Workspace
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES, Scene, State, Workspace
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_rendering import render_depth
 

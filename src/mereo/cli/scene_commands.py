@@ -16,7 +16,7 @@ class SceneList:
 
     def run(self) -> None:
         """Print the names of the built-in scenes."""
-        from mereo.scenes.registry import SCENES
+        from mereo.scenes.scene import SCENES
 
         for name in SCENES:
             print(name)

@@ -22,8 +22,8 @@ from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 from mereo.reconstruction.pipeline import segment_names
-from mereo.scenes.registry import SCENES, load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view

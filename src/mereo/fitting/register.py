@@ -23,7 +23,8 @@ from mereo.reconstruction.isosurfaces import Extraction
 from mereo.reconstruction.pipeline import Reconstruction, turned_back
 from mereo.reconstruction.segment_statistics import measure
 from mereo.scenes.random_states import built_in_model
-from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES
 from mereo.scenes.statistical_model import StatisticalModel
 
 

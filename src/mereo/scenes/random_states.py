@@ -6,8 +6,8 @@ from jaxtyping import Float, Float32, UInt8
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.scenes.registry import SCENES, load_scene
-from mereo.scenes.scene import Scene, State
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES, Scene, State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel, build_model, material_points
 

@@ -3,13 +3,7 @@
 from importlib import import_module
 from pathlib import Path
 
-from mereo.scenes.scene import Scene
-
-SCENES = (
-    *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
-    *("tumor", "liver-simulated"),
-)
-"""Built-in scenes, one module each in ``mereo.scenes.builtin``: the paper's ten, then ours."""
+from mereo.scenes.scene import SCENES, Scene
 
 
 def is_yaml(scene: "str | Path | Scene") -> bool:

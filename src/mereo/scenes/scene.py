@@ -11,6 +11,12 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import look_at, rotation_along
 from mereo.scenes.seeds import TEST_SEED_START
 
+SCENES = (
+    *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
+    *("tumor", "liver-simulated"),
+)
+"""Built-in scenes, one module each in ``mereo.scenes.builtin``: the paper's ten, then ours."""
+
 PAPER_APERTURE_RAD = float(np.deg2rad(140.0))
 WHOLE_SPHERE_RAD = float(np.deg2rad(360.0))
 

@@ -14,8 +14,8 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
-from mereo.scenes.registry import SCENES, load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view

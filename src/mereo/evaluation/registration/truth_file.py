@@ -17,7 +17,8 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import write_json
 from mereo.io.errors import readable
 from mereo.io.readers import read_point_cloud
-from mereo.scenes.registry import SCENES, load_scene
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES
 
 TRUTH = "truth.json"
 """Name of the file."""

@@ -21,8 +21,7 @@ from mereo.scenes.files.deformation_blocks import AnyDeformation, LatticeBlock, 
 from mereo.scenes.files.schema import CameraBlock, SceneFile
 from mereo.scenes.files.segments import read_segments
 from mereo.scenes.recorded_states import load_states
-from mereo.scenes.registry import SCENES
-from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.scene import SCENES, Scene, Workspace
 
 ELSEWHERE = {"source", "segments", "model", "parts", "labels", "names", "cells"}
 """Keys that decide the meshes, which identify themselves, or nothing."""

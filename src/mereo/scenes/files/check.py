@@ -18,8 +18,8 @@ from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read
 from mereo.scenes.files.rewrite import with_segment_files
 from mereo.scenes.files.segments import read_segments
-from mereo.scenes.registry import SCENES, is_yaml, load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.registry import is_yaml, load_scene
+from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.seeds import example_rng
 
 STATES = 6

@@ -5,8 +5,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from mereo.scenes.registry import SCENES
-from mereo.scenes.scene import Scene
+from mereo.scenes.scene import SCENES, Scene
 
 
 def load(path: Path) -> Scene:

@@ -16,7 +16,7 @@ from mereo.geometry.mesh_check import likely_unit
 from mereo.io.atomic_files import atomic_file
 from mereo.io.label_volumes import is_volume, read_label_volume, segment_surfaces
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.scenes.registry import SCENES
+from mereo.scenes.scene import SCENES
 
 SIZE = 20.0
 """Shortest side in scene units, as in the paper, unless the object is longer than ``LONGEST`` then."""
