@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
+from threadpoolctl import threadpool_limits
 
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
@@ -72,7 +73,9 @@ def states_for(examples: int) -> int:
 
 
 def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED) -> StatisticalModel:
-    """The statistical model of a scene."""
+    """Statistical model of a scene, from ``count`` states of a training seed; the same bits on any number of cores."""
     scene = scene.for_seed(seed)
     nodes, labels = interior_nodes(scene.rest)
-    return build_model(scene.rest, nodes, labels, sample_states(scene, nodes, labels, count, seed))
+    states = sample_states(scene, nodes, labels, count, seed)
+    with threadpool_limits(1, "blas"):  # threads add in another order
+        return build_model(scene.rest, nodes, labels, states)
