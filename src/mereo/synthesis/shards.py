@@ -127,7 +127,7 @@ def generate(
     if not (output / TEMPLATE).exists():
         with atomic_file(output / TEMPLATE) as temporary:
             temporary.write_bytes(save({"distance": rest_distances(loaded.rest)}))
-    if not (output / STATISTICAL_MODEL).exists():
+    if not test and not (output / STATISTICAL_MODEL).exists():  # nothing is trained on a test set
         save_statistical_model(scene_model(loaded, states_for(examples)), output / STATISTICAL_MODEL)
     missing = [item for item in shards if not item.is_complete()]
     total = sum(item.end - item.first for item in missing)
