@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 STEP = 1e-6
-"""Of the coordinates' magnitude: finite differences then err by about 1e-6 in truncation and 1e-10 in rounding."""
+"""Step of finite differences, of the coordinates' magnitude: they err by about 1e-6 in truncation, 1e-10 in rounding."""
 
 TOLERANCE = 1e-7
-"""Of the coordinates' magnitude: where Newton's iteration is done."""
+"""Tolerance, of the coordinates' magnitude: where Newton's iteration is done."""
 
 ITERATIONS = 30
 LEAST_DETERMINANT = 0.02

@@ -25,7 +25,7 @@ FOLLOWED = 32
 """Material points that one point follows."""
 
 SOFTENING = 0.05
-"""Of the segment's size: material points nearer than this count alike."""
+"""Softening length, of the segment's size: material points nearer than this count alike."""
 
 RIDGE = 1e-6
 """Keeps the normal equations regular where all material points lie in a plane."""
@@ -33,7 +33,7 @@ RIDGE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class PointWeights:
-    """Which material points each point follows, and with which weight; rows of ``weight`` sum to one."""
+    """Material points that each point follows, and their weights; rows of ``weight`` sum to one."""
 
     index: Int[np.ndarray, "n k"]
     weight: Float[np.ndarray, "n k"]
@@ -45,7 +45,7 @@ class PointWeights:
         return result.reshape(len(self.index), *material.shape[1:])
 
     def rows(self, chosen: np.ndarray) -> "PointWeights":
-        """Of some of the points."""
+        """Weights of some of the points."""
         return PointWeights(self.index[chosen], self.weight[chosen])
 
 
@@ -67,7 +67,7 @@ class Anchors:
         return cKDTree(self.position)
 
     def weights(self, points: Float[np.ndarray, "n 3"]) -> PointWeights:
-        """How points move with the anchors; the weight of an anchor falls with the fourth power of its distance."""
+        """Weights by which points move with the anchors; an anchor's falls with the fourth power of its distance."""
         count = min(FOLLOWED, len(self.index))
         distance, near = self.tree.query(points, k=range(1, count + 1))
         size = float(np.ptp(self.position, axis=0).max())

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 FitChoice = Literal["off", "auto", "modes", "full"]
-"""What answers a frame: the network alone; the registered model where that explains the frame, else the network; the
-registered model in any case, by its modes or by the draws of its scene as well."""
+"""Source of the answer to a frame: the network alone; the registered model where that explains the frame, else the
+network; the registered model in any case, by its modes or by the draws of its scene as well."""
 
 
 @dataclass(frozen=True)
@@ -93,4 +93,4 @@ class DrawsConfig:
 
 
 MANY_DRAWS = DrawsConfig(starts=2, kept=1, approaches=2, first_rounds=1, last_rounds=4, jumps=0)
-"""For scenes with many draws."""
+"""Constants for scenes with many draws."""

@@ -17,7 +17,7 @@ SIGHT_LINES = 256
 """Lines of sight along which the hidden inside is asked for."""
 
 DEPTHS = np.concatenate([np.arange(0.04, 0.6, 0.08), np.arange(0.6, 2.4, 0.15)])
-"""How far behind the observed point, in half longest sides of the visible part."""
+"""Depths behind the observed point, in half longest sides of the visible part."""
 
 OBSERVED = 400
 """Observed points that are asked for."""
@@ -50,11 +50,11 @@ class Correspondences:
         return Correspondences(*(part[chosen] for part in parts))
 
     def scaled(self, factor: float) -> "Correspondences":
-        """With the camera frame in another unit."""
+        """Correspondences with the camera frame in another unit."""
         return Correspondences(self.points * factor, self.rest, self.labels, self.confidence, self.observed)
 
     def evenly(self, each: int = EACH) -> "Correspondences":
-        """At most ``each`` observed and as many inside, evenly spread in space."""
+        """Even subset: at most ``each`` observed and as many inside, evenly spread in space."""
         chosen = [np.empty(0, dtype=np.int64)]
         for rows in (np.flatnonzero(self.observed), np.flatnonzero(~self.observed)):
             if len(rows):

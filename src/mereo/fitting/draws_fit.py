@@ -25,7 +25,7 @@ TOWARDS_MIDDLE = (1.0, 0.8, 0.6, 0.4)
 """Shares of guessed draws that are tried, until the scene takes them."""
 
 SHARES = (1.0, 0.5, 0.2)
-"""Of a step that are tried until the scene takes one."""
+"""Shares of a step that are tried until the scene takes one."""
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
@@ -56,7 +56,7 @@ def guessed(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
 
 
 def wide_misfit(problem: DrawsProblem, fit: DrawsFit) -> float:
-    """By the cloud's first sigma."""
+    """Misfit by the cloud's first sigma."""
     seen = played(problem, fit.drawn, fit.z, fit.posed, wide=True)
     return np.inf if seen is None else seen.misfit
 

@@ -63,7 +63,7 @@ class DrawsProblem:
     def of(
         cls, base: Problem, states: DrawnStates, found: Correspondences, config: DrawsConfig | None = None
     ) -> "DrawsProblem":
-        """With the constants for as many draws as the scene has, where none are given."""
+        """Problem with the constants for as many draws as the scene has, where none are given."""
         model = base.model
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= DrawsConfig().few else MANY_DRAWS
@@ -114,7 +114,7 @@ def played(
 
 
 def draws_prior(fit: DrawsFit, motion: Float32[np.ndarray, "m 3 d"], trust: float) -> Prior:
-    """Of a change of the draws: N(0, 1) of the draws themselves, near where they are; those that move nothing stay."""
+    """Prior of a change of the draws: N(0, 1) of the draws themselves; those that move nothing stay."""
     moving = np.abs(motion).max(axis=(0, 1)) > 1e-9
     precision = 1.0 + 1.0 / trust**2
     return Prior(np.where(moving, -fit.z / precision, 0.0), np.diag(np.where(moving, precision, HELD)))

@@ -42,7 +42,7 @@ class Posed:
         return np.exp(-self.log_scale) * ((points - self.translation) @ self.rotation)
 
     def moved(self, step: Float[np.ndarray, " p"]) -> "Posed":
-        """After one step of the parameters."""
+        """State after one step of the parameters."""
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         return Posed(
             turn @ self.rotation, self.translation + step[3:6], self.z + step[POSE:], self.log_scale + float(step[6])
@@ -65,7 +65,7 @@ class NormalEquations:
         log_scale: float,
         scale_std: float,
     ) -> "NormalEquations":
-        """Of ``(z - center)^T precision (z - center)`` and of a scale that is known up to ``scale_std``."""
+        """Equations of ``(z - center)^T precision (z - center)`` and of a scale that is known up to ``scale_std``."""
         count = POSE + len(z)
         matrix, gradient = np.zeros((count, count)), np.zeros(count)
         matrix[POSE:, POSE:], gradient[POSE:] = precision, precision @ (z - center)
@@ -75,7 +75,7 @@ class NormalEquations:
     def add(
         self, jacobian: Float[np.ndarray, "r p"], residual: Float[np.ndarray, " r"], weight: Float[np.ndarray, " r"]
     ) -> "NormalEquations":
-        """With further residuals."""
+        """Sum with further residuals."""
         weighted = jacobian * weight[:, None].astype(jacobian.dtype)
         matrix = (weighted.T @ jacobian).astype(np.float64)
         return NormalEquations(self.matrix + matrix, self.gradient + weighted.T.astype(np.float64) @ residual)

@@ -8,7 +8,7 @@ from mereo.fitting.problem import Problem
 from mereo.geometry.procrustes import best_rotations
 
 ROUNDS = 4
-"""Of robust reweighting."""
+"""Rounds of robust reweighting."""
 
 RANKED_BY = 64
 """Correspondences that rank the library."""
@@ -17,7 +17,7 @@ POOL = 80
 """States most alike, among which different ones are chosen."""
 
 ALIKE = 0.03
-"""Of half the rest box's longest side: points nearer than this agree."""
+"""Tolerance, of half the rest box's longest side: points nearer than this agree."""
 
 
 def robust_poses(
@@ -26,7 +26,7 @@ def robust_poses(
     weight: Float32[np.ndarray, " p"],
     sigma: float,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """For many shapes at once the robust rigid pose on the same points: cost in 0..1, rotations, translations."""
+    """Robust rigid poses of many shapes at once on the same points: cost in 0..1, rotations, translations."""
     share = np.broadcast_to(weight / weight.sum(), states.shape[:2])
     for _ in range(ROUNDS):
         center, goal = np.matmul(share[:, None], states), (share @ target)[:, None]

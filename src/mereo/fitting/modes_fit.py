@@ -49,7 +49,7 @@ def fit_whole(problem: Problem) -> Posed:
 
 
 def refine(problem: Problem, posed: Posed, widening: float = 1.0) -> Posed:
-    """From nearby, under the prior of the library's states around ``posed``."""
+    """Refined state, from nearby, under the prior of the library's states around ``posed``."""
     config = problem.config
     prior = Prior.near(problem.model, posed.z, config.neighbors, config.neighbor_std)
     return fit_cloud(problem, posed, prior, widening * config.refine_sigma, config.refine_steps, 0.0)

@@ -31,7 +31,7 @@ MOST = 2.0
 """Standard deviations of a draw that is guessed."""
 
 RIDGE = 1e-3
-"""Of the regression of draws on modes, relative to the states' own spread."""
+"""Ridge of the regression of draws on modes, relative to the states' own spread."""
 
 PROJECTED = 400
 """Material points by which many states are expressed in modes."""
@@ -79,7 +79,7 @@ class Drawn:
         return cls(seed, ndtri(np.concatenate([call.shares for call in calls])), sizes, smooth)
 
     def deformations(self, scene: Scene, z: Float[np.ndarray, " d"]) -> tuple[Deformation, ...] | None:
-        """Of the state with other draws; None where the scene refuses it."""
+        """Deformations of the state with other draws; None where the scene refuses it."""
         shares = np.split(ndtr(np.clip(z, -LARGEST, LARGEST)), np.cumsum(self.sizes)[:-1])
         try:
             return scene.sample_deformations(Playback(self.seed, shares))
@@ -139,7 +139,7 @@ class DrawnStates:
 
 
 def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]) -> Float[np.ndarray, "n k"]:
-    """Of many states at once, by a few rounds of alignment and least squares on a few material points."""
+    """Coefficients of many states at once, by a few rounds of alignment and least squares on a few material points."""
     few = spread(model.rest_points, PROJECTED)
     flat = model.modes[few].reshape(-1, model.count).astype(np.float64)
     normal = flat.T @ flat + 1e-6 * np.trace(flat.T @ flat) / model.count * np.eye(model.count)
@@ -156,7 +156,7 @@ def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]
 
 
 def anchors_moved(model: StatisticalModel, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "a 3"]:
-    """Where the anchors of all segments go, one segment after the other."""
+    """Positions to which the anchors of all segments go, one segment after the other."""
     pairs = zip(deformations, model.anchors, strict=True)
     return np.concatenate([deformation(model.rest_points[index]) for deformation, index in pairs])
 
@@ -164,5 +164,5 @@ def anchors_moved(model: StatisticalModel, deformations: tuple[Deformation, ...]
 def material_moved(
     scene: Scene, model: StatisticalModel, deformations: tuple[Deformation, ...]
 ) -> Float[np.ndarray, "m 3"]:
-    """Where all material points go."""
+    """Positions to which all material points go."""
     return state_points(scene.deform(deformations), model.nodes, model.node_labels)

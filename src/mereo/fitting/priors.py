@@ -18,12 +18,12 @@ class Prior:
 
     @classmethod
     def whole(cls, model: StatisticalModel) -> "Prior":
-        """Of all states: N(0, 1) each."""
+        """Prior of all states: N(0, 1) each."""
         return cls(np.zeros(model.count), np.eye(model.count))
 
     @classmethod
     def near(cls, model: StatisticalModel, z: Float[np.ndarray, " k"], count: int, extra_std: float) -> "Prior":
-        """Of the ``count`` states of the library nearest in shape, each coefficient ``extra_std`` more unsure."""
+        """Prior of the ``count`` states of the library nearest in shape, each coefficient ``extra_std`` more unsure."""
         distance = (((model.library - z) * model.motion) ** 2).sum(axis=1)
         near = model.library[np.argsort(distance)[:count]].astype(np.float64)
         center = near.mean(axis=0)
@@ -62,7 +62,7 @@ class PairTerm:
     def add_to(
         self, normal: NormalEquations, z: Float[np.ndarray, " k"], worth: float, slack: float
     ) -> NormalEquations:
-        """With the squared errors of all lengths, together worth ``worth`` points; ``slack`` is added to their std."""
+        """Sum with squared errors of all lengths, together worth ``worth`` points; ``slack`` is added to their std."""
         if len(self.std) == 0:
             return normal
         vector, length = self._vectors(z)

@@ -17,7 +17,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 @dataclass(frozen=True)
 class Misfit:
-    """How badly a state explains a frame, as squared standard deviations.
+    """Misfit: how badly a state explains a frame, as squared standard deviations.
 
     Attributes:
         cloud: of one partner on average.
@@ -77,19 +77,19 @@ class Problem:
         return self.config.start_sigma * self.model.half
 
     def known(self, posed: Posed, prior: Prior, slack: float) -> NormalEquations:
-        """What is known without the frame: prior, scale, kept distances up to ``slack``."""
+        """Normal equations of what is known without the frame: prior, scale, kept distances up to ``slack``."""
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
         return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
 
     def seen(self, normal: NormalEquations, posed: Posed, sigma: float, network_worth: float) -> NormalEquations:
-        """With cloud, witnesses and correspondences."""
+        """Sum with cloud, witnesses and correspondences."""
         surface = Surface.of(self.model, posed)
         normal = self.network.add_to(normal, posed, self.network_sigma, network_worth, robust=True)
         normal = normal.add(*surface.cloud_term(posed, self.evidence.partners, sigma, self.config.cloud_worth))
         return add_witnesses(normal, surface, posed, self.evidence, self.witnesses, sigma)
 
     def misfit(self, posed: Posed, sigma: float | None = None) -> Misfit:
-        """Of a state; ``sigma`` of the cloud is its last one where not given."""
+        """Misfit of a state; ``sigma`` of the cloud is its last one where not given."""
         sigma = self.config.cloud_sigma if sigma is None else sigma
         surface = Surface.of(self.model, posed)
         cloud = float(robust_square(surface.nearest(self.evidence.partners)[0], sigma).mean())

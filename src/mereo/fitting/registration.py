@@ -18,7 +18,7 @@ Method = Literal["modes", "draws"]
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """What a registration says about points of the frame.
+    """Answer of a registration about points of the frame.
 
     Attributes:
         label: 0 for empty space, i + 1 for segment i.
@@ -35,7 +35,7 @@ class Located:
 
 @dataclass(frozen=True, eq=False)
 class SegmentMotion:
-    """From rest to the frame, for points of one segment. Satisfies ``Deformation``."""
+    """Motion from rest to the frame, for points of one segment. Satisfies ``Deformation``."""
 
     rest: Anchors
     moved: Float[np.ndarray, "m 3"]
@@ -87,7 +87,7 @@ class Registration:
     def to_camera(
         self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"] | None = None
     ) -> Float[np.ndarray, "n 3"]:
-        """Where points of the rest model are in the camera frame.
+        """Positions of points of the rest model in the camera frame.
 
         Args:
             points: rest pose, scene units.
@@ -119,7 +119,7 @@ class Registration:
         return Located(labels, distance, direction, self.to_rest(points, nearest))
 
     def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
-        """The same in another frame."""
+        """Registration in another frame."""
         return replace(self, material=self.material @ T_new_camera[:3, :3].T + T_new_camera[:3, 3])
 
     @cached_property

@@ -47,12 +47,12 @@ class Surface:
 
     @classmethod
     def of(cls, model: StatisticalModel, posed: Posed) -> "Surface":
-        """Of a state."""
+        """Surface of a state."""
         return cls.through(model, posed.place(model.material(posed.z)))
 
     @classmethod
     def through(cls, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> "Surface":
-        """Of posed material points."""
+        """Surface through posed material points."""
         a, b, c = (material[model.faces[:, i]] for i in range(3))
         normal = np.cross(b - a, c - a)
         facing = np.flatnonzero(np.einsum("fi,fi->f", normal, a) < 0)
@@ -111,7 +111,7 @@ class NetworkTerm:
         return cls(found.points, weights(model.mean), weights(model.modes), found.confidence)
 
     def place(self, posed: Posed) -> Float[np.ndarray, "n 3"]:
-        """Where the state has the points."""
+        """Positions that the state gives the points."""
         return posed.place(self.mean + self.modes @ posed.z.astype(np.float32))
 
     def energy(self, posed: Posed, sigma: float) -> float:
@@ -122,7 +122,7 @@ class NetworkTerm:
     def add_to(
         self, normal: NormalEquations, posed: Posed, sigma: float, worth: float, robust: bool
     ) -> NormalEquations:
-        """With the squared distances, together worth as many independent points as ``worth``."""
+        """Sum with the squared distances, together worth as many independent points as ``worth``."""
         points = self.place(posed)
         offset = points - self.target
         weight = self.confidence / self.confidence.sum() * (worth / sigma**2)
@@ -139,7 +139,7 @@ def add_witnesses(
     chosen: Int[np.ndarray, " w"],
     sigma: float,
 ) -> NormalEquations:
-    """With the chosen vertices that are outside the silhouette or in free space."""
+    """Sum with the chosen vertices that are outside the silhouette or in free space."""
     direction, amount = evidence.violations(surface.material[chosen], ROBUST * sigma)
     rows = np.flatnonzero(amount > 0)
     if len(rows) == 0:

@@ -28,7 +28,7 @@ FRAGMENT = 0.02
 """A piece whose diagonal is below this share of the segment's is a stray."""
 
 FLECK = 1e-5
-"""Of the largest piece's volume."""
+"""Share of the largest piece's volume."""
 
 MOST_SHELLS = 300
 """More are no object of parts but debris, and their union would take minutes."""

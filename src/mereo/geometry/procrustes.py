@@ -9,7 +9,7 @@ from jaxtyping import Float
 from mereo.geometry.transforms import fit_rigid
 
 ROUNDS = 20
-"""Of reweighting in ``robust_rigid``; it has converged by then."""
+"""Rounds of reweighting in ``robust_rigid``; it has converged by then."""
 
 
 def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray, "*s 3 3"]:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 _DEVICE = rtcore.EmbreeDevice()
 
 _MARGIN = 1e-4
-"""Of slopes: a hundredth of a pixel of the paper's camera, and a thousand times the rounding of single precision."""
+"""Tolerance of slopes: a hundredth of a pixel of the paper's camera, a thousand times single precision's rounding."""
 
 
 class Hits(NamedTuple):

@@ -12,7 +12,7 @@ Format = Literal["glb", "ply", "obj", "stl", "npz", "vti", "nifti", "seg.nrrd", 
 
 @dataclass(frozen=True)
 class FilesConfig:
-    """Which files a reconstruction becomes; where and in which unit: docs/design/0012-files-out.md.
+    """Files that a reconstruction becomes; where and in which unit: docs/design/0012-files-out.md.
 
     Attributes:
         formats: surfaces as glb, ply, obj, stl; labels as npz, vti (ParaView), nifti, seg.nrrd (3D Slicer); points,
@@ -29,7 +29,7 @@ DEFAULT_FILES = FilesConfig()
 
 @dataclass(frozen=True)
 class InputConfig:
-    """How a frame is read.
+    """Settings of reading a frame.
 
     Attributes:
         intrinsics: the depth camera, JSON or YAML; recordings have their own.

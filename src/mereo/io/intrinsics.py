@@ -46,7 +46,7 @@ class CameraWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """What a file says about a depth camera.
+    """Statements of a file about a depth camera.
 
     Attributes:
         camera: the pinhole.

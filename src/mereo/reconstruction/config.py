@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class IsolationConfig:
-    """What to leave out of a frame, so that only the object is left. Everything is off by default.
+    """Parts of a frame to leave out, so that only the object is left. Everything is off by default.
 
     Attributes:
         depth_range: nearest and farthest depth (z) in metres that is kept.

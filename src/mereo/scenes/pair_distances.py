@@ -20,7 +20,7 @@ LEAST_RATIO = 2.0
 """Pairs whose distance varies at least so many times more under the Gaussian than among the states."""
 
 FLOOR = 0.002
-"""Of half the rest box's longest side: no distance is taken to be known better."""
+"""Least deviation, of half the rest box's longest side: no distance is taken to be known better."""
 
 
 @dataclass(frozen=True, eq=False)

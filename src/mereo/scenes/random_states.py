@@ -44,7 +44,7 @@ def interior_nodes(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "j 3"], UInt8
 def state_points(
     state: State, nodes: Float[np.ndarray, "j 3"], labels: UInt8[np.ndarray, " j"]
 ) -> Float[np.ndarray, "m 3"]:
-    """Where a state has moved all material points, in the scene's frame."""
+    """Positions to which a state has moved all material points, in the scene's frame."""
     moved = np.empty_like(nodes)
     for label in np.unique(labels):
         rows = labels == label
@@ -68,7 +68,7 @@ def built_in_model(name: str, segments: tuple[str, ...]) -> StatisticalModel | N
 
 
 def states_for(examples: int) -> int:
-    """How many states the model of a dataset is built from: as many as it has examples, within limits."""
+    """Number of states that the model of a dataset is built from: as many as it has examples, within limits."""
     return min(max(examples, LEAST_STATES), STATES)
 
 

@@ -30,7 +30,7 @@ HELD_OUT = 0.05
 """Share of the states that the modes do not see: their distance from the model is its residue."""
 
 LEAST_MOTION = 2e-4
-"""Of half the rest box's longest side: modes whose root mean square motion is smaller are left out."""
+"""Threshold, of half the rest box's longest side: modes whose root mean square motion is smaller are left out."""
 
 PAIR_POINTS = 160
 """Material points among which distances are compared."""
@@ -77,12 +77,12 @@ class StatisticalModel:
 
     @property
     def count(self) -> int:
-        """How many modes there are."""
+        """Number of modes."""
         return self.modes.shape[2]
 
     @cached_property
     def faces(self) -> Int[np.ndarray, "f 3"]:
-        """Of all segments, as indices of material points."""
+        """Faces of all segments, as indices of material points."""
         return self.rest.merged()[1].astype(np.int64)
 
     @cached_property
@@ -92,7 +92,7 @@ class StatisticalModel:
 
     @cached_property
     def labels(self) -> UInt8[np.ndarray, " m"]:
-        """Of each material point."""
+        """Label of each material point."""
         owner = np.repeat(np.arange(len(self.vertex_counts)), self.vertex_counts)
         return np.concatenate([owner + 1, self.node_labels]).astype(np.uint8)
 
@@ -113,7 +113,7 @@ class StatisticalModel:
 
     @cached_property
     def anchors(self) -> tuple[Int[np.ndarray, " a"], ...]:
-        """For each segment the material points that others of it follow."""
+        """Anchors of each segment: the material points that others of it follow."""
         result = []
         for index, first in enumerate(np.cumsum([0, *self.vertex_counts[:-1]])):
             vertices = first + spread(self.rest.segments[index].vertices, ANCHORS)
@@ -123,7 +123,7 @@ class StatisticalModel:
 
     @cached_property
     def rest_anchors(self) -> tuple[Anchors, ...]:
-        """The same at rest."""
+        """Anchors of each segment at rest."""
         return tuple(Anchors(index, self.rest_points[index]) for index in self.anchors)
 
     @cached_property
@@ -138,7 +138,7 @@ class StatisticalModel:
 
     @cached_property
     def sparse_library(self) -> Float32[np.ndarray, "n p 3"]:
-        """Where these are in all states of the library."""
+        """Positions of these few in all states of the library."""
         motion = self.library @ self.modes[self.sparse].reshape(-1, self.count).T
         return self.mean[self.sparse].astype(np.float32) + motion.reshape(len(self.library), -1, 3)
 
@@ -166,7 +166,7 @@ class StatisticalModel:
         return self.rest.with_vertices(np.split(material[: ends[-1]].astype(np.float64), ends[:-1]))
 
     def weights(self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]) -> PointWeights:
-        """How points at rest, each of the segment that its label (1 or more) says, follow the material points."""
+        """Weights by which points at rest, of the segments ``labels`` (1 or more), follow the material points."""
         return following(self.rest_anchors, points, labels)
 
     def project(self, material: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, " k"]]:

@@ -25,7 +25,7 @@ from mereo.scenes.pair_distances import PairDistances
 from mereo.scenes.statistical_model import StatisticalModel
 
 LIBRARY_STEP = 1 / 32
-"""Of a coefficient; bytes reach to 4 standard deviations, which one normal number in 16,000 exceeds."""
+"""Step of a coefficient; bytes reach to 4 standard deviations, which one normal number in 16,000 exceeds."""
 
 WIDE_MODES = 12
 """The first ones, in two bytes: they move most, and so would be rounded most."""
@@ -116,7 +116,7 @@ def with_fewer_modes(model: StatisticalModel, most: int) -> StatisticalModel:
 
 
 def modes_within(model: StatisticalModel, size: int) -> int:
-    """How many modes fit into ``size`` bytes; 0 where not even the rest of the model does."""
+    """Number of modes that fit into ``size`` bytes; 0 where not even the rest of the model does."""
     tensors, _ = pack_model(model)
     each = 3 * len(model.mean) + len(model.library) + 4
     fixed = sum(value.nbytes for value in tensors.values()) - each * model.count

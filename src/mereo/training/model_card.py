@@ -23,10 +23,10 @@ from mereo.scenes.statistical_model_file import modes_within, with_fewer_modes
 from mereo.training.config import PRESETS
 
 MOST_BYTES = 8_000_000
-"""Of a released file; modes that do not fit are left out."""
+"""Size of a released file at most; modes that do not fit are left out."""
 
 HEADER_BYTES = 4_000
-"""What names and shapes of the statistical model take."""
+"""Bytes that names and shapes of the statistical model take."""
 
 PLAIN_CHARACTERS = "abcdefghijklmnopqrstuvwxyz0123456789-_"
 

@@ -20,7 +20,7 @@ CRANK_RADIUS = 4.0
 ROD_LENGTH = 12.0
 PISTON_RADIUS = 4.0
 CROWN = 3.8
-"""From the piston pin up to the crown."""
+"""Height from the piston pin up to the crown."""
 
 THROWS = (1.0, -1.0, -1.0, 1.0)
 """At crank angle 0 the crank pins of these cylinders point up (1) or down (-1)."""

@@ -25,7 +25,7 @@ SCALE = 4.0
 """Scene units per decimetre: the body is 17 units deep, 40 wide and 67 tall."""
 
 FACES = 5000
-"""To which the body's 26,756 triangles are simplified before it is cut."""
+"""Triangles to which the body's 26,756 triangles are simplified before it is cut."""
 
 LONGEST_EDGE = 3.6
 """Longer edges are split, so that the flat cut faces bend with the rest."""

@@ -21,7 +21,7 @@ BACKDROP = ((58, 65, 78), (22, 25, 32))
 """Top and bottom of the background, neutral and dark: the palette's yellow is hard to see on white."""
 
 ENVIRONMENT = 0.45
-"""Of viser's surrounding light; with all of it the palette's colours fade to white."""
+"""Share of viser's surrounding light; with all of it the palette's colours fade to white."""
 
 CLOUD_COLOR = (244, 246, 250)
 CLOUD_SIZE = 0.008
