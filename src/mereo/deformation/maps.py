@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 STEP = 1e-6
-"""Step of finite differences, of the coordinates' magnitude: they err by about 1e-6 in truncation, 1e-10 in rounding."""
+"""Step of finite differences, of the coordinates' magnitude: they err by 1e-6 in truncation, 1e-10 in rounding."""
 
 TOLERANCE = 1e-7
 """Tolerance, of the coordinates' magnitude: where Newton's iteration is done."""
