@@ -293,6 +293,7 @@ def test_progress_tells_rate_and_time_left(
 ) -> None:
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
     generate(TOY, tmp_path / "data", SMALL, examples=6, seed=3)
-    lines = capsys.readouterr().out.splitlines()
+    modes, *lines = capsys.readouterr().out.splitlines()
+    assert modes == "modes of 100 random states, for registration"
     assert re.fullmatch(r"4 of 6, \d+\.\d examples/s, \d+ s left", lines[0])
     assert lines[1].startswith("6 of 6, ") and re.fullmatch(r"6 examples made in \d+ (s|min)", lines[2])

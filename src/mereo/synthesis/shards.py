@@ -128,7 +128,9 @@ def generate(
         with atomic_file(output / TEMPLATE) as temporary:
             temporary.write_bytes(save({"distance": rest_distances(loaded.rest)}))
     if not test and not (output / STATISTICAL_MODEL).exists():  # nothing is trained on a test set
-        save_statistical_model(scene_model(loaded, states_for(examples)), output / STATISTICAL_MODEL)
+        states = states_for(examples)
+        print(f"modes of {states} random states, for registration", flush=True)
+        save_statistical_model(scene_model(loaded, states), output / STATISTICAL_MODEL)
     missing = [item for item in shards if not item.is_complete()]
     total = sum(item.end - item.first for item in missing)
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile
