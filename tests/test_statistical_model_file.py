@@ -8,6 +8,7 @@ import pytest
 import torch
 from analytic import untrained
 
+from mereo.deformation.maps import Identity
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.weights import load_model, save_model, weights_bytes
 from mereo.scenes.random_states import scene_model
@@ -85,3 +86,11 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.safetensors").write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"m.safetensors is no statistical model of mereo \(.*\); delete it and run"):
         load_statistical_model(tmp_path / "m.safetensors")
+
+
+def test_an_object_that_does_not_deform_has_no_modes(tmp_path: Path) -> None:
+    still = replace(load_scene("rope"), sample_deformations=lambda _: (Identity(),) * 9)
+    save_statistical_model(scene_model(still, 20), tmp_path / "m.safetensors")
+    read = load_statistical_model(tmp_path / "m.safetensors")
+    assert read.count == 0 and read.residue < 1e-5
+    np.testing.assert_allclose(read.material(np.zeros(0)), read.rest_points, atol=1e-4)

@@ -73,7 +73,7 @@ def _distances(
     mean: Float32[np.ndarray, "v 3"], modes: Float32[np.ndarray, "v 3 k"], z: Float32[np.ndarray, "n k"]
 ) -> Float32[np.ndarray, "n v v"]:
     """Between all pairs of points in each state."""
-    points = mean + (z @ modes.reshape(-1, z.shape[1]).T).reshape(len(z), -1, 3)
+    points = mean + (z @ modes.reshape(3 * len(mean), z.shape[1]).T).reshape(len(z), -1, 3)
     squared = (points**2).sum(axis=2)
     product = np.matmul(points, points.transpose(0, 2, 1))
     result: np.ndarray = np.sqrt(np.maximum(squared[:, :, None] + squared[:, None] - 2 * product, 0.0))

@@ -32,7 +32,7 @@ def interior_nodes(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "j 3"], UInt8
     points = rng.uniform(low, high, size=(CANDIDATES, 3))
     labels = Solids(rest).label(points)
     each = NODES // len(rest.segments)
-    rows = []
+    rows = [np.empty(0, dtype=np.int64)]
     for label in range(1, len(rest.segments) + 1):
         inside = np.flatnonzero(labels == label)
         if len(inside):

@@ -139,7 +139,7 @@ class StatisticalModel:
     @cached_property
     def sparse_library(self) -> Float32[np.ndarray, "n p 3"]:
         """Positions of these few in all states of the library."""
-        motion = self.library @ self.modes[self.sparse].reshape(-1, self.count).T
+        motion = self.library @ self.modes[self.sparse].reshape(3 * len(self.sparse), self.count).T
         return self.mean[self.sparse].astype(np.float32) + motion.reshape(len(self.library), -1, 3)
 
     def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> "StatisticalModel":
@@ -171,7 +171,7 @@ class StatisticalModel:
 
     def project(self, material: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, " k"]]:
         """Pose and coefficients of a state: ``T_state_model`` and z of (nearly) least squared distance."""
-        flat = self.modes.reshape(-1, self.count).astype(np.float64)
+        flat = self.modes.reshape(3 * len(self.modes), self.count).astype(np.float64)
         normal = flat.T @ flat + 1e-9 * np.trace(flat.T @ flat) * np.eye(self.count)
         z = np.zeros(self.count)
         for _ in range(PROJECTIONS):
@@ -229,7 +229,7 @@ def build_model(
     library, modes = _principal(seen, most, LEAST_MOTION * half)
     left = unseen - (unseen @ np.linalg.pinv(modes)) @ modes if len(modes) else unseen
     residue = float(np.sqrt((left.astype(np.float64) ** 2).sum() / (left.size / 3)))
-    layout = np.ascontiguousarray(modes.reshape(len(modes), -1, 3).transpose(1, 2, 0))
+    layout = np.ascontiguousarray(modes.reshape(len(modes), len(mean), 3).transpose(1, 2, 0))
     pairs = kept_distances(spread(material_points(rest, nodes), PAIR_POINTS), mean, layout, library, half)
     return StatisticalModel(rest, nodes, node_labels, mean, layout, library, residue, pairs)
 
