@@ -92,10 +92,7 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """
     config, base = problem.config, problem.base
     for _ in range(config.jumps):
-        cloud = (
-            problem.around(fit.material, np.zeros((len(fit.material), 3, 0), dtype=np.float32)).misfit(fit.posed).cloud
-        )
-        if cloud < base.config.explained:
+        if problem.rigid(fit.material).misfit(fit.posed).cloud < base.config.explained:
             break
         others = []
         for number in np.flatnonzero(fit.drawn.smooth):

@@ -79,6 +79,10 @@ class DrawsProblem:
         network = NetworkTerm(self.found.points, self.weights(mean), self.weights(modes), self.found.confidence)
         return Problem(model, network, self.base.evidence, self.base.scale_std, self.base.config)
 
+    def rigid(self, material: Float[np.ndarray, "m 3"]) -> Problem:
+        """Problem of one state's pose alone."""
+        return self.around(material, np.zeros((len(material), 3, 0), dtype=np.float32))
+
 
 @dataclass(frozen=True, eq=False)
 class DrawsFit:
@@ -106,10 +110,9 @@ def played(
     if deformations is None:
         return None
     material = material_moved(problem.scene, problem.model, deformations)
-    fixed = problem.around(material, np.zeros((len(material), 3, 0), dtype=np.float32))
     rigid = replace(posed, z=np.empty(0))
     sigma = problem.config.start_sigma * problem.model.half if wide else None
-    misfit = fixed.misfit(rigid, sigma).total + float(z @ z)
+    misfit = problem.rigid(material).misfit(rigid, sigma).total + float(z @ z)
     return DrawsFit(drawn, z, rigid, material, misfit)
 
 

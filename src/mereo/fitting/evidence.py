@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from mereo.deformation.moving_least_squares import spread
+from mereo.geometry.downsampling import random_subset
 
 MOST_POINTS = 6000
 """Denser clouds are thinned."""
@@ -53,8 +54,7 @@ class Evidence:
     @classmethod
     def of(cls, points: Float[np.ndarray, "n 3"]) -> "Evidence":
         """Prepare a cloud; its lines of sight start at the origin."""
-        if len(points) > MOST_POINTS:
-            points = points[np.random.default_rng(0).choice(len(points), MOST_POINTS, replace=False)]
+        points = random_subset(points, MOST_POINTS)
         ranges = np.linalg.norm(points, axis=1)
         sight = cKDTree(points / ranges[:, None])
         # the fourth neighbour of a pixel is one pitch away, as the first is; irregular clouds are not so lucky

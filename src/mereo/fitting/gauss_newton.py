@@ -37,10 +37,6 @@ class Posed:
         """Points of the model's frame in the camera frame."""
         return np.exp(self.log_scale) * (unposed @ self.rotation.T) + self.translation
 
-    def unplace(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Inverse of ``place``."""
-        return np.exp(-self.log_scale) * ((points - self.translation) @ self.rotation)
-
     def moved(self, step: Float[np.ndarray, " p"]) -> "Posed":
         """State after one step of the parameters."""
         turn = Rotation.from_rotvec(step[:3]).as_matrix()

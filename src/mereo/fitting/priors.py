@@ -30,10 +30,6 @@ class Prior:
         covariance = (near - center).T @ (near - center) / max(1, len(near) - 1)
         return cls(center, np.linalg.inv(covariance + extra_std**2 * np.eye(model.count)))
 
-    def energy(self, z: Float[np.ndarray, " k"]) -> float:
-        """Squared distance from the mean, in standard deviations."""
-        return float((z - self.center) @ self.precision @ (z - self.center))
-
 
 @dataclass(frozen=True, eq=False)
 class PairTerm:

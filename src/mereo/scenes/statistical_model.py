@@ -18,6 +18,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.procrustes import align_all
 from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.pair_distances import PairDistances, kept_distances
+from mereo.scenes.rest_pose import rest_frame
 
 PROCRUSTES_ROUNDS = 100
 PROCRUSTES_POINTS = 600
@@ -104,12 +105,12 @@ class StatisticalModel:
     @cached_property
     def half(self) -> float:
         """Half of the rest box's longest side."""
-        return float(np.ptp(self.rest.bounds, axis=0).max() / 2)
+        return rest_frame(self.rest)[1]
 
     @cached_property
     def rest_center(self) -> Float[np.ndarray, "3"]:
         """Middle of the rest box."""
-        return self.rest.bounds.mean(axis=0)
+        return rest_frame(self.rest)[0]
 
     @cached_property
     def anchors(self) -> tuple[Int[np.ndarray, " a"], ...]:
@@ -225,7 +226,7 @@ def build_model(
     held_out = max(1, round(HELD_OUT * len(states)))
     mean, aligned = _aligned(material_points(rest, nodes), states)
     seen, unseen = aligned[:-held_out], aligned[-held_out:]
-    half = float(np.ptp(rest.bounds, axis=0).max() / 2)
+    _, half = rest_frame(rest)
     library, modes = _principal(seen, most, LEAST_MOTION * half)
     left = unseen - (unseen @ np.linalg.pinv(modes)) @ modes if len(modes) else unseen
     residue = float(np.sqrt((left.astype(np.float64) ** 2).sum() / (left.size / 3)))
