@@ -212,9 +212,10 @@ class Reconstruct:
         isolation: what of the frame is left out.
         inference: where and how exactly the network computes.
         files: which files, and in which unit.
-        fit: register the object's own deformation model to the frame: off leaves the network's answer; auto takes the
-            registered model where it explains the frame; modes and full take it in any case, full by fitting the draws
-            of the scene as well.
+        fit: register the object's own deformation model to the frame: auto takes the registered model where it explains
+            the frame, if the weights carry one; off leaves the network's answer; modes and full take the model in any
+            case, full by fitting the draws of the scene as well.
+        scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
         force: replace an existing output folder.
     """
 
@@ -226,7 +227,8 @@ class Reconstruct:
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
     files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
-    fit: FitChoice = "off"
+    fit: FitChoice = "auto"
+    scene: str | None = None
     force: bool = False
 
     def run(self) -> None:
@@ -243,6 +245,7 @@ class Reconstruct:
             inference=self.inference,
             files=self.files,
             choice=self.fit,
+            scene=self.scene,
             force=self.force,
         )
 

@@ -6,10 +6,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from mereo.fitting.answer import Answer, answer
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import describe, register, registered
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import CloudAxes
+from mereo.fitting.register import Registrar, describe
 from mereo.io.atomic_files import new_directory
 from mereo.io.config import DEFAULT_FILES, FilesConfig, InputConfig
 from mereo.io.sensor_frame import read_frame
@@ -20,7 +19,7 @@ from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import STRAY_SHARE, stray_share
 from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.reconstruction.pipeline import Reconstruction
 from mereo.visualization.result_files import write_files
 
 
@@ -34,7 +33,8 @@ def reconstruct_file(
     isolation: IsolationConfig = IsolationConfig(),  # noqa: B008
     inference: InferenceConfig = InferenceConfig(),  # noqa: B008
     files: FilesConfig = DEFAULT_FILES,
-    choice: FitChoice = "off",
+    choice: FitChoice = "auto",
+    scene: str | None = None,
     force: bool = False,
 ) -> Reconstruction:
     """Read one frame of a sensor, reconstruct it, write a new directory, print what was found: ``mereo reconstruct``.
@@ -49,6 +49,7 @@ def reconstruct_file(
         inference: where and how exactly the network computes.
         files: which files are written, and in which unit.
         choice: whether the network answers, or the registered model.
+        scene: whose draws are fitted, where it is not the built-in one that the weights were trained on.
         force: replace an existing folder.
 
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``read_frame``, ``find_object`` and
@@ -66,15 +67,17 @@ def reconstruct_file(
         warning = size_warning(seen, model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
-        result = reconstruct(seen.cloud, model, resolution, frame.axes, label_points="points" in formats)
+        registrar = registrar_of(model, choice, scene)
+        found = answer(seen.cloud, model, registrar, resolution, frame.axes, label_points="points" in formats)
+        result = found.reconstruction
         facts: dict[str, object] = {
             "title": frame.source,
             "weights": str(weights),
             "resolution": resolution,
             "points": len(seen.cloud),
         }
-        if choice != "off":
-            result, facts["registration"] = _registered(result, seen.cloud, model, choice, frame.axes)
+        if registrar is not None:
+            facts["registration"] = facts_of(found)
         facts |= {"device": model.device.type, "precision": model.working_precision}
         write_files(directory, result, seen.cloud, frame.axes, files, frame.unit_m, {**facts, **seen.facts()})
     print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
@@ -82,18 +85,24 @@ def reconstruct_file(
     return result
 
 
-def _registered(
-    result: Reconstruction, cloud: PointCloud, model: Model, choice: FitChoice, axes: CloudAxes
-) -> tuple[Reconstruction, dict[str, object]]:
-    """The registered model, or the network's answer where "auto" does not believe it; says which, and the facts."""
-    registration = register(result, cloud, model, choice)
-    taken = registration.accepted or choice != "auto"
+def registrar_of(model: Model, choice: FitChoice, scene: str | None = None) -> Registrar | None:
+    """Registrar for a choice of the command line; None where the network alone is to answer."""
+    if choice == "off" or (choice == "auto" and model.statistical_model is None):
+        return None
+    return Registrar.of(model, choice, scene)
+
+
+def facts_of(found: Answer) -> dict[str, object]:
+    """Facts about where an answer comes from, for the summary; also printed in one line."""
+    source, registration = "registration" if found.taken else "network", found.registration
+    if registration is None:
+        print(f"the network's answer, as no registration was found: {found.refusal}")
+        return {"answer": source, "refusal": found.refusal}
     explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
-    print(explained if taken else f"{explained}: too little, the network's answer is kept")
-    if taken and not registration.accepted:
+    print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
+    if found.taken and not registration.accepted:
         print("that is too little to believe it: --fit auto keeps the network's answer")
-    facts = {"answer": "registration" if taken else "network", **describe(registration)}
-    return (registered(result, registration, model, axes) if taken else result), facts
+    return {"answer": source, **describe(registration)}
 
 
 def print_segments(result: Reconstruction, title: str) -> None:
