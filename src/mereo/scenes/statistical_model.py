@@ -19,6 +19,7 @@ from mereo.geometry.procrustes import align_all
 from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.pair_distances import PairDistances, kept_distances
 from mereo.scenes.rest_pose import rest_frame
+from mereo.scenes.source_frame import SourceFrame
 
 PROCRUSTES_ROUNDS = 100
 PROCRUSTES_POINTS = 600
@@ -65,6 +66,7 @@ class StatisticalModel:
         library: coefficients of the states that the model was built from.
         residue: root mean square distance of held-out states from the model.
         pairs: distances that the states keep, which the linear model alone does not.
+        source_frame: frame of the object's own files; None in models from before it was kept.
     """
 
     rest: SegmentedMesh
@@ -75,6 +77,7 @@ class StatisticalModel:
     library: Float32[np.ndarray, "n k"]
     residue: float
     pairs: PairDistances
+    source_frame: SourceFrame | None = None
 
     @property
     def count(self) -> int:
