@@ -47,6 +47,7 @@ def answer(
     frame: CloudAxes = "camera",
     label_points: bool = False,
     scene_unit: float | None = None,
+    stated_unit: float | None = None,
 ) -> Answer:
     """Answer to the frame that a cloud shows.
 
@@ -59,6 +60,8 @@ def answer(
         frame: the cloud's axes, as in ``mereo.reconstruct``.
         label_points: also say on which segment each point of the cloud lies.
         scene_unit: length of a scene unit in the cloud's unit, where it is known.
+        stated_unit: the same as the input states it (``Registrar.stated_unit``), believed only where the network's own
+            estimate agrees.
 
     Raises ``ValueError`` as ``mereo.reconstruct`` does, and for other choices than "auto" as ``fit_frame`` does.
     """
@@ -67,7 +70,7 @@ def answer(
         return Answer(extract(seen, model, resolution, label_points))
     auto = registrar.choice == "auto"
     try:
-        registration = registrar.register(seen.seen, seen.code, scene_unit)
+        registration = registrar.register(seen.seen, seen.code, scene_unit, stated_unit)
     except ValueError as error:
         if not auto:
             raise

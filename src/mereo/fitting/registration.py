@@ -55,6 +55,7 @@ class Registration:
         method: which description of the states it was found in.
         z: coefficients of the modes, or standard normal draws of the scene.
         scene_unit: length of a scene unit in the input's.
+        unit_known: whether that was known beforehand; otherwise it was found together with the pose.
         explained: share of the observed points that lie on the model's facing surface, up to the tolerance.
         accepted: whether that is enough to believe it.
         seconds: of the fit alone.
@@ -65,6 +66,7 @@ class Registration:
     method: Method
     z: Float[np.ndarray, " k"]
     scene_unit: float
+    unit_known: bool
     explained: float
     accepted: bool
     seconds: float

@@ -8,14 +8,17 @@ from typing import Any
 
 from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.evaluation.scoring import CELLS, Evaluation, evaluate, markdown_table, metrics, trained_scene
+from mereo.fitting.carry import Carried
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import new_directory, write_json
+from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.writers.formats import Results, chosen_formats, write_formats
-from mereo.io.writers.glb import viewer_rotation
+from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_for
@@ -138,8 +141,13 @@ def write_files(
     files: FilesConfig,
     unit_m: float,
     facts: dict[str, object],
+    carried: Sequence[Carried] = (),
 ) -> None:
-    """Write what ``write_reconstruction`` does into a directory that is there; ``facts`` go into the summary."""
+    """Write what ``write_reconstruction`` does into a directory that is there; ``facts`` go into the summary.
+
+    What is carried goes into ``carried/`` under its files' own names; its surfaces also into pictures and report, and
+    together with the segments into ``carried.glb``, where GLB is asked for.
+    """
     started = time.perf_counter()
     formats = chosen_formats(files.formats)
     to_viewer = viewer_rotation(frame)
@@ -148,8 +156,33 @@ def write_files(
     to_camera = camera_axes(frame)
     seen = PointCloud(transform_points(to_camera, cloud.points))
     title = str(facts.get("title", "mereo reconstruction"))
-    render_cloud_and_segments(directory / "preview.png", seen, result.surfaces.transformed(to_camera), title)
+    for one in carried:
+        write_attachment(directory / "carried" / one.name, one.content, results.factor, to_viewer, unit_m)
+    shown = with_carried(result.surfaces, carried)
+    if "glb" in formats and len(shown.segments) > len(result.surfaces.segments):
+        write_segments_glb(directory / "carried.glb", shown, to_viewer, unit_m)
+    render_cloud_and_segments(directory / "preview.png", seen, shown.transformed(to_camera), title)
     timings_s = {**result.timings_s, "write": time.perf_counter() - started}
     summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
-    write_report(directory / "report.html", cloud, result.surfaces, summary, to_viewer)
+    extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
+    told = [*({"name": part.name} for part in extra), *summary["segments"]]
+    write_report(directory / "report.html", cloud, shown, {**summary, "segments": told}, to_viewer)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
+
+
+def with_carried(surfaces: SegmentedMesh, carried: Sequence[Carried]) -> SegmentedMesh:
+    """Segments with all carried surfaces before them, declared to lie inside them, so that they are seen through them.
+
+    Their names are those of their files, with that of the part where a file has several; their colours differ from the
+    segments'.
+    """
+    parts: list[Segment] = []
+    for one in carried:
+        if isinstance(one.content, Surfaces):
+            mesh = one.content.mesh
+            several = len(mesh.segments) > 1
+            parts += [replace(s, name=f"{one.name}: {s.name}" if several else one.name) for s in mesh.segments]
+    free = [color for color in reversed(PALETTE) if color not in surfaces.colors] or list(PALETTE)
+    parts = [replace(part, color=free[index % len(free)]) for index, part in enumerate(parts)]
+    nested = tuple((part.name, name) for part in parts for name in surfaces.names)
+    return SegmentedMesh((*parts, *surfaces.segments), (*surfaces.nested, *nested))
