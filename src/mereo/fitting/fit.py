@@ -29,7 +29,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 KNOWN_SCALE_STD = 1e-6
 
 UNIT_TOLERANCE = 0.15
-"""Difference of a stated unit from the correspondences' own up to which it is believed: they are off by less in 259 of
+"""Difference of a stated unit from the correspondences' own up to which it is believed: they are off by less in 258 of
 264 training views, and no two units that are mistaken for each other are nearer than a factor of 2.5."""
 
 SCALE_PAIRS = 4000
