@@ -243,7 +243,7 @@ def carrying(folder: Path, *names: str) -> list[str]:
 
 
 def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Path) -> None:
-    options = ["--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
+    options = ["--fit", "modes", "--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
     assert run(folder, *options, *carrying(folder, "own.ply", "own.glb", "grasp.csv")) == 0
     out = folder / "out"
     summary = json.loads((out / "summary.json").read_text())
@@ -262,7 +262,7 @@ def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Pa
 
 
 def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
-    registrar, cloud = Registrar.of(weights), view.depth.to_points()
+    registrar, cloud = Registrar.of(weights, "modes"), view.depth.to_points()
     free = registrar.register(cloud)
     wrong = registrar.register(cloud, stated_unit=registrar.stated_unit(1.0))  # 0.01: it is said to be in metres
     right = registrar.register(cloud, stated_unit=registrar.stated_unit(0.01))

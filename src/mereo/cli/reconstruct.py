@@ -128,8 +128,9 @@ def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...
     here = found.registration.moved(inverse_rigid(found.reconstruction.T_camera_input))
     carried = tuple(carry_one(one, here) for one in placed)
     for one in carried:
-        count = len(one.content.points)
-        print(f"carried {one.name}: {one.inside} of {count} points inside, the others up to {one.farthest:.4g} away")
+        outside = len(one.content.points) - one.inside
+        away = f"{outside} of them outside, up to {one.farthest:.4g} away" if outside else "all inside"
+        print(f"carried {one.name}: {len(one.content.points)} points, {away}")
     return carried
 
 

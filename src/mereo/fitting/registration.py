@@ -15,6 +15,8 @@ from mereo.scenes.statistical_model import StatisticalModel, following
 
 Method = Literal["modes", "draws"]
 
+AT_ONCE = 20_000
+
 
 @dataclass(frozen=True, eq=False)
 class Located:
@@ -97,7 +99,11 @@ class Registration:
                 nearest.
         """
         labels = nearest_labels(self.rest_solids, points) if labels is None else labels
-        return self.model.weights(points, labels)(self.material)
+        result = np.empty_like(points)
+        for first in range(0, len(points), AT_ONCE):  # the weights of a large mesh would take gigabytes
+            rows = slice(first, first + AT_ONCE)
+            result[rows] = self.model.weights(points[rows], labels[rows])(self.material)
+        return result
 
     def to_rest(
         self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"] | None = None

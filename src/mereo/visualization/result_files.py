@@ -6,6 +6,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.evaluation.scoring import CELLS, Evaluation, evaluate, markdown_table, metrics, trained_scene
 from mereo.fitting.carry import Carried
@@ -28,7 +30,13 @@ from mereo.synthesis.config import GenerateConfig
 from mereo.visualization.error_maps import error_picture
 from mereo.visualization.evaluation_report import write_evaluation_report
 from mereo.visualization.previews import render_cloud_and_segments
-from mereo.visualization.reconstruction_report import write_report
+from mereo.visualization.reconstruction_report import cluster, write_report
+
+PICTURED_FACES = 100_000
+"""A mesh of more faces is coarsened for pictures: shading takes seconds for each hundred thousand."""
+
+PICTURED_CELLS = 150
+"""Cells along the longest side to which it is coarsened."""
 
 
 def evaluate_weights(
@@ -161,13 +169,21 @@ def write_files(
     shown = with_carried(result.surfaces, carried)
     if "glb" in formats and len(shown.segments) > len(result.surfaces.segments):
         write_segments_glb(directory / "carried.glb", shown, to_viewer, unit_m)
-    render_cloud_and_segments(directory / "preview.png", seen, shown.transformed(to_camera), title)
+    pictured = replace(shown, segments=tuple(_pictured(segment) for segment in shown.segments))
+    render_cloud_and_segments(directory / "preview.png", seen, pictured.transformed(to_camera), title)
     timings_s = {**result.timings_s, "write": time.perf_counter() - started}
     summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
     extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
     told = [*({"name": part.name} for part in extra), *summary["segments"]]
-    write_report(directory / "report.html", cloud, shown, {**summary, "segments": told}, to_viewer)
+    write_report(directory / "report.html", cloud, pictured, {**summary, "segments": told}, to_viewer)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
+
+
+def _pictured(segment: Segment) -> Segment:
+    """A segment as pictures need it."""
+    if len(segment.faces) <= PICTURED_FACES:
+        return segment
+    return cluster(segment, float(np.ptp(segment.vertices, axis=0).max()) / PICTURED_CELLS)
 
 
 def with_carried(surfaces: SegmentedMesh, carried: Sequence[Carried]) -> SegmentedMesh:
