@@ -113,8 +113,8 @@ def polar(motion: Deformation, points: np.ndarray) -> np.ndarray:
 
 def test_poses_turn_as_their_surroundings_do(state: State, bent: Registration) -> None:
     points = np.random.default_rng(2).uniform((-15, -4, -3), (15, 4, 3), size=(50, 3))
-    labels = nearest_labels(bent.rest_solids, points)
-    found = local_rotations(bent, points, labels)
+    shares = np.eye(4)[nearest_labels(bent.rest_solids, points) - 1]
+    found = local_rotations(bent, points, shares)
     truth = T[:3, :3] @ polar(state.deformations[0], points)
     angle = Rotation.from_matrix(found @ truth.transpose(0, 2, 1)).magnitude()
     assert np.rad2deg(angle).max() < 2.0 and np.linalg.det(found).min() > 0.999
@@ -130,6 +130,22 @@ def test_a_plane_bends_with_the_object(registrar: Registrar, bent: Registration)
     assert len(points) > 100
     centered = points - points.mean(axis=0)
     assert np.linalg.svd(centered)[1][2] / np.sqrt(len(points)) > 0.05  # no longer flat
+
+
+def test_a_surface_outside_does_not_tear(registrar: Registrar, bent: Registration) -> None:
+    """It passes from the boxes' surroundings to the ball's, which is lifted by 2 units: edges of 0.9 stay under 2."""
+    corners = np.array([[-15.0, 7, -5], [15, 7, -5], [15, 7, 16], [-15, 7, 16]])
+    plane = Segment("plan", (1, 2, 3), corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    placed = placed_one(registrar, Surfaces(SegmentedMesh((plane,))))
+    assert isinstance(placed.content, Surfaces) and (placed.distance > 0).all()
+    found, faces = carry(placed, bent).content.points, placed.content.mesh.segments[0].faces
+    nearest = bent.to_camera(placed.content.points)
+
+    def longest(points: np.ndarray) -> float:
+        return float(np.linalg.norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2).max())
+
+    assert longest(placed.content.points) <= 0.9 + 1e-9
+    assert longest(found) < 2.0 < longest(nearest)
 
 
 def test_far_away_things_are_refused(registrar: Registrar) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
@@ -27,6 +27,10 @@ LONGEST_EDGE = 0.05
 
 MOST_FACES = 2_000_000
 
+LEAST_SHARE = 1e-3
+TINY = 1e-6
+"""Distance in scene units below which a point is on the surface."""
+
 STEP = 1e-3
 """Step of the map's Jacobian, of half the rest box's longest side."""
 
@@ -38,13 +42,13 @@ class Placed:
     Attributes:
         name: of its file.
         content: rest pose, scene units; surfaces with edges short enough to bend.
-        labels: of the segment that each point moves along with.
-        distance: of each point from its segment, 0 inside; scene units.
+        shares: of each segment in the motion of each point; rows sum to one.
+        distance: of each point from the nearest segment, 0 inside; scene units.
     """
 
     name: str
     content: Content
-    labels: UInt8[np.ndarray, " n"]
+    shares: Float[np.ndarray, "n s"]
     distance: Float[np.ndarray, " n"]
 
 
@@ -89,27 +93,40 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
 def carry(placed: Placed, registration: Registration) -> Carried:
     """An attachment where the registered object is: points move along with their segments, poses turn as they do."""
     content = placed.content
-    points = registration.to_camera(content.points, placed.labels)
+    points = moved(registration, content.points, placed.shares)
     rotations = None
     if content.rotations is not None:
-        rotations = local_rotations(registration, content.points, placed.labels) @ content.rotations
+        rotations = local_rotations(registration, content.points, placed.shares) @ content.rotations
     farthest = float(placed.distance.max()) * registration.scene_unit
     return Carried(placed.name, content.at(points, rotations), int((placed.distance == 0).sum()), farthest)
 
 
+def moved(
+    registration: Registration, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, "n s"]
+) -> Float[np.ndarray, "n 3"]:
+    """Positions where the registered object is of points at rest that move along with segments by ``shares``."""
+    result = np.zeros_like(points)
+    for index, share in enumerate(shares.T):
+        rows = np.flatnonzero(share > 0)
+        if len(rows):
+            labels = np.full(len(rows), index + 1, dtype=np.uint8)
+            result[rows] += share[rows, None] * registration.to_camera(points[rows], labels)
+    return result
+
+
 def local_rotations(
-    registration: Registration, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]
+    registration: Registration, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, "n s"]
 ) -> Float[np.ndarray, "n 3 3"]:
     """Rotation of the surroundings of points at rest: the polar factor of the map's Jacobian there.
 
     Args:
         registration: of the object.
         points: rest pose, scene units.
-        labels: of the segments that they move along with.
+        shares: of the segments in their motion.
     """
     step = STEP * registration.model.half
     columns = [
-        registration.to_camera(points + along, labels) - registration.to_camera(points - along, labels)
+        moved(registration, points + along, shares) - moved(registration, points - along, shares)
         for along in step * np.eye(3)
     ]
     return best_rotations(np.stack(columns, axis=1))  # rows are the Jacobian's columns: its transpose
@@ -133,11 +150,10 @@ def _placed(
     attachment: Attachment, T_scene_file: Float[np.ndarray, "4 4"], model: StatisticalModel, solids: Solids
 ) -> Placed:
     content = _transformed(attachment.content, T_scene_file)
-    _check_near(attachment.name, _outside(solids, content.points)[1], 2 * model.half)
+    _check_near(attachment.name, _shares(solids, content.points)[1], 2 * model.half)
     if isinstance(content, Surfaces):
         content = _bendable(content, LONGEST_EDGE * model.half)
-    labels, distance = _outside(solids, content.points)
-    return Placed(attachment.name, content, labels, distance)
+    return Placed(attachment.name, content, *_shares(solids, content.points))
 
 
 def _transformed(content: Content, T: Float[np.ndarray, "4 4"]) -> Content:
@@ -147,16 +163,23 @@ def _transformed(content: Content, T: Float[np.ndarray, "4 4"]) -> Content:
     return content.at(transform_points(T, content.points), rotations)
 
 
-def _outside(
+def _shares(
     solids: Solids, points: Float[np.ndarray, "n 3"]
-) -> tuple[UInt8[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The segment that holds each point or comes nearest, and the distance from it, 0 inside."""
-    labels, distance = solids.label(points), np.zeros(len(points))
+) -> tuple[Float[np.ndarray, "n s"], Float[np.ndarray, " n"]]:
+    """Share of each segment in the motion of points, and their distance from the nearest one, 0 inside.
+
+    Inside a segment the share is its alone. Outside it falls with the fourth power of the distance, so that a surface
+    does not tear where another segment comes nearer.
+    """
+    labels, away = solids.label(points), np.zeros(len(points))
+    shares = np.eye(solids.count)[np.maximum(labels, 1) - 1]
     outside = np.flatnonzero(labels == 0)
     if len(outside):
-        nearest = solids.nearest(points[outside])
-        labels[outside], distance[outside] = nearest.owner + 1, nearest.distance
-    return labels, distance
+        distance = np.stack([solids.segment_distance(i, points[outside]) for i in range(solids.count)], axis=1)
+        away[outside] = distance.min(axis=1)
+        closeness = (np.maximum(away[outside, None], TINY) / np.maximum(distance, TINY)) ** 4
+        shares[outside] = np.maximum(closeness - LEAST_SHARE, 0.0)
+    return shares / shares.sum(axis=1, keepdims=True), away
 
 
 def _check_near(name: str, distance: Float[np.ndarray, " n"], size: float) -> None:
