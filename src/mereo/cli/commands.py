@@ -162,6 +162,8 @@ class Evaluate:
         noise_std: Gaussian noise on the depth, standard deviation in scene units.
         terms: what else is wrong with the depth image.
         inference: where and how exactly the network computes.
+        fit: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the modes'
+            and the draws' own scores beside it; off the network alone; modes leaves the draws out.
     """
 
     weights: Positional[str]
@@ -174,6 +176,7 @@ class Evaluate:
     noise_std: float = 0.1
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
+    fit: FitChoice = "auto"
 
     def run(self) -> None:
         """Write scores and pictures of their errors, and print the table."""
@@ -185,7 +188,8 @@ class Evaluate:
 
             if settings != GenerateConfig():
                 raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
-            evaluate_on_scans(load_for(self.weights, self.inference), self.output, truths=self.scans)
+            model = load_for(self.weights, self.inference)
+            evaluate_on_scans(model, self.output, truths=self.scans, choice=self.fit)
             return
         evaluate_weights(
             self.weights,
@@ -195,6 +199,7 @@ class Evaluate:
             scene=self.scene,
             settings=settings,
             inference=self.inference,
+            choice=self.fit,
         )
 
 

@@ -11,9 +11,10 @@ from rich.table import Table
 
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
+from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import bunny_posed
-from mereo.evaluation.scoring import grid_confusion, predict_grid
+from mereo.evaluation.scoring import predict_grid
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.models.model import Model

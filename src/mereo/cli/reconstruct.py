@@ -11,7 +11,7 @@ from mereo.fitting.answer import Answer, answer
 from mereo.fitting.carry import Carried, Placed, place
 from mereo.fitting.carry import carry as carry_one
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import Registrar, describe
+from mereo.fitting.register import Registrar, describe, registrar_for
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import new_directory
 from mereo.io.attachments import read_attachments
@@ -19,7 +19,6 @@ from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
-from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import STRAY_SHARE, stray_share
@@ -79,7 +78,7 @@ def reconstruct_file(
         warning = size_warning(seen, model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
-        registrar = Registrar.of(model, choice, scene) if attachments else registrar_of(model, choice, scene)
+        registrar = Registrar.of(model, choice, scene) if attachments else registrar_for(model, choice, scene)
         placed = place(attachments, registrar, carry_frame) if registrar is not None else ()
         found = answer(
             seen.cloud,
@@ -107,13 +106,6 @@ def reconstruct_file(
     print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result
-
-
-def registrar_of(model: Model, choice: FitChoice, scene: str | None = None) -> Registrar | None:
-    """Registrar for a choice of the command line; None where the network alone is to answer."""
-    if choice == "off" or (choice == "auto" and model.statistical_model is None):
-        return None
-    return Registrar.of(model, choice, scene)
 
 
 def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...]:

@@ -131,6 +131,13 @@ class Registrar:
             return None
 
 
+def registrar_for(model: Model, choice: FitChoice, scene: Scene | str | None = None) -> Registrar | None:
+    """Registrar for a choice; None where the network alone answers: "auto" needs weights that carry a model."""
+    if choice == "off" or (choice == "auto" and model.statistical_model is None):
+        return None
+    return Registrar.of(model, choice, scene)
+
+
 def same_topology(scene: Scene, model: StatisticalModel) -> bool:
     """Whether a scene's rest meshes have the names and numbers of vertices and faces of a model's."""
 

@@ -164,6 +164,23 @@ class StatisticalModel:
         squared: np.ndarray = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
         return np.sqrt(squared / len(self.modes))
 
+    @cached_property
+    def explained(self) -> Float[np.ndarray, " k"]:
+        """Share of the states' variance that the first 1 ... k modes explain together."""
+        variance = np.cumsum(self.motion**2)
+        return variance / (variance[-1] + self.residue**2) if self.count else variance
+
+    @cached_property
+    def residues(self) -> Float[np.ndarray, " n"]:
+        """Root mean square distance of a state that the model has not seen, by its first 0 ... k modes."""
+        left = np.concatenate([np.cumsum(self.motion[::-1] ** 2)[::-1], [0.0]])
+        return np.sqrt(left + self.residue**2)
+
+    def modes_for(self, residue: float) -> int | None:
+        """Fewest modes that leave no more than this root mean square distance; None where all leave more."""
+        enough = np.flatnonzero(self.residues <= residue)
+        return int(enough[0]) if len(enough) else None
+
     def mesh(self, material: Float[np.ndarray, "m 3"]) -> SegmentedMesh:
         """The segments, with the rest mesh's faces, at these positions."""
         ends = np.cumsum(self.vertex_counts)

@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scan_scoring import evaluate_scans
-from mereo.evaluation.scoring import CELLS, Evaluation, evaluate, markdown_table, metrics, trained_scene
+from mereo.evaluation.scoring import CELLS, evaluate, trained_scene
+from mereo.evaluation.tables import markdown_table, metrics
 from mereo.fitting.carry import Carried
+from mereo.fitting.config import FitChoice
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -49,12 +52,22 @@ def evaluate_weights(
     cells: int = CELLS,
     settings: GenerateConfig | None = None,
     inference: InferenceConfig = EXACT,
+    choice: FitChoice = "auto",
 ) -> Evaluation:
     """Score weights, write metrics.json, table.md, errors.png, report.html, and print the table: ``mereo evaluate``."""
     with new_directory(output) as directory:
         model = load_for(weights, inference)
         settings = settings or GenerateConfig()
-        evaluation = evaluate(model, scene, examples=examples, seed=seed, cells=cells, progress=True, settings=settings)
+        evaluation = evaluate(
+            model,
+            scene,
+            examples=examples,
+            seed=seed,
+            cells=cells,
+            progress=True,
+            settings=settings,
+            choice=choice,
+        )
         facts = {
             "weights": str(weights),
             "scene": scene or trained_scene(model),
@@ -72,11 +85,16 @@ def evaluate_weights(
 
 
 def evaluate_on_scans(
-    model: Model, output: str | Path, *, truths: Sequence[str | Path] = (), cells: int = CELLS
+    model: Model,
+    output: str | Path,
+    *,
+    truths: Sequence[str | Path] = (),
+    cells: int = CELLS,
+    choice: FitChoice = "auto",
 ) -> Evaluation:
     """Score a model on real scans, with the same files as ``evaluate_weights``: ``mereo evaluate --scans``."""
     with new_directory(output) as directory:
-        evaluation = evaluate_scans(model, truths=truths, cells=cells)
+        evaluation = evaluate_scans(model, truths=truths, cells=cells, choice=choice)
         facts = {"scans": list(evaluation.examples), "truths": [str(path) for path in truths]}
         write_evaluation(directory, evaluation, {**facts, "trained": model.provenance})
     print(markdown_table(evaluation))
