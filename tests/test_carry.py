@@ -1,35 +1,23 @@
-"""Carrying what is defined in the rest model to where the object is: theorems, then the command."""
+"""Carrying what is defined in the rest model to where the object is: theorems."""
 
-import json
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from analytic import untrained
-from scene_files import write_bar
 from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
 
-from mereo import __main__ as command_line
 from mereo.deformation.maps import Deformation
-from mereo.evaluation.sample_views import SampleView, load_view
 from mereo.fitting.carry import Placed, carry, local_rotations, place
-from mereo.fitting.fit import fit_frame
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration, nearest_labels
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import rigid, transform_points
-from mereo.io.attachments import Attachment, Positions, Surfaces, read_attachments
-from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.pose_tables import PoseTable, read_pose_table
-from mereo.models.model import Model
-from mereo.models.weights import load_model, save_model
-from mereo.scenes.random_states import scene_model, state_points, with_frame
-from mereo.scenes.registry import load_scene
+from mereo.io.attachments import Attachment, Positions, Surfaces
+from mereo.io.pose_tables import PoseTable
+from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.scene import State
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -167,165 +155,3 @@ def test_the_frame_of_the_files_must_be_known(registrar: Registrar) -> None:
     tenth = Positions(points.points / 10)
     named = placed_one(replace(older, given=frame), tenth, "source")
     np.testing.assert_allclose(named.content.points, points.points)
-
-
-# --- the frame of the files -------------------------------------------------------------------------------------------
-
-
-def test_files_in_millimetres_come_to_the_scene(tmp_path: Path) -> None:
-    scene = load_scene(write_bar(tmp_path))
-    for name, part in zip(("left", "right"), scene.rest.segments, strict=True):
-        own = read_segmented_mesh(tmp_path / f"{name}.stl").segments[0].vertices
-        np.testing.assert_allclose(transform_points(scene.T_scene_source, own), part.vertices, atol=1e-9)
-    assert scene.source_frame.scale == pytest.approx(2.0)  # 10 mm become 20 units
-    assert scene.source_frame.source_unit_m == pytest.approx(0.001)
-    model = scene_model(scene, 20)
-    assert model.source_frame is not None and model.source_frame.unit_m == scene.unit_m
-    registrar = Registrar(untrained(scene.rest.names, "bar"), model)
-    middle = Positions(np.array([[120.0, 5.0, 5.0]]))
-    np.testing.assert_allclose(placed_one(registrar, middle, "source").content.points, [[0, 0, 0]], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("scene", "file"),
-    [
-        ("bunny", "bunny/bunny.off"),
-        ("liver", "liver/lapgym_liver_visual.stl"),
-        ("tumor", "liver/lapgym_gallbladder_visual.stl"),
-        ("liver-simulated", "liver/lapgym_liver_visual.stl"),
-        ("skull", "skull/sofa_skull_and_teeth_coarse.obj"),
-        ("human", "human/makehuman_base.obj"),
-    ],
-)
-def test_built_in_scenes_say_how_their_files_lie_in_them(
-    require_asset: Callable[[str], Path], scene: str, file: str
-) -> None:
-    """Vertices of the source lie on the surface at rest, but for what the scene leaves out or moves."""
-    require_asset("human/makehuman_default.mhskel" if scene == "human" else file)
-    loaded, mesh = load_scene(scene), read_segmented_mesh(require_asset(file))
-    own = mesh.segments[0].vertices if scene != "human" else mesh.segments[mesh.names.index("body")].vertices
-    if scene == "skull":
-        own = next(part.vertices for part in mesh.segments if "skull_bone" in part.name)
-    distance = Solids(loaded.rest).nearest(transform_points(loaded.T_scene_source, own)).distance
-    assert np.median(distance) < 0.05, np.median(distance)
-
-
-def test_a_model_from_before_gets_the_frame_of_its_built_in_scene(model: StatisticalModel) -> None:
-    rope = load_scene("rope")
-    old = replace(scene_model(rope, 10), source_frame=None)
-    found = with_frame(old, "rope").source_frame
-    assert found is not None
-    np.testing.assert_array_equal(found.T_scene_source, np.eye(4))
-    assert with_frame(old, "mine").source_frame is None
-    assert with_frame(replace(model, source_frame=None), "rope").source_frame is None  # another object
-
-
-# --- the command ------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def weights() -> Model:
-    states = scene_model(replace(load_scene("rope"), unit_m=0.01), 300)
-    return replace(load_model("rope"), statistical_model=states)
-
-
-@pytest.fixture(scope="module")
-def view() -> SampleView:
-    return load_view("rope")
-
-
-@pytest.fixture(scope="module")
-def folder(weights: Model, view: SampleView, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights, a cloud in centimetres that is said to be so, and three files to carry."""
-    folder = tmp_path_factory.mktemp("carry")
-    save_model(weights, folder / "rope.safetensors")
-    np.save(folder / "cloud.npy", view.depth.to_points().points)
-    rest = load_scene("rope").rest
-    part = rest.segments[1]
-    trimesh.Trimesh(part.vertices, part.faces, process=False).export(folder / "own.ply")
-    trimesh.Trimesh(part.vertices, part.faces, process=False).export(folder / "own.glb")
-    x, y, z = part.vertices.mean(axis=0)
-    (folder / "grasp.csv").write_text(f"x,y,z,qx,qy,qz,qw,width\n{x},{y},{z},0,0,0,1,0.02\n", encoding="utf-8")
-    return folder
-
-
-def run(folder: Path, *options: str, cloud: str = "cloud.npy", output: str = "out") -> int:
-    arguments = ["reconstruct", str(folder / cloud), "--weights", str(folder / "rope.safetensors")]
-    return command_line.main([*arguments, "--output", str(folder / output), "--resolution", "32", *options])
-
-
-def carrying(folder: Path, *names: str) -> list[str]:
-    return [word for name in names for word in ("--carry", str(folder / name))]
-
-
-def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Path) -> None:
-    options = ["--fit", "modes", "--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
-    assert run(folder, *options, *carrying(folder, "own.ply", "own.glb", "grasp.csv")) == 0
-    out = folder / "out"
-    summary = json.loads((out / "summary.json").read_text())
-    assert [one["file"] for one in summary["carried"]] == ["own.ply", "own.glb", "grasp.csv"]
-    assert all(one["farthest"] < 0.01 for one in summary["carried"]) and summary["registration"]["unit"] == "known"
-    own = read_segmented_mesh(out / "segments.glb").segments[1].vertices
-    carried = read_segmented_mesh(out / "carried/own.glb").segments[0].vertices
-    assert np.linalg.norm(carried[: len(own)] - own, axis=1).max() < 0.3
-    in_mm = read_segmented_mesh(out / "carried/own.ply").segments[0].vertices
-    np.testing.assert_allclose(in_mm, 10 * carried, rtol=1e-4, atol=1e-3)
-    grasp = read_pose_table(out / "carried/grasp.csv")
-    assert np.linalg.norm(grasp.points[0] / 10 - own.mean(axis=0)) < 1.0
-    assert grasp.rows[0][-1] == "0.02" and grasp.rotations is not None
-    together = read_segmented_mesh(out / "carried.glb")
-    assert together.names[:2] == ("own.ply", "own.glb") and len(together.names) == 2 + len(summary["segments"])
-
-
-def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
-    registrar, cloud = Registrar.of(weights, "modes"), view.depth.to_points()
-    free = registrar.register(cloud)
-    wrong = registrar.register(cloud, stated_unit=registrar.stated_unit(1.0))  # 0.01: it is said to be in metres
-    right = registrar.register(cloud, stated_unit=registrar.stated_unit(0.01))
-    np.testing.assert_array_equal(wrong.material, free.material)
-    assert not wrong.unit_known and not free.unit_known
-    assert right.unit_known and right.scene_unit == pytest.approx(1.0, rel=1e-4)
-    assert weights.statistical_model is not None
-    near = fit_frame(cloud, weights, weights.statistical_model, stated_unit=0.95)
-    assert near.unit == 0.95  # within what the network's own estimate leaves open
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--fit", "off"], "--fit is off, but --carry needs a registration"),
-        (["--carry", "nowhere.stl"], "nowhere.stl does not exist"),
-    ],
-)
-def test_the_command_refuses_before_any_work(
-    folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
-) -> None:
-    assert run(folder, *carrying(folder, "grasp.csv"), *options, cloud="no-such-cloud.npy", output="refused") != 0
-    assert message in " ".join(capsys.readouterr().err.split()) and not (folder / "refused").exists()
-
-
-def test_without_a_registration_nothing_is_written(
-    folder: Path, view: SampleView, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.save(folder / "stretched.npy", view.depth.to_points().points * np.array([1.0, 1.6, 1.0]))
-    assert run(folder, *carrying(folder, "grasp.csv"), cloud="stretched.npy", output="none") != 0
-    assert "the network's answer is kept, but --carry needs a registration" in capsys.readouterr().err
-    assert not (folder / "none").exists()
-    (folder / "far.csv").write_text("x,y,z\n9000,0,0\n", encoding="utf-8")
-    assert run(folder, *carrying(folder, "far.csv"), output="none") != 0
-    assert "1 of 1 points of far.csv are farther from the object" in capsys.readouterr().err
-
-
-def test_weights_without_a_model_say_so(
-    folder: Path, weights: Model, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    bare = replace(weights, statistical_model=None, provenance={**weights.provenance, "scene": "mine"})
-    save_model(bare, tmp_path / "rope.safetensors")
-    np.save(tmp_path / "cloud.npy", np.load(folder / "cloud.npy"))
-    assert run(tmp_path, *carrying(folder, "grasp.csv")) != 0
-    assert "carry no statistical model of their object's states" in capsys.readouterr().err
-
-
-def test_everything_that_can_be_carried_is_read_by_its_name(folder: Path) -> None:
-    kinds = [type(one.content) for one in read_attachments([folder / "own.ply", folder / "grasp.csv"])]
-    assert kinds == [Surfaces, PoseTable]

@@ -40,6 +40,7 @@ def test_the_file_answers_as_the_weights_and_the_card_knows_it(tmp_path: Path) -
     assert path.stat().st_size <= 8_000_000
     released = load_model(path)
     assert released.statistical_model is not None and released.statistical_model.rest.names == model.names
+    assert released.statistical_model.source_frame is not None
     points = np.random.default_rng(0).normal((0, 0, 0.6), 0.04, (600, 3))
     # float16 weights are read as they were; the template is rounded to bytes
     for key, value in released.network.state_dict().items():

@@ -1,0 +1,129 @@
+"""``mereo reconstruct --carry``, and the unit that the input states."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from mereo import __main__ as command_line
+from mereo.evaluation.sample_views import SampleView, load_view
+from mereo.fitting.fit import fit_frame
+from mereo.fitting.register import Registrar
+from mereo.io.attachments import Surfaces, read_attachments
+from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.pose_tables import PoseTable, read_pose_table
+from mereo.models.model import Model
+from mereo.models.weights import load_model, save_model
+from mereo.scenes.random_states import scene_model
+from mereo.scenes.registry import load_scene
+
+
+@pytest.fixture(scope="module")
+def weights() -> Model:
+    states = scene_model(replace(load_scene("rope"), unit_m=0.01), 300)
+    return replace(load_model("rope"), statistical_model=states)
+
+
+@pytest.fixture(scope="module")
+def view() -> SampleView:
+    return load_view("rope")
+
+
+@pytest.fixture(scope="module")
+def folder(weights: Model, view: SampleView, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights, a cloud in centimetres that is said to be so, and three files to carry."""
+    folder = tmp_path_factory.mktemp("carry")
+    save_model(weights, folder / "rope.safetensors")
+    np.save(folder / "cloud.npy", view.depth.to_points().points)
+    rest = load_scene("rope").rest
+    part = rest.segments[1]
+    trimesh.Trimesh(part.vertices, part.faces, process=False).export(folder / "own.ply")
+    trimesh.Trimesh(part.vertices, part.faces, process=False).export(folder / "own.glb")
+    x, y, z = part.vertices.mean(axis=0)
+    (folder / "grasp.csv").write_text(f"x,y,z,qx,qy,qz,qw,width\n{x},{y},{z},0,0,0,1,0.02\n", encoding="utf-8")
+    return folder
+
+
+def run(folder: Path, *options: str, cloud: str = "cloud.npy", output: str = "out") -> int:
+    arguments = ["reconstruct", str(folder / cloud), "--weights", str(folder / "rope.safetensors")]
+    return command_line.main([*arguments, "--output", str(folder / output), "--resolution", "32", *options])
+
+
+def carrying(folder: Path, *names: str) -> list[str]:
+    return [word for name in names for word in ("--carry", str(folder / name))]
+
+
+def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Path) -> None:
+    options = ["--fit", "modes", "--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
+    assert run(folder, *options, *carrying(folder, "own.ply", "own.glb", "grasp.csv")) == 0
+    out = folder / "out"
+    summary = json.loads((out / "summary.json").read_text())
+    assert [one["file"] for one in summary["carried"]] == ["own.ply", "own.glb", "grasp.csv"]
+    assert all(one["farthest"] < 0.01 for one in summary["carried"]) and summary["registration"]["unit"] == "known"
+    own = read_segmented_mesh(out / "segments.glb").segments[1].vertices
+    carried = read_segmented_mesh(out / "carried/own.glb").segments[0].vertices
+    assert np.linalg.norm(carried[: len(own)] - own, axis=1).max() < 0.3
+    in_mm = read_segmented_mesh(out / "carried/own.ply").segments[0].vertices
+    np.testing.assert_allclose(in_mm, 10 * carried, rtol=1e-4, atol=1e-3)
+    grasp = read_pose_table(out / "carried/grasp.csv")
+    assert np.linalg.norm(grasp.points[0] / 10 - own.mean(axis=0)) < 1.0
+    assert grasp.rows[0][-1] == "0.02" and grasp.rotations is not None
+    together = read_segmented_mesh(out / "carried.glb")
+    assert together.names[:2] == ("own.ply", "own.glb") and len(together.names) == 2 + len(summary["segments"])
+
+
+def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
+    registrar, cloud = Registrar.of(weights, "modes"), view.depth.to_points()
+    free = registrar.register(cloud)
+    wrong = registrar.register(cloud, stated_unit=registrar.stated_unit(1.0))  # 0.01: it is said to be in metres
+    right = registrar.register(cloud, stated_unit=registrar.stated_unit(0.01))
+    np.testing.assert_array_equal(wrong.material, free.material)
+    assert not wrong.unit_known and not free.unit_known
+    assert right.unit_known and right.scene_unit == pytest.approx(1.0, rel=1e-4)
+    assert weights.statistical_model is not None
+    near = fit_frame(cloud, weights, weights.statistical_model, stated_unit=0.95)
+    assert near.unit == 0.95  # within what the network's own estimate leaves open
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--fit", "off"], "--fit is off, but --carry needs a registration"),
+        (["--carry", "nowhere.stl"], "nowhere.stl does not exist"),
+    ],
+)
+def test_the_command_refuses_before_any_work(
+    folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert run(folder, *carrying(folder, "grasp.csv"), *options, cloud="no-such-cloud.npy", output="refused") != 0
+    assert message in " ".join(capsys.readouterr().err.split()) and not (folder / "refused").exists()
+
+
+def test_without_a_registration_nothing_is_written(
+    folder: Path, view: SampleView, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(folder / "stretched.npy", view.depth.to_points().points * np.array([1.0, 1.6, 1.0]))
+    assert run(folder, *carrying(folder, "grasp.csv"), cloud="stretched.npy", output="none") != 0
+    assert "the network's answer is kept, but --carry needs a registration" in capsys.readouterr().err
+    assert not (folder / "none").exists()
+    (folder / "far.csv").write_text("x,y,z\n9000,0,0\n", encoding="utf-8")
+    assert run(folder, *carrying(folder, "far.csv"), output="none") != 0
+    assert "1 of 1 points of far.csv are farther from the object" in capsys.readouterr().err
+
+
+def test_weights_without_a_model_say_so(
+    folder: Path, weights: Model, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    bare = replace(weights, statistical_model=None, provenance={**weights.provenance, "scene": "mine"})
+    save_model(bare, tmp_path / "rope.safetensors")
+    np.save(tmp_path / "cloud.npy", np.load(folder / "cloud.npy"))
+    assert run(tmp_path, *carrying(folder, "grasp.csv")) != 0
+    assert "carry no statistical model of their object's states" in capsys.readouterr().err
+
+
+def test_everything_that_can_be_carried_is_read_by_its_name(folder: Path) -> None:
+    kinds = [type(one.content) for one in read_attachments([folder / "own.ply", folder / "grasp.csv"])]
+    assert kinds == [Surfaces, PoseTable]
