@@ -93,6 +93,7 @@ def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
     [
         (["--fit", "off"], "--fit is off, but --carry needs a registration"),
         (["--carry", "nowhere.stl"], "nowhere.stl does not exist"),
+        (["--carry", "."], "has the suffix ''; what is carried is one of .stl"),
     ],
 )
 def test_the_command_refuses_before_any_work(
@@ -100,6 +101,11 @@ def test_the_command_refuses_before_any_work(
 ) -> None:
     assert run(folder, *carrying(folder, "grasp.csv"), *options, cloud="no-such-cloud.npy", output="refused") != 0
     assert message in " ".join(capsys.readouterr().err.split()) and not (folder / "refused").exists()
+
+
+def test_a_frame_of_nothing_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(folder, "--carry-frame", "scene", output="refused") != 0
+    assert "--carry-frame is 'scene' and nothing is carried" in capsys.readouterr().err
 
 
 def test_without_a_registration_nothing_is_written(

@@ -65,6 +65,8 @@ def reconstruct_file(
     """
     formats = chosen_formats(files.formats)  # a missing extra is said before the work, not after
     attachments = read_attachments(carry)
+    if carry_frame != "source" and not attachments:
+        raise ValueError(f"--carry-frame is {carry_frame!r} and nothing is carried: name a file with --carry")
     if attachments and choice == "off":
         raise ValueError("--fit is off, but --carry needs a registration, along which things move: use --fit auto")
     with new_directory(output, force) as directory:
