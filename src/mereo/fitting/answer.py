@@ -62,7 +62,18 @@ def answer(
 
     Raises ``ValueError`` as ``mereo.reconstruct`` does, and for other choices than "auto" as ``fit_frame`` does.
     """
-    seen = encode_frame(cloud, model, frame)
+    return answer_frame(encode_frame(cloud, model, frame), model, registrar, resolution, label_points, scene_unit)
+
+
+def answer_frame(
+    seen: EncodedFrame,
+    model: Model,
+    registrar: Registrar | None,
+    resolution: int = 128,
+    label_points: bool = False,
+    scene_unit: float | None = None,
+) -> Answer:
+    """``answer`` to a frame that the model has understood already, with its arguments."""
     if registrar is None:
         return Answer(extract(seen, model, resolution, label_points))
     auto = registrar.choice == "auto"
