@@ -96,7 +96,8 @@ class ModesFit:
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or drawn.misfit >= self.misfit.total:
             return replace(self.registration(), seconds=seconds)
-        return self._registration("draws", drawn.z, drawn.posed, drawn.placed(), seconds)
+        found = self._registration("draws", drawn.z, drawn.posed, drawn.placed(), seconds)
+        return replace(found, drawn=replace(drawn.drawn, z=drawn.z))
 
     def _registration(
         self,

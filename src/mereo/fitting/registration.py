@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
+from mereo.fitting.playback import Drawn
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, signed_distance_and_direction
 from mereo.scenes.statistical_model import StatisticalModel, following
@@ -61,6 +62,7 @@ class Registration:
         explained: share of the observed points that lie on the model's facing surface, up to the tolerance.
         accepted: whether that is enough to believe it.
         seconds: of the fit alone.
+        drawn: the scene's draws where ``method`` is "draws", with their seed: what plays the state again.
     """
 
     model: StatisticalModel
@@ -72,6 +74,7 @@ class Registration:
     explained: float
     accepted: bool
     seconds: float
+    drawn: Drawn | None = None
 
     @cached_property
     def mesh(self) -> SegmentedMesh:
