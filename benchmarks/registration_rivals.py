@@ -1,7 +1,7 @@
 """What readers use today, on the frames of benchmarks/fitting.py: ICP, and coherent point drift (CPD) in all its forms.
 
     python benchmarks/registration_rivals.py [OBJECT ...] [--seed S] [--views N] [--first I] [--cells C]
-        [--start network|truth] [--scans] [--search RIVAL ...]
+        [--start network|truth ...] [--scans] [--search RIVAL ...]
 
 Each rival gets the observed cloud and the model's visible surface, in the pose that the network's correspondences give
 (``--start network``, where our fit starts too) or in the best one for the true material points (``truth``), with its
@@ -9,9 +9,9 @@ documented settings and with those that a search found. The answer is where all 
 it is scored alike: mean IoU / mIoU of single views on C^3 cells, error of material points (median / 95 %, scene units)
 near observed points and elsewhere, median seconds without the network's.
 
-``--search`` tries settings from the start that is asked for, one setting after the other, by the mean error of all
-material points in half longest sides of the rest box. Search on seeds below 1,000,000 only; what it found on views 0 to
-4 of seed 700,000 is in rivals/settings.py.
+``--search`` tries settings from the first start that is asked for, one setting after the other, by the mean error of
+all material points in half longest sides of the rest box. Search on seeds below 1,000,000 only; what it found on views
+0 to 4 of seed 700,000 (Bayesian CPD: on view 0) is in rivals/settings.py.
 
 Rivals, none of which mereo needs; without one its rows are left out, with a sentence that says so:
 
@@ -127,19 +127,24 @@ def scored(registration: Registration, case: Case, grid: TruthGrid, finished: bo
     return iou, miou, registration.seconds, finished, *errors(registration, case)
 
 
-def rows(view: Prepared, network: Model, rivals: dict[str, Rival], cells: int) -> dict[str, Row]:
-    """Scores of ours and of all rivals on one view."""
+def ours(view: Prepared, network: Model, grid: TruthGrid) -> dict[str, Row]:
+    """Scores of the network alone and of the fit of the modes."""
     case, model = view.case, view.rest.model
-    grid = truth_grid(case.truth, cells)
     alone = score(predict_grid(network, case.cloud, grid), grid, len(network.names))
-    table: dict[str, Row] = {"network": (*alone, np.nan, True, np.empty(0), np.empty(0))}
-    table["modes (ours)"] = scored(fit(case.cloud, network, model, case.unit), case, grid)
+    modes = scored(fit(case.cloud, network, model, case.unit), case, grid)
+    return {"network": (*alone, np.nan, True, np.empty(0), np.empty(0)), "modes (ours)": modes}
+
+
+def theirs(view: Prepared, rivals: dict[str, Rival], start: str, grid: TruthGrid) -> dict[str, Row]:
+    """Scores of all rivals from one start."""
+    table = {}
     for name, rival in rivals.items():
         variants = {"": rival.default} | ({", tuned": rival.default | rival.tuned} if rival.tuned else {})
         for suffix, settings in variants.items():
             found, seconds = attempt(rival, settings, view)
+            model = view.rest.model
             answer = Registration(model, found.material, "modes", np.empty(0), 1.0, np.nan, True, seconds)
-            table[name + suffix] = scored(answer, case, grid, found.finished)
+            table[f"{name}{suffix} ({start})"] = scored(answer, view.case, grid, found.finished)
     return table
 
 
@@ -161,11 +166,9 @@ def report(found: dict[str, dict[str, list[Row]]]) -> None:
     for name, objects in found.items():
         print(line(name, [row for part in objects.values() for row in part]))
     names = list(next(iter(found.values())))
-    print("\n| mIoU | " + " | ".join(names) + " |\n|---" * 1 + "|" + "---|" * (len(names)))
+    print(f"\n| mIoU | {' | '.join(names)} |\n|---|{'---|' * len(names)}")
     for name, objects in found.items():
-        print(
-            f"| {name} | " + " | ".join(f"{np.mean([row[1] for row in part]):.3f}" for part in objects.values()) + " |"
-        )
+        print(f"| {name} | {' | '.join(f'{np.mean([row[1] for row in part]):.3f}' for part in objects.values())} |")
 
 
 # --- search -----------------------------------------------------------------------------------------------------------
@@ -181,10 +184,10 @@ def mean_error(rival: Rival, settings: Settings, prepared: list[Prepared]) -> fl
 
 
 def search(name: str, rival: Rival, prepared: list[Prepared]) -> None:
-    """Best value of one setting after the other."""
-    tuned: Settings = {}
-    least = mean_error(rival, rival.default, prepared)
-    print(f"{name}: default {least:.4f}", flush=True)
+    """Best value of one setting after the other, from what an earlier search found."""
+    tuned = dict(rival.tuned)
+    least = mean_error(rival, rival.default | tuned, prepared)
+    print(f"{name}: {least:.4f} with {tuned}", flush=True)
     for key, values in rival.search.items():
         for value in values:
             error = mean_error(rival, rival.default | tuned | {key: value}, prepared)
@@ -212,7 +215,7 @@ def main() -> None:
     parser.add_argument("objects", nargs="*", default=["bunny", "liver", "rope", "engine", "human", "lizard"])
     for name, value in (("seed", 700_000), ("views", 5), ("first", 0), ("cells", 50)):
         parser.add_argument(f"--{name}", type=int, default=value)
-    parser.add_argument("--start", choices=("network", "truth"), default="network")
+    parser.add_argument("--start", nargs="+", choices=("network", "truth"), default=["network"])
     parser.add_argument("--scans", action="store_true")
     parser.add_argument("--search", nargs="*", choices=list(RIVALS))
     options = parser.parse_args()
@@ -227,10 +230,17 @@ def main() -> None:
             scans(scene, model) if options.scans else views(scene, model, options.seed, options.first, options.views)
         )
         for case in cases:
-            view = prepare(case, network, model, surface, options.start)
-            rivals = rivals or available(RIVALS, view)
-            everything.append(view)
-            for rival, row in {} if options.search is not None else rows(view, network, rivals, options.cells).items():
+            started = {start: prepare(case, network, model, surface, start) for start in options.start}
+            first = started[options.start[0]]
+            everything.append(first)
+            if options.search is not None:
+                continue
+            rivals = rivals or available(RIVALS, first)
+            grid = truth_grid(case.truth, options.cells)
+            table = ours(first, network, grid)
+            for start, view in started.items():
+                table |= theirs(view, rivals, start, grid)
+            for rival, row in table.items():
                 found[rival][name].append(row)
                 print(line(f"{case.name} {rival}", [row]), flush=True)
     if options.search is None:

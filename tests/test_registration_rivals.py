@@ -71,19 +71,18 @@ def test_atlas_cpd_finds_a_state_of_the_model(model: StatisticalModel) -> None:
 
 
 def test_all_points_follow_deformable_cpd_as_its_own_do(model: StatisticalModel) -> None:
-    """Ours at the source points is what the library answers, and so does the other library."""
+    """Ours at the source points is what the library answers, and the other library answers the same everywhere."""
     pycpd = pytest.importorskip("pycpd", reason="pycpd is not installed")
-    rustcpd = pytest.importorskip("rustcpd", reason="rustcpd is not installed")
+    pytest.importorskip("rustcpd", reason="rustcpd is not installed")
     cloud = transform_points(POSE, model.material(np.ones(model.count)))[::7]
     frame = started(model, model.rest_points, cloud, POSE)
     chosen = frame.source(200, False)
     source, target = frame.normalized(frame.posed[chosen]), frame.normalized(cloud)
-    moved, _ = pycpd.DeformableRegistration(X=target, Y=source, beta=0.7).register()
-    again = rustcpd.register_deformable(target, source, beta=0.7, low_rank=None).points
-    settings = RIVALS["deformable CPD"].default | {"beta": 0.7, "count": 200}
-    found = deformable_cpd(frame, settings).material[chosen]
-    np.testing.assert_allclose(found, frame.restored(moved), atol=1e-9)
-    np.testing.assert_allclose(moved, again, atol=1e-9)
+    moved, _ = pycpd.DeformableRegistration(X=target, Y=source, beta=0.7, w=0.1).register()
+    settings = RIVALS["deformable CPD"].default | {"beta": 0.7, "count": 200, "w": 0.1}
+    found = deformable_cpd(frame, settings).material
+    np.testing.assert_allclose(found[chosen], frame.restored(moved), atol=1e-9)
+    np.testing.assert_allclose(found, deformable_cpd(frame, settings | {"fast": True}).material, atol=1e-9)
 
 
 def test_facing_points_turn_with_the_object(model: StatisticalModel) -> None:

@@ -65,8 +65,13 @@ def icp(frame: Frame, settings: Settings) -> Registered:
 def clouds(frame: Frame, settings: Settings) -> tuple[np.ndarray, np.ndarray, Settings]:
     """Source and target in normalized coordinates, and the settings that are the algorithm's own."""
     chosen = frame.source(settings["count"], settings["facing"])
-    own = {key: value for key, value in settings.items() if key not in ("count", "facing", "scale")}
+    own = {key: value for key, value in settings.items() if key not in ("count", "facing", "scale", "fast")}
     return frame.normalized(frame.posed[chosen]), frame.normalized(frame.cloud), own
+
+
+def rust(settings: Settings) -> Settings:
+    """Settings by the names that rustcpd gives them."""
+    return {"outlier_weight" if key == "w" else key: value for key, value in settings.items()}
 
 
 def rigid_cpd(frame: Frame, settings: Settings) -> Registered:
@@ -77,8 +82,7 @@ def rigid_cpd(frame: Frame, settings: Settings) -> Registered:
         found = library("pycpd").RigidRegistration(X=target, Y=source, **own)
         found.register()
         return Registered(frame.restored(found.transform_point_cloud(points)))
-    own = {"outlier_weight" if key == "w" else key: value for key, value in own.items()}
-    result = library("rustcpd").register_rigid(target, source, scale=False, parallel=False, **own)
+    result = library("rustcpd").register_rigid(target, source, scale=False, parallel=False, **rust(own))
     return Registered(frame.restored(points @ result.rotation + result.translation))
 
 
@@ -91,11 +95,17 @@ def affine_cpd(frame: Frame, settings: Settings) -> Registered:
 
 
 def deformable_cpd(frame: Frame, settings: Settings) -> Registered:
-    """Deformable; with pycpd. Other material points follow by the algorithm's own Gaussian kernel."""
+    """Deformable; with pycpd, or with rustcpd where it is to be ``fast``, to the same result.
+
+    Other material points follow by the algorithm's own Gaussian kernel.
+    """
     source, target, own = clouds(frame, settings)
+    points = frame.normalized(frame.posed)
+    if settings["fast"]:
+        result = library("rustcpd").register_deformable(target, source, low_rank=None, parallel=False, **rust(own))
+        return Registered(frame.restored(np.asarray(result.transform(points))))
     found = library("pycpd").DeformableRegistration(X=target, Y=source, **own)
     found.register()
-    points = frame.normalized(frame.posed)
     kernel = np.exp(-cdist(points, source, "sqeuclidean") / (2 * found.beta**2))
     return Registered(frame.restored(points + kernel @ found.W))
 

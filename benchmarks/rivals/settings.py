@@ -51,13 +51,17 @@ RIVALS: dict[str, Rival] = {
             "downsampling_resolution": [0.05, 1.0],
             "max_iterations": [100],
         },
+        {"registration_type": "ICP"},
     ),
-    "rigid CPD": Rival(rigid_cpd, COMMON | {"scale": True}, {"scale": [False]} | MIXTURE),
-    "affine CPD": Rival(affine_cpd, COMMON, MIXTURE),
+    "rigid CPD": Rival(
+        rigid_cpd, COMMON | {"scale": True}, {"scale": [False]} | MIXTURE, {"facing": True, "sigma2": 0.1}
+    ),
+    "affine CPD": Rival(affine_cpd, COMMON, MIXTURE, {"facing": True, "sigma2": 0.005}),
     "deformable CPD": Rival(
         deformable_cpd,
-        COMMON,
+        COMMON | {"fast": False},
         MIXTURE | {"beta": [1.0, 0.5, 0.25], "alpha": [0.5, 8.0, 32.0, 128.0], "tolerance": [1e-5], "count": [1000]},
+        {"fast": True, "facing": True, "sigma2": 0.02, "w": 0.1, "tolerance": 1e-5, "count": 1000},
     ),
     "Bayesian CPD": Rival(
         bayesian_cpd,
@@ -69,7 +73,20 @@ RIVALS: dict[str, Rival] = {
         COMMON | {"scale": True},
         {"scale": [False]}
         | ATLAS
-        | {"lambda_regularization": [1.0, 10.0, 0.01], "adaptive_mixing": [1.0], "tolerance": [1e-5], "count": [1000]},
+        | {
+            "lambda_regularization": [0.01, 1.0, 10.0, 30.0, 100.0],
+            "adaptive_mixing": [1.0],
+            "tolerance": [1e-5],
+            "count": [1000, 2000],
+        },
+        {
+            "scale": False,
+            "facing": True,
+            "sigma2": 0.005,
+            "outlier_weight": 0.3,
+            "lambda_regularization": 10.0,
+            "count": 1000,
+        },
         mean=True,
     ),
 }
