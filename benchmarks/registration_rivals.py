@@ -11,7 +11,7 @@ near observed points and elsewhere, median seconds without the network's.
 
 ``--search`` tries settings from the first start that is asked for, one setting after the other, by the mean error of
 all material points in half longest sides of the rest box. Search on seeds below 1,000,000 only; what it found on views
-0 to 4 of seed 700,000 (Bayesian CPD: on view 0) is in rivals/settings.py.
+0 to 4 of seed 700,000 (Bayesian CPD, and the atlas a second time, on view 0) is in rivals/settings.py.
 
 Rivals, none of which mereo needs; without one its rows are left out, with a sentence that says so:
 

@@ -67,6 +67,7 @@ RIVALS: dict[str, Rival] = {
         bayesian_cpd,
         COMMON,
         {"facing": [True], "gamma": [0.1, 0.02], "lmd": [20.0, 200.0, 2000.0], "w": [0.1, 0.3], "k": [1.0]},
+        {"facing": True, "k": 1.0},
     ),
     "atlas CPD": Rival(
         atlas_cpd,
@@ -82,9 +83,10 @@ RIVALS: dict[str, Rival] = {
         {
             "scale": False,
             "facing": True,
-            "sigma2": 0.005,
-            "outlier_weight": 0.3,
+            "sigma2": 0.1,
+            "outlier_weight": 0.1,
             "lambda_regularization": 10.0,
+            "tolerance": 1e-5,
             "count": 1000,
         },
         mean=True,
