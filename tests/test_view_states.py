@@ -12,6 +12,7 @@ from toy_scene import toy_scene
 
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.playback import Drawn, material_moved
+from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
 from mereo.fitting.registration_state import load_state, state_of
 from mereo.fitting.state_file import STATE, save_state
@@ -51,8 +52,14 @@ def seen() -> PointCloud:
 
 
 @pytest.fixture(scope="module")
-def inspection(model: Model, seen: PointCloud) -> Inspection:
-    return Inspection.of(seen, model, 32, registrar=default_registrar(model))
+def registrar(model: Model, states: StatisticalModel) -> Registrar:
+    """That of the default answer, but for the scene's draws, which take long."""
+    return QuickRegistrar(model, states)
+
+
+@pytest.fixture(scope="module")
+def inspection(model: Model, seen: PointCloud, registrar: Registrar) -> Inspection:
+    return Inspection.of(seen, model, 32, registrar=registrar)
 
 
 def by_modes(states: StatisticalModel, seed: int = 0) -> Registration:
@@ -88,9 +95,9 @@ def test_a_page_of_a_frame_shows_and_asks_the_default_answer(inspection: Inspect
     np.testing.assert_allclose(found.probability, inspection.network(places).probability)
 
 
-def test_a_scanners_frame_is_asked_in_its_own_axes(model: Model, seen: PointCloud) -> None:
+def test_a_scanners_frame_is_asked_in_its_own_axes(model: Model, seen: PointCloud, registrar: Registrar) -> None:
     scan = PointCloud(seen.points @ SCANNER_TO_CAMERA.T)
-    inspection = Inspection.of(scan, model, 24, "scanner", default_registrar(model))
+    inspection = Inspection.of(scan, model, 24, "scanner", registrar)
     assert inspection.registration is not None
     places = scan.points[:6] - [0.0, 0.0, 2.0]
     found = inspection.ask(places)
@@ -100,8 +107,8 @@ def test_a_scanners_frame_is_asked_in_its_own_axes(model: Model, seen: PointClou
 
 
 def test_weights_without_a_model_are_asked_alone_and_it_is_said(model: Model, seen: PointCloud) -> None:
-    alone = replace(model, statistical_model=None)
-    assert default_registrar(alone) is None
+    alone, registrar = replace(model, statistical_model=None), default_registrar(model)
+    assert default_registrar(alone) is None and registrar is not None and registrar.choice == "auto"
     inspection = Inspection.of(seen, alone, 24, registrar=default_registrar(alone))
     assert inspection.registration is None and inspection.source == (
         "network alone: the weights carry no statistical model"
@@ -110,9 +117,9 @@ def test_weights_without_a_model_are_asked_alone_and_it_is_said(model: Model, se
     assert found.rest is None and found.probability is not None
 
 
-def test_an_answer_that_is_not_taken_says_why(model: Model, seen: PointCloud) -> None:
+def test_an_answer_that_is_not_taken_says_why(model: Model, seen: PointCloud, registrar: Registrar) -> None:
     stretched = PointCloud(seen.points * [1.0, 1.6, 1.0])
-    inspection = Inspection.of(stretched, model, 24, registrar=default_registrar(model))
+    inspection = Inspection.of(stretched, model, 24, registrar=registrar)
     assert inspection.registration is None
     assert inspection.source.startswith("network alone: the registered model (")
     assert inspection.source.endswith("of the observed points, too few")
@@ -189,6 +196,8 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
     from mereo.__main__ import main
 
     monkeypatch.setattr(serve, "import_viser", lambda: None)
+    # the shipped weights' own, which may have to be built first
+    monkeypatch.setattr(serve, "statistical_model_of", lambda _: replace(states, mean=states.mean + 1.0))
     save_state(tmp_path / STATE, state_of(by_modes(states), "rope", weights="gone.safetensors"))
     np.save(tmp_path / "cloud.npy", seen.points)
     places = {"STATE": str(tmp_path / STATE), "CLOUD": str(tmp_path / "cloud.npy")}
