@@ -51,6 +51,7 @@ def test_weights_with_a_statistical_model_show_the_fit_and_write_it(
     (scores,) = (line.split("│")[2:4] for line in out.splitlines() if "(mIoU)" in line)
     network, fit = (float(score) for score in scores)
     assert fit > network and "network" in out and "fit" in out
+    assert f"mereo view {tmp_path / 'rope'}" in out
     assert "the registered model explains" in out and len(shown) == 1
     again = load_state(tmp_path / "rope", model.statistical_model)
     seen = load_view("rope").depth.to_points().points
