@@ -9,12 +9,11 @@ import pytest
 from analytic import untrained
 
 from mereo import __main__ as command_line
-from mereo.cli.reconstruct import registrar_of
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.evaluation.sample_views import SampleView, load_view
 from mereo.fitting.answer import Answer, answer
 from mereo.fitting.fit import ModesFit
-from mereo.fitting.register import Registrar, statistical_model_of
+from mereo.fitting.register import Registrar, registrar_for, statistical_model_of
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.solids import Solids
@@ -120,8 +119,8 @@ def test_auto_plays_the_scene_only_where_the_modes_do_not_explain_the_cloud(mode
 
 
 def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> None:
-    assert registrar_of(replace(model, statistical_model=None), "auto") is None
-    assert registrar_of(model, "off") is None and registrar_of(model, "auto") is not None
+    assert registrar_for(replace(model, statistical_model=None), "auto") is None
+    assert registrar_for(model, "off") is None and registrar_for(model, "auto") is not None
 
 
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:

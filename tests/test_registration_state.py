@@ -36,7 +36,9 @@ def model() -> StatisticalModel:
 
 def placed(model: StatisticalModel, unposed: np.ndarray, **facts: Any) -> Registration:
     material = UNIT * unposed @ T[:3, :3].T + T[:3, 3]
-    return Registration(model, material, scene_unit=UNIT, explained=0.97, accepted=True, seconds=0.25, **facts)
+    return Registration(
+        model, material, scene_unit=UNIT, unit_known=True, explained=0.97, accepted=True, seconds=0.25, **facts
+    )
 
 
 def by_modes(model: StatisticalModel) -> Registration:
@@ -58,7 +60,7 @@ def assert_same(again: Registration, before: Registration) -> None:
     size = np.ptp(before.material, axis=0).max()
     assert np.abs(again.material - before.material).max() <= 1e-6 * size
     assert (again.method, again.scene_unit, again.explained) == (before.method, before.scene_unit, before.explained)
-    assert (again.accepted, again.seconds) == (before.accepted, before.seconds)
+    assert (again.accepted, again.seconds, again.unit_known) == (before.accepted, before.seconds, True)
     np.testing.assert_array_equal(again.z, before.z)
 
 

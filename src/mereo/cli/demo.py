@@ -14,14 +14,15 @@ from jaxtyping import UInt8
 from rich.console import Console
 from rich.table import Table
 
-from mereo.cli.reconstruct import facts_of, registrar_of
+from mereo.cli.reconstruct import facts_of
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
+from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import bunny_posed
-from mereo.evaluation.scoring import grid_confusion, predict_grid
+from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.answer import Answer, answer_frame
-from mereo.fitting.register import Registrar
+from mereo.fitting.register import Registrar, registrar_for
 from mereo.fitting.registration_state import write_state
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
@@ -119,7 +120,7 @@ def _frame_case(name: str) -> Case:
 def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
     """Reconstruct a case, print network and fit beside the truth, and write the folder of the default answer."""
     seen = encode_frame(case.cloud, model, case.frame)
-    network, registrar = extract(seen, model, RESOLUTION), registrar_of(model, "auto")
+    network, registrar = extract(seen, model, RESOLUTION), registrar_for(model, "auto")
     columns = {"network": Column(_scores(case, model, predict_grid(model, seen.code, case.truth)), seconds_of(network))}
     found, started = Answer(network), time.perf_counter()
     if registrar is not None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mereo.fitting.register import Registrar
+from mereo.fitting.config import FitChoice
+from mereo.fitting.register import Registrar, registrar_for
 from mereo.fitting.registration import Registration, nearest_labels
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
@@ -42,27 +43,34 @@ class Answer:
 def answer(
     cloud: PointCloud | Float[np.ndarray, "n 3"],
     model: Model,
-    registrar: Registrar | None,
+    registrar: Registrar | FitChoice | None = "auto",
     resolution: int = 128,
     frame: CloudAxes = "camera",
     label_points: bool = False,
     scene_unit: float | None = None,
+    stated_unit: float | None = None,
 ) -> Answer:
     """Answer to the frame that a cloud shows.
 
     Args:
         cloud: points on the object, any unit and density.
         model: the weights.
-        registrar: of the same object; None asks the network alone. With the choice "auto" a registration that does not
-            explain the cloud leaves the answer to the network, with others it is taken all the same.
+        registrar: of the same object, to be set up once for many frames, or the choice of one that is set up here; None
+            asks the network alone. With "auto" a registration that does not explain the cloud leaves the answer to the
+            network, with other choices it is taken all the same.
         resolution: cells along the longest side of the object's box.
         frame: the cloud's axes, as in ``mereo.reconstruct``.
         label_points: also say on which segment each point of the cloud lies.
         scene_unit: length of a scene unit in the cloud's unit, where it is known.
+        stated_unit: the same as the input states it (``Registrar.stated_unit``), believed only where the network's own
+            estimate agrees.
 
     Raises ``ValueError`` as ``mereo.reconstruct`` does, and for other choices than "auto" as ``fit_frame`` does.
     """
-    return answer_frame(encode_frame(cloud, model, frame), model, registrar, resolution, label_points, scene_unit)
+    if isinstance(registrar, str):
+        registrar = registrar_for(model, registrar)
+    seen = encode_frame(cloud, model, frame)
+    return answer_frame(seen, model, registrar, resolution, label_points, scene_unit, stated_unit)
 
 
 def answer_frame(
@@ -72,13 +80,14 @@ def answer_frame(
     resolution: int = 128,
     label_points: bool = False,
     scene_unit: float | None = None,
+    stated_unit: float | None = None,
 ) -> Answer:
     """``answer`` to a frame that the model has understood already, with its arguments."""
     if registrar is None:
         return Answer(extract(seen, model, resolution, label_points))
     auto = registrar.choice == "auto"
     try:
-        registration = registrar.register(seen.seen, seen.code, scene_unit)
+        registration = registrar.register(seen.seen, seen.code, scene_unit, stated_unit)
     except ValueError as error:
         if not auto:
             raise

@@ -27,6 +27,11 @@ from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.statistical_model import StatisticalModel
 
 KNOWN_SCALE_STD = 1e-6
+
+UNIT_TOLERANCE = 0.15
+"""Difference of a stated unit from the correspondences' own up to which it is believed: they are off by less in 258 of
+264 training views, and no two units that are mistaken for each other are nearer than a factor of 2.5."""
+
 SCALE_PAIRS = 4000
 """Pairs of correspondences whose distances, there and at rest, tell an unknown unit."""
 
@@ -109,6 +114,7 @@ class ModesFit:
             method=method,
             z=z,
             scene_unit=self.unit * float(np.exp(posed.log_scale)),
+            unit_known=self.problem.scale_std == KNOWN_SCALE_STD,
             explained=explained,
             accepted=explained >= self.problem.config.accepted,
             seconds=seconds,
@@ -122,6 +128,7 @@ def fit_frame(
     scene_unit: float | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
     code: EncodedCloud | None = None,
+    stated_unit: float | None = None,
 ) -> ModesFit:
     """Fit of the modes to a cloud, from the network's correspondences.
 
@@ -132,6 +139,7 @@ def fit_frame(
         scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
         config: constants.
         code: of the cloud, where it is known already.
+        stated_unit: what the input says that ``scene_unit`` is, which is believed where the correspondences agree.
 
     Raises ``ValueError`` for a network without rest coordinates or of other segments, and where it finds too little.
     """
@@ -147,8 +155,11 @@ def fit_frame(
         raise ValueError(
             "the weights predict no rest coordinates, from which a fit starts; train with a dataset that has a template"
         )
+    found = found.evenly()
+    if scene_unit is None and stated_unit is not None and agree(estimate_unit(found), stated_unit):
+        scene_unit = stated_unit
     asked = time.perf_counter() - started
-    fitted = ModesFit.of(cloud.points, found.evenly(), model, scene_unit, config)
+    fitted = ModesFit.of(cloud.points, found, model, scene_unit, config)
     return replace(fitted, seconds=fitted.seconds + asked)
 
 
@@ -183,6 +194,11 @@ def explained_share(problem: Problem, material: Float[np.ndarray, "m 3"]) -> flo
     """Share of the observed points within the tolerance of the surface that faces the camera."""
     distance = Surface.through(problem.model, material).nearest(problem.evidence.partners)[0]
     return float((distance <= problem.config.tolerance).mean())
+
+
+def agree(one: float, other: float) -> bool:
+    """Whether two units differ by no more than ``UNIT_TOLERANCE``."""
+    return abs(float(np.log(one / other))) < float(np.log1p(UNIT_TOLERANCE))
 
 
 def estimate_unit(found: Correspondences) -> float:

@@ -81,14 +81,27 @@ class Registrar:
         """Random states of the scene, among which a fit of its draws starts; they take seconds once."""
         return None if self.scene is None else DrawnStates.of(self.scene, self.model)
 
+    def stated_unit(self, unit_m: float) -> float | None:
+        """Length of a scene unit in a cloud's unit of ``unit_m`` metres; None where the object's size is not known."""
+        frame = self.model.source_frame
+        return None if frame is None or frame.unit_m is None else frame.unit_m / unit_m
+
     def fit_modes(
-        self, seen: PointCloud, code: EncodedCloud | None = None, scene_unit: float | None = None
+        self,
+        seen: PointCloud,
+        code: EncodedCloud | None = None,
+        scene_unit: float | None = None,
+        stated_unit: float | None = None,
     ) -> ModesFit:
         """Fit of the modes; raises ``ValueError`` as ``fit_frame`` does."""
-        return fit_frame(seen, self.network, self.model, scene_unit, code=code)
+        return fit_frame(seen, self.network, self.model, scene_unit, code=code, stated_unit=stated_unit)
 
     def register(
-        self, seen: PointCloud, code: EncodedCloud | None = None, scene_unit: float | None = None
+        self,
+        seen: PointCloud,
+        code: EncodedCloud | None = None,
+        scene_unit: float | None = None,
+        stated_unit: float | None = None,
     ) -> Registration:
         """Registration of the model to a cloud, as ``choice`` says.
 
@@ -96,10 +109,11 @@ class Registrar:
             seen: observed points, camera frame, any unit.
             code: what ``network`` made of them, where it is known already.
             scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
+            stated_unit: the same as the input states it, believed only where the network's own estimate agrees.
 
         Raises ``ValueError`` as ``fit_frame`` does.
         """
-        return self.finish(self.fit_modes(seen, code, scene_unit))
+        return self.finish(self.fit_modes(seen, code, scene_unit, stated_unit))
 
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer from a fit of the modes: the draws too where ``choice`` asks for them."""
@@ -115,6 +129,13 @@ class Registrar:
             return self.states
         except AssetUnavailable:  # the weights carry all that the modes need; without the scene's mesh they have to do
             return None
+
+
+def registrar_for(model: Model, choice: FitChoice, scene: Scene | str | None = None) -> Registrar | None:
+    """Registrar for a choice; None where the network alone answers: "auto" needs weights that carry a model."""
+    if choice == "off" or (choice == "auto" and model.statistical_model is None):
+        return None
+    return Registrar.of(model, choice, scene)
 
 
 def same_topology(scene: Scene, model: StatisticalModel) -> bool:
@@ -147,6 +168,7 @@ def describe(registration: Registration) -> dict[str, object]:
         "explained": registration.explained,
         "accepted": registration.accepted,
         "scene_unit": registration.scene_unit,
+        "unit": "known" if registration.unit_known else "found",
         "coefficients": registration.z.tolist(),
         "seconds": registration.seconds,
     }

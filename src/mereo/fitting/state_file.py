@@ -90,7 +90,7 @@ class RegistrationState(Block):
         unit_m: metres in the input's unit.
         frame: axes of the input.
         T_camera_input: from the input's frame to the camera frame.
-        explained, accepted, seconds: as in ``Registration``.
+        unit_known, explained, accepted, seconds: as in ``Registration``.
         witness: places of a few material points in the camera frame.
     """
 
@@ -109,6 +109,7 @@ class RegistrationState(Block):
     frame: CloudAxes
     T_camera_input: Pose
     explained: Annotated[FiniteFloat, Field(ge=0, le=1)]
+    unit_known: bool
     accepted: bool
     seconds: Annotated[FiniteFloat, Field(ge=0)]
     witness: Annotated[tuple[Point, ...], Field(min_length=WITNESSES, max_length=WITNESSES)]

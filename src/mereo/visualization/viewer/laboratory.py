@@ -15,7 +15,8 @@ from jaxtyping import Float, UInt8
 
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.scoring import check_names, grid_confusion, predict_grid
+from mereo.evaluation.results import grid_confusion
+from mereo.evaluation.scoring import check_names, predict_grid
 from mereo.fitting.answer import answer
 from mereo.fitting.fit import ModesFit
 from mereo.fitting.register import Registrar
