@@ -16,6 +16,7 @@ from mereo.models.model import EncodedCloud, Model
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
+from mereo.visualization.viewer.laboratory import QuickRegistrar
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +42,17 @@ def test_weights_with_a_statistical_model_show_the_fit_and_write_it(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    assert model.statistical_model is not None
+    modes = QuickRegistrar(model, model.statistical_model)  # the scene's draws would take long
     monkeypatch.setattr(demo, "load_model", lambda _: model)
+    monkeypatch.setattr(demo, "registrar_of", lambda *_: modes)
     demo.main(tmp_path)
     out = capsys.readouterr().out
     (scores,) = (line.split("│")[2:4] for line in out.splitlines() if "(mIoU)" in line)
     network, fit = (float(score) for score in scores)
     assert fit > network and "network" in out and "fit" in out
+    assert f"mereo view {tmp_path / 'rope'}" in out
     assert "the registered model explains" in out and len(shown) == 1
-    assert model.statistical_model is not None
     again = load_state(tmp_path / "rope", model.statistical_model)
     seen = load_view("rope").depth.to_points().points
     assert np.median(Solids(again.mesh).nearest(seen).distance) < 0.3

@@ -133,7 +133,8 @@ def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
     started = time.perf_counter()
     _write(case, found, registrar, folder)
     written_s = time.perf_counter() - started
-    line = f"{len(case.cloud)} points; written in {written_s:.1f} s; look at {folder / 'report.html'}\n"
+    page = f", or in the browser: mereo view {folder}" if found.taken else ""
+    line = f"{len(case.cloud)} points; written in {written_s:.1f} s; look at {folder / 'report.html'}{page}\n"
     console.print(line, highlight=False, soft_wrap=True)
 
 

@@ -46,8 +46,10 @@ def played_back(scene: Scene, seed: int, shares: Sequence[np.ndarray]) -> Played
 def draw_names(played: Played) -> tuple[str, ...]:
     """Name of each number in the order of the draws, as its slider is called; "" for one that cannot vary."""
     sliders = {(slider.key, slider.index): f"{slider.group}: {slider.name}" for slider in parameters(played)}
-    return tuple(
-        sliders.get((call.key, index), sliders.get((call.key, None), ""))
-        for call in played.calls
-        for index in range(len(call.shares))
-    )
+
+    def name(key: Key, index: int) -> str:
+        if (key, None) in sliders:
+            return f"{sliders[key, None]} {index + 1}"
+        return sliders.get((key, index), "")
+
+    return tuple(name(call.key, index) for call in played.calls for index in range(len(call.shares)))

@@ -11,6 +11,9 @@ from mereo.visualization.vertex_colors import ColorScale
 from mereo.visualization.viewer.probe import Probed
 
 SOFT = "opacity:.62"
+NOTHING = 1e-6
+"""Distance, as a share of a place's coordinates, that is none: a click meets the surface up to rounding."""
+
 BOX = "padding:2px 0.9em 6px;font-size:0.82em;line-height:1.5"
 
 
@@ -84,6 +87,8 @@ def answer(found: Probed, names: Sequence[str], colors: Sequence[Color], place: 
     label, distance, direction = int(found.label[0]), float(found.distance[0]), found.direction[0]
     where = "inside" if distance < 0 else "outside"
     said = "distance not trained" if np.isnan(distance) else f"{abs(distance):.3g}{unit} {where} the nearest surface"
+    if abs(distance) <= NOTHING * float(np.abs(place).max()):
+        said = "on the surface"
     toward = "" if np.isnan(direction).any() else f"towards {_vector(direction.tolist())}"
     rest = "" if found.rest is None else f"<br>at rest at {_vector(found.rest[0].tolist())} scene units"
     return (
@@ -98,7 +103,8 @@ def _likeliest(found: Probed, names: Sequence[str], colors: Sequence[Color]) -> 
     if found.probability is None:
         return ""
     order = np.argsort(-found.probability[0], kind="stable")[:4]
-    return bars([(names[k], colors[k], float(found.probability[0, k])) for k in order])
+    shown = bars([(names[k], colors[k], float(found.probability[0, k])) for k in order])
+    return shown if found.rest is None else f'<div style="{BOX};{SOFT}">the network says</div>{shown}'
 
 
 def _vector(values: Sequence[float]) -> str:

@@ -84,6 +84,7 @@ class LabPage:
         with panel.add_tab("What the camera sees"):
             gui.add_html(html.heading(title, facts))
             self._picture = gui.add_image(np.zeros((288, 288, 3), dtype=np.uint8), format="png")
+            self._source = gui.add_html("")
             self._score = gui.add_html("")
             axes = ({"show": False}, {"stroke": "#9aa3b2", "grid": {"stroke": "rgba(150,160,175,.18)"}, "size": 34})
             self._curve = gui.add_uplot(
@@ -207,7 +208,8 @@ class LabPage:
             self._curve.data = (np.arange(len(self._scores), dtype=float), columns[0], columns[1])
             self._curve.visible = True
         resolution = int(max(trial.result.labels.labels.shape)) - 1
-        self._say(f"{trial.source}; {resolution} cells in {trial.seconds:.2f} s; scored on {trial.cells}³ points")
+        self._source.content = html.message(trial.source)
+        self._say(f"{resolution} cells in {trial.seconds:.2f} s; scored on {trial.cells}³ points")
 
     def _draw(self) -> None:
         """Callbacks and the worker draw; one at a time."""

@@ -159,16 +159,17 @@ def shapes_of(state: RegistrationState, scene: Scene, model: Model | None) -> Fr
 
 
 def weights_of(state: RegistrationState, weights: str | None) -> str:
-    """Weights to be loaded for a state: the given ones, else those that it names."""
+    """Weights to be loaded for a state: the given ones, else those that it names, else those shipped for its scene."""
     if weights is not None:
         return weights
+    known = state.weights or state.scene
     try:
-        find_weights(state.weights)
+        find_weights(known)
     except FileNotFoundError:
         raise FileNotFoundError(
-            f"the state was made with the weights {state.weights!r}, which are not here: name them with --weights"
+            f"the state was made with the weights {known!r}, which are not here: name them with --weights"
         ) from None
-    return state.weights
+    return known
 
 
 def _serve(server: Any, page: LabPage | None = None) -> None:
