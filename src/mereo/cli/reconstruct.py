@@ -12,6 +12,7 @@ from mereo.fitting.carry import Carried, Placed, place
 from mereo.fitting.carry import carry as carry_one
 from mereo.fitting.config import FitChoice
 from mereo.fitting.register import Registrar, describe, registrar_for
+from mereo.fitting.registration_state import write_state
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import new_directory
 from mereo.io.attachments import read_attachments
@@ -105,6 +106,7 @@ def reconstruct_file(
         if carried:
             facts["carried"] = [one.facts() for one in carried]
         write_files(directory, result, seen.cloud, frame.axes, files, frame.unit_m, {**facts, **seen.facts()}, carried)
+        write_state(directory, found, registrar, str(weights), frame.axes, frame.unit_m)
     print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result
