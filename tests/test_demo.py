@@ -45,7 +45,7 @@ def test_weights_with_a_statistical_model_show_the_fit_and_write_it(
     assert model.statistical_model is not None
     modes = QuickRegistrar(model, model.statistical_model)  # the scene's draws would take long
     monkeypatch.setattr(demo, "load_model", lambda _: model)
-    monkeypatch.setattr(demo, "registrar_of", lambda *_: modes)
+    monkeypatch.setattr(demo, "registrar_for", lambda *_: modes)
     demo.main(tmp_path)
     out = capsys.readouterr().out
     (scores,) = (line.split("│")[2:4] for line in out.splitlines() if "(mIoU)" in line)

@@ -29,7 +29,7 @@ from mereo.visualization.viewer import display, serve
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, ModeShapes
 from mereo.visualization.viewer.laboratory import Laboratory, QuickRegistrar
-from mereo.visualization.viewer.probe import Inspection, default_registrar
+from mereo.visualization.viewer.probe import Inspection
 
 AWAY = np.array([0.0, 0.0, 150.0])
 needs_browser = pytest.mark.skipif(find_spec("viser") is None or BROWSER is None, reason="no viser or no browser")
@@ -66,7 +66,7 @@ def by_modes(states: StatisticalModel, seed: int = 0) -> Registration:
     """A library state, 150 units in front of the camera."""
     z = states.library[seed].astype(np.float64)
     material = states.material(z) + AWAY
-    return Registration(states, material, "modes", z, 1.0, 0.98, True, 0.1)
+    return Registration(states, material, "modes", z, 1.0, True, 0.98, True, 0.1)
 
 
 def by_draws(states: StatisticalModel, seed: int = 3) -> Registration:
@@ -75,7 +75,7 @@ def by_draws(states: StatisticalModel, seed: int = 3) -> Registration:
     deformations = drawn.deformations(scene, drawn.z)
     assert deformations is not None
     material = material_moved(scene, states, deformations) + AWAY
-    return Registration(states, material, "draws", drawn.z, 1.0, 0.98, True, 0.1, drawn)
+    return Registration(states, material, "draws", drawn.z, 1.0, True, 0.98, True, 0.1, drawn)
 
 
 # --- a frame ----------------------------------------------------------------------------------------------------------
@@ -107,9 +107,7 @@ def test_a_scanners_frame_is_asked_in_its_own_axes(model: Model, seen: PointClou
 
 
 def test_weights_without_a_model_are_asked_alone_and_it_is_said(model: Model, seen: PointCloud) -> None:
-    alone, registrar = replace(model, statistical_model=None), default_registrar(model)
-    assert default_registrar(alone) is None and registrar is not None and registrar.choice == "auto"
-    inspection = Inspection.of(seen, alone, 24, registrar=default_registrar(alone))
+    inspection = Inspection.of(seen, replace(model, statistical_model=None), 24)
     assert inspection.registration is None and inspection.source == (
         "network alone: the weights carry no statistical model"
     )
@@ -232,6 +230,7 @@ def test_the_laboratory_shows_and_scores_the_default_answer(model: Model) -> Non
     alone = Laboratory(load_scene("rope"), replace(model, statistical_model=None)).rebuild(view, 24, 24)
     assert "registered model" in trial.source and alone.source.startswith("network alone")
     assert trial.scores.miou > alone.scores.miou
+    assert laboratory.registrar is not None and laboratory.registrar.choice == "auto"
     assert laboratory.registrar is laboratory.registrar  # built once
 
 

@@ -63,6 +63,7 @@ class Case:
         weights: a shipped name.
         cloud, frame: the input as its sensor gives it.
         truth: the right answer, in a camera frame.
+        unit_m: metres in the input's unit; None for scene units.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Case:
     cloud: PointCloud
     frame: CloudAxes
     truth: TruthGrid
+    unit_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +108,7 @@ def _scan_case() -> Case:
     scan = bunny_posed(REAL_SCAN)
     _, truth, _ = scan.in_camera()
     title = f"{REAL_SCAN}: a real Cyberware range scan of the Stanford bunny, metres"
-    return Case(REAL_SCAN, title, "bunny", scan.cloud, scan.frame, truth_grid(truth))
+    return Case(REAL_SCAN, title, "bunny", scan.cloud, scan.frame, truth_grid(truth), 1.0)
 
 
 def _frame_case(name: str) -> Case:
@@ -124,7 +126,8 @@ def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
     columns = {"network": Column(_scores(case, model, predict_grid(model, seen.code, case.truth)), seconds_of(network))}
     found, started = Answer(network), time.perf_counter()
     if registrar is not None:
-        found = answer_frame(seen, model, registrar, RESOLUTION)
+        stated = None if case.unit_m is None else registrar.stated_unit(case.unit_m)
+        found = answer_frame(seen, model, registrar, RESOLUTION, stated_unit=stated)
         seconds = sum(seen.timings_s.values()) + time.perf_counter() - started
         if found.registration is not None:
             labels = label_grid(found.registration.mesh, *case.truth.grid.axes())

@@ -19,7 +19,7 @@ from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scoring import check_names, predict_grid
 from mereo.fitting.answer import answer
 from mereo.fitting.fit import ModesFit
-from mereo.fitting.register import Registrar
+from mereo.fitting.register import Registrar, registrar_for
 from mereo.fitting.registration import Registration
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
@@ -32,7 +32,7 @@ from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom
-from mereo.visualization.viewer.probe import default_registrar, source_of
+from mereo.visualization.viewer.probe import source_of
 
 NEAR: tuple[int, int, int] = (255, 236, 190)
 FAR: tuple[int, int, int] = (38, 30, 84)
@@ -114,7 +114,7 @@ class Laboratory:
     @cached_property
     def registrar(self) -> Registrar | None:
         """Registrar of the default answer, set up once."""
-        return None if self.model is None else default_registrar(self.model, self.scene)
+        return None if self.model is None else registrar_for(self.model, "auto", self.scene)
 
     @cached_property
     def quick_registrar(self) -> Registrar | None:

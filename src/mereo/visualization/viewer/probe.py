@@ -15,7 +15,6 @@ from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
 from mereo.models.model import Answer, EncodedCloud, Model
-from mereo.scenes.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +66,11 @@ class Inspection:
         resolution: int = 128,
         frame: CloudAxes = "camera",
         registrar: Registrar | None = None,
+        unit_m: float | None = None,
     ) -> "Inspection":
-        """Default answer to a cloud, to be asked; raises as ``fitting.answer.answer`` does."""
-        found = answer(cloud, model, registrar, resolution, frame)
+        """Default answer to a cloud of a unit of ``unit_m`` metres; raises as ``fitting.answer.answer`` does."""
+        stated = None if registrar is None or unit_m is None else registrar.stated_unit(unit_m)
+        found = answer(cloud, model, registrar, resolution, frame, stated_unit=stated)
         result = found.reconstruction
         return cls(
             surfaces=result.surfaces,
@@ -131,11 +132,6 @@ class Inspection:
     def _turned(self, direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Directions of the camera frame in the input's."""
         return direction @ self.T_camera_input[:3, :3]
-
-
-def default_registrar(model: Model, scene: Scene | None = None) -> Registrar | None:
-    """Registrar of the answer that `mereo reconstruct` gives by default; None where the weights carry no model."""
-    return None if model.statistical_model is None else Registrar.of(model, scene=scene)
 
 
 def source_of(found: FrameAnswer, registrar: Registrar | None) -> str:

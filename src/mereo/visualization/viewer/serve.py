@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mereo.evaluation.sample_views import load_view, shipped_views
-from mereo.fitting.register import statistical_model_of
+from mereo.fitting.register import registrar_for, statistical_model_of
 from mereo.fitting.registration_state import played_state, restored
 from mereo.fitting.state_file import RegistrationState, read_state
 from mereo.geometry.camera import PointCloud
@@ -27,7 +27,7 @@ from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom, ModeShapes
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
-from mereo.visualization.viewer.probe import Inspection, default_registrar
+from mereo.visualization.viewer.probe import Inspection
 
 PORT = 8080
 """Port of the page where none is chosen."""
@@ -82,7 +82,8 @@ def view_frame(
     else:
         frame = Frame.read(input, reading, isolation)
     model = load_for(weights, inference or InferenceConfig())
-    inspection = Inspection.of(frame.cloud, model, resolution, frame.axes, default_registrar(model))
+    registrar = registrar_for(model, "auto")
+    inspection = Inspection.of(frame.cloud, model, resolution, frame.axes, registrar, frame.unit_m)
     server = start_server(port, "mereo")
     FramePage(server, inspection, frame.title, f"{len(frame.cloud):,} points · weights {weights}", frame.unit)
     _serve(server)
