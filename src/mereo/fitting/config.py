@@ -57,6 +57,9 @@ class FitConfig:
     rounds: int = 2
     curved: int = 300
     scale_std: float = 0.1
+    samples: int = 1000
+    witness_step: int = 2
+    exact_steps: int = 3
     accepted: float = 0.95
     tolerance: float = 0.45
 

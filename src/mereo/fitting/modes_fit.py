@@ -76,5 +76,6 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
         sigma = max(start * half * config.cooling**step, config.cloud_sigma)
         worth = config.network_worth[0] * (1 - share) + config.network_worth[1] * share
         normal = problem.known(posed, prior, slack * half * config.pair_cooling**step)
-        posed = posed.moved(problem.seen(normal, posed, sigma, worth).step(config.damping))
+        exact = steps - step <= config.exact_steps and sigma <= 2 * config.cloud_sigma
+        posed = posed.moved(problem.seen(normal, posed, sigma, worth, exact).step(config.damping))
     return posed

@@ -11,7 +11,8 @@ from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed
 from mereo.fitting.priors import PairTerm, Prior
-from mereo.fitting.residuals import ROBUST, WITNESS_WEIGHT, NetworkTerm, Surface, add_witnesses, robust_square
+from mereo.fitting.residuals import ROBUST, WITNESS_WEIGHT, NetworkTerm, Surface, add_cloud, add_witnesses, robust_square
+from mereo.fitting.sampled_surface import SampledSurface
 from mereo.scenes.statistical_model import StatisticalModel
 
 
@@ -81,12 +82,20 @@ class Problem:
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
         return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
 
-    def seen(self, normal: NormalEquations, posed: Posed, sigma: float, network_worth: float) -> NormalEquations:
-        """Sum with cloud, witnesses and correspondences."""
-        surface = Surface.of(self.model, posed)
+    @cached_property
+    def samples(self) -> SampledSurface:
+        """Samples of the model's surface."""
+        return SampledSurface.of(self.model, self.config.samples)
+
+    def seen(
+        self, normal: NormalEquations, posed: Posed, sigma: float, network_worth: float, exact: bool
+    ) -> NormalEquations:
+        """Sum with cloud, witnesses and correspondences; ``exact`` asks the faces and not the samples."""
+        samples = self.samples.posed(posed)
+        surface = Surface.of(self.model, posed) if exact else samples
         normal = self.network.add_to(normal, posed, self.network_sigma, network_worth, robust=True)
-        normal = normal.add(*surface.cloud_term(posed, self.evidence.partners, sigma, self.config.cloud_worth))
-        return add_witnesses(normal, surface, posed, self.evidence, self.witnesses, sigma)
+        normal = add_cloud(normal, posed, self.evidence.partners, surface, sigma, self.config.cloud_worth)
+        return add_witnesses(normal, posed, samples.every(self.config.witness_step), self.evidence, sigma)
 
     def misfit(self, posed: Posed, sigma: float | None = None) -> Misfit:
         """Misfit of a state; ``sigma`` of the cloud is its last one where not given."""
