@@ -13,8 +13,8 @@ from jaxtyping import Float, Float32, Int
 
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
-from mereo.fitting.gauss_newton import NormalEquations, Posed, along, geman_mcclure, in_space
-from mereo.fitting.sampled_surface import PosedSamples, cross
+from mereo.fitting.gauss_newton import NormalEquations, Posed, along, cross, geman_mcclure, in_space
+from mereo.fitting.sampled_surface import PosedSamples
 from mereo.geometry.mesh import barycentric
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -126,7 +126,7 @@ class NetworkTerm:
         weight = self.confidence / self.confidence.sum() * (worth / sigma**2)
         if robust:
             weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
-        return normal.add(in_space(posed, points, self.modes), offset.T.ravel(), np.tile(weight, 3))
+        return normal.add(in_space(posed, points, self.modes), offset.ravel(), np.repeat(weight, 3))
 
 
 def add_cloud(

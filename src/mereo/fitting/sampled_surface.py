@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from mereo.fitting.gauss_newton import Posed
+from mereo.fitting.gauss_newton import Posed, cross
 from mereo.scenes.statistical_model import StatisticalModel
 
 
@@ -22,10 +23,12 @@ class SampledSurface:
 
     Attributes:
         mean, modes: of the frames.
+        spacing: distance between samples, about.
     """
 
     mean: Float32[np.ndarray, "s 3 3"]
     modes: Float32[np.ndarray, "s 3 3 k"]
+    spacing: float
 
     @classmethod
     def of(cls, model: StatisticalModel, count: int) -> "SampledSurface":
@@ -38,14 +41,17 @@ class SampledSurface:
         weight = np.diff(share, axis=1, prepend=0.0, append=1.0)
         combine = np.zeros((count, 3, 3))
         combine[:, 0], combine[:, 1:, 0], combine[:, [1, 2], [1, 2]] = weight, -1.0, 1.0
-        index = model.faces[face]
-        mean = combine @ model.mean[index]
-        modes = np.matmul(combine.astype(np.float32), model.modes[index].reshape(count, 3, -1))
-        return cls(mean.astype(np.float32), modes.reshape(count, 3, 3, model.count))
+        index = np.broadcast_to(model.faces[face][:, None], combine.shape)
+        rows = np.repeat(np.arange(3 * count), 3)
+        frames = csr_array((combine.ravel().astype(np.float32), (rows, index.ravel())), (3 * count, len(model.mean)))
+        modes = (frames @ model.modes.reshape(len(model.modes), -1)).reshape(count, 3, 3, model.count)
+        mean = (frames @ model.mean).reshape(count, 3, 3)
+        spacing = float(np.sqrt(ends[-1] / 2 / count))
+        return cls(mean.astype(np.float32), modes, spacing)
 
     def every(self, step: int) -> "SampledSurface":
         """Fewer samples."""
-        return SampledSurface(self.mean[::step], self.modes[::step])
+        return SampledSurface(self.mean[::step], self.modes[::step], self.spacing * np.sqrt(step))
 
     def posed(self, posed: Posed) -> "PosedSamples":
         """Samples of a state in the camera frame."""
@@ -74,11 +80,10 @@ class PosedSamples:
     normal: Float32[np.ndarray, "s 3"]
     facing: Bool[np.ndarray, " s"]
 
-    def every(self, step: int) -> "PosedSamples":
-        """Fewer samples."""
-        return PosedSamples(
-            self.surface.every(step), self.place[::step], self.normal[::step], self.facing[::step]
-        )
+    def few(self, count: int) -> "PosedSamples":
+        """About ``count`` samples, as evenly spread."""
+        step = max(1, len(self.place) // count)
+        return PosedSamples(self.surface.every(step), self.place[::step], self.normal[::step], self.facing[::step])
 
     def planes(
         self, points: Float[np.ndarray, "p 3"]
@@ -89,11 +94,3 @@ class PosedSamples:
         tree = cKDTree(self.place[rows], balanced_tree=False, compact_nodes=False)
         near = rows[tree.query(points)[1]]
         return self.place[near].astype(np.float64), self.normal[near].astype(np.float64), self.surface.modes[near, 0]
-
-
-def cross(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Cross products; numpy's own spends more time on the axes than on the numbers."""
-    result = np.empty_like(a)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        result[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
-    return result
