@@ -41,8 +41,8 @@ class FitConfig:
     last_steps: int = 15
     cooling: float = 0.75
     cloud_sigma: float = 0.2
-    cloud_worth: float = 1500.0
-    network_worth: tuple[float, float] = (100.0, 30.0)
+    cloud_worth: float = 3000.0
+    network_worth: tuple[float, float] = (60.0, 10.0)
     pair_worth: float = 100.0
     pair_slack: float = 0.05
     pair_cooling: float = 0.7
