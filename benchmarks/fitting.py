@@ -17,8 +17,9 @@ from scipy.spatial import cKDTree
 
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
+from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scans import SCANS, scan_in_camera
-from mereo.evaluation.scoring import grid_confusion, predict_grid
+from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.fit import fit
 from mereo.fitting.playback import DrawnStates
 from mereo.fitting.registration import Registration

@@ -13,7 +13,8 @@ import numpy as np
 
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import intersection_over_union
-from mereo.evaluation.scoring import grid_confusion, predict_grid, trained_scene
+from mereo.evaluation.results import grid_confusion
+from mereo.evaluation.scoring import predict_grid, trained_scene
 from mereo.models.weights import load_model, shipped_names
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import isolate

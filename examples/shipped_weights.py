@@ -9,7 +9,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from mereo.evaluation.scoring import EvaluatedView, evaluate
+from mereo.evaluation.results import EvaluatedView
+from mereo.evaluation.scoring import evaluate
 from mereo.models.weights import load_model, shipped_names
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.seeds import TEST_SEED_START

@@ -42,12 +42,17 @@ def test_a_trial_of_the_laboratory(encoded: list[np.ndarray]) -> None:
     assert len(encoded) == 1
 
 
-def test_a_page_of_a_frame(encoded: list[np.ndarray], tmp_path: Path) -> None:
+def test_a_result_that_is_written(encoded: list[np.ndarray], tmp_path: Path) -> None:
+    cloud = load_view("rope").depth.to_points()
+    write_reconstruction(reconstruct(cloud, load_model("rope"), 16), cloud, tmp_path / "result")
+    assert len(encoded) == 1
+
+
+def test_a_page_of_a_frame(encoded: list[np.ndarray]) -> None:
     cloud = load_view("rope").depth.to_points()
     inspection = Inspection.of(cloud, load_model("rope"), 16)
     inspection.ask(cloud.points[:5])
-    confidence(inspection.result.surfaces, inspection.ask)
-    write_reconstruction(inspection.result, cloud, tmp_path / "result")
+    confidence(inspection.surfaces, inspection.network)
     assert len(encoded) == 1
 
 

@@ -105,12 +105,14 @@ def test_attempts_that_the_scene_threw_away_have_no_sliders() -> None:
     scene = scene_of(rejecting)
     attempts = []
     for seed in range(20):
-        recorder, _ = play(scene, seed, {}, None)
+        recorder = Recorder(seed, {})
+        play(scene, recorder)
         attempts.append(len(recorder.calls))
         played = random_state(scene, seed)
         assert len(parameters(played)) == 3
         # what is kept leads to the same state at once
-        again, deformations = play(scene, seed, {c.key: c.shares for c in played.calls}, None)
+        again = Recorder(seed, {c.key: c.shares for c in played.calls})
+        deformations = play(scene, again)
         assert len(again.calls) == 3
         np.testing.assert_array_equal(deformations[0](np.zeros((1, 3)))[0], shift_of(played))
     assert max(attempts) > 9
@@ -134,7 +136,8 @@ def test_loops_that_keep_what_they_draw_keep_their_sliders() -> None:
 
     scene = scene_of(sample)
     for seed in range(5):
-        recorder, deformations = play(scene, seed, {}, None)
+        recorder = Recorder(seed, {})
+        deformations = play(scene, recorder)
         played = random_state(scene, seed)
         assert len(played.calls) == len(recorder.calls)
         np.testing.assert_array_equal(deformations[0](np.zeros((1, 3)))[0], shift_of(played))

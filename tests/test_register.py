@@ -11,8 +11,9 @@ from analytic import untrained
 from mereo import __main__ as command_line
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.evaluation.sample_views import SampleView, load_view
-from mereo.fitting.register import register, registered, statistical_model_of
-from mereo.fitting.registration import Registration
+from mereo.fitting.answer import Answer, answer
+from mereo.fitting.fit import ModesFit
+from mereo.fitting.register import Registrar, registrar_for, statistical_model_of
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.solids import Solids
@@ -39,8 +40,8 @@ def network(model: Model, view: SampleView) -> Reconstruction:
 
 
 @pytest.fixture(scope="module")
-def found(network: Reconstruction, model: Model, view: SampleView) -> Registration:
-    return register(network, view.depth.to_points(), model)
+def found(model: Model, view: SampleView) -> Answer:
+    return answer(view.depth.to_points(), model, Registrar.of(model), 48, label_points=True)
 
 
 def iou(view: SampleView, result: Reconstruction) -> float:
@@ -50,41 +51,38 @@ def iou(view: SampleView, result: Reconstruction) -> float:
     return intersection_over_union(confusion_matrix(grid.labels[kept], labels, len(grid.names) + 1)).miou
 
 
-def test_the_answer_is_the_model_itself(
-    network: Reconstruction, found: Registration, model: Model, view: SampleView
-) -> None:
-    answer = registered(network, found, model)
+def test_the_answer_is_the_model_itself(network: Reconstruction, found: Answer, model: Model, view: SampleView) -> None:
+    result = found.reconstruction
     rest = statistical_model_of(model).rest
-    assert found.accepted and answer.surfaces.names == rest.names
-    for segment, at_rest in zip(answer.surfaces.segments, rest.segments, strict=True):
+    assert found.taken and result.surfaces.names == rest.names
+    for segment, at_rest in zip(result.surfaces.segments, rest.segments, strict=True):
         np.testing.assert_array_equal(segment.faces, at_rest.faces)
-    assert iou(view, answer) > iou(view, network) + 0.05
+    assert iou(view, result) > iou(view, network) + 0.05
 
 
-def test_labels_are_those_of_the_segments(network: Reconstruction, found: Registration, model: Model) -> None:
-    answer = registered(network, found, model)
-    grid = answer.labels
+def test_labels_are_those_of_the_segments(network: Reconstruction, found: Answer) -> None:
+    result = found.reconstruction
+    grid = result.labels
     index = np.argwhere(np.ones(grid.labels.shape, dtype=bool))
-    agree = Solids(answer.surfaces).label(grid.positions(index)) == grid.labels.reshape(-1)
+    agree = Solids(result.surfaces).label(grid.positions(index)) == grid.labels.reshape(-1)
     assert agree.mean() > 0.999 and not grid.touched_sides().any()
-    np.testing.assert_allclose(grid.spacing, network.labels.spacing)
-    assert answer.observed is not None and network.observed is not None
-    assert answer.observed.labels.min() >= 1 and len(answer.observed.labels) == len(network.observed.labels)
+    assert grid.spacing[0] == pytest.approx(np.ptp(result.surfaces.bounds, axis=0).max() / 48)
+    assert result.observed is not None and network.observed is not None
+    assert result.observed.labels.min() >= 1 and len(result.observed.labels) == len(network.observed.labels)
 
 
 def test_a_scanners_frame_gets_its_answer_in_that_frame(model: Model, view: SampleView) -> None:
     points = view.depth.to_points().points @ SCANNER_TO_CAMERA.T
-    network = reconstruct(PointCloud(points), model, resolution=48, frame="scanner")
-    answer = registered(network, register(network, points, model), model, "scanner")
-    assert np.median(Solids(answer.surfaces).nearest(points).distance) < 0.02 * np.ptp(points, axis=0).max()
-    for one in answer.segments:
-        inside = answer.labels.positions(np.argwhere(answer.labels.labels == one.label)).mean(axis=0)
+    result = answer(PointCloud(points), model, Registrar.of(model), 48, "scanner").reconstruction
+    assert np.median(Solids(result.surfaces).nearest(points).distance) < 0.02 * np.ptp(points, axis=0).max()
+    for one in result.segments:
+        inside = result.labels.positions(np.argwhere(result.labels.labels == one.label)).mean(axis=0)
         np.testing.assert_allclose(one.centroid, inside, atol=1e-9)
 
 
 def test_weights_without_states_say_what_to_do() -> None:
     other = replace(untrained(("a", "b")), provenance={"scene": "mine"})
-    with pytest.raises(ValueError, match="the weights of a, b carry no statistical model .* or leave out --fit"):
+    with pytest.raises(ValueError, match="the weights of a, b carry no statistical model .* or use --fit off"):
         statistical_model_of(other)
 
 
@@ -98,8 +96,45 @@ def test_the_command_says_which_answer_it_is(model: Model, view: SampleView, tmp
     assert facts["answer"] == "registration" and facts["method"] == "modes" and facts["explained"] > 0.95
 
 
-def test_full_needs_a_built_in_scene(network: Reconstruction, model: Model, view: SampleView) -> None:
-    with pytest.raises(
-        ValueError, match="trained on 'mine', which is no built-in scene; --fit full plays .* --fit modes"
-    ):
-        register(network, view.depth.to_points(), replace(model, provenance={"scene": "mine"}), "full")
+def test_full_needs_a_scene(model: Model) -> None:
+    other = replace(model, provenance={"scene": "mine"})
+    with pytest.raises(ValueError, match="trained on 'mine', which is no built-in scene; .* with --scene, or use"):
+        Registrar.of(other, "full")
+    assert Registrar.of(other, "full", "rope").scene is not None
+    with pytest.raises(ValueError, match="the scene 'engine' has other segments or meshes than the weights' own model"):
+        Registrar.of(other, "full", "engine")
+
+
+def test_auto_plays_the_scene_only_where_the_modes_do_not_explain_the_cloud(model: Model, view: SampleView) -> None:
+    registrar = Registrar.of(model)
+    fitted = registrar.fit_modes(view.depth.to_points())
+    problem = fitted.problem
+
+    def judged_by(explained: float) -> ModesFit:
+        return replace(fitted, problem=replace(problem, config=replace(problem.config, explained=explained)))
+
+    assert registrar.finish(judged_by(np.inf)).method == "modes" and "states" not in vars(registrar)
+    registrar.finish(judged_by(0.0))
+    assert vars(registrar)["states"] is not None
+
+
+def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> None:
+    assert registrar_for(replace(model, statistical_model=None), "auto") is None
+    assert registrar_for(model, "off") is None and registrar_for(model, "auto") is not None
+
+
+def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
+    stretched = view.depth.to_points().points * np.array([1.0, 1.6, 1.0])
+    found = answer(stretched, model, Registrar.of(model), 32)
+    assert found.registration is not None and not found.registration.accepted and not found.taken
+    forced = answer(stretched, model, Registrar.of(model, "modes"), 32)
+    assert forced.taken and forced.registration is not None and not forced.registration.accepted
+
+
+def test_where_no_registration_is_found_auto_says_why(model: Model, view: SampleView) -> None:
+    other = replace(model, names=tuple(f"other_{i}" for i in range(len(model.names))))
+    registrar = Registrar(other, statistical_model_of(model))
+    found = answer(view.depth.to_points(), other, registrar, 32)
+    assert not found.taken and found.registration is None and "they must be of one object" in str(found.refusal)
+    with pytest.raises(ValueError, match="they must be of one object"):
+        answer(view.depth.to_points(), other, replace(registrar, choice="modes"), 32)

@@ -17,16 +17,14 @@ from PIL import Image
 from toy_scene import rest_mesh, toy_scene
 
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.labels import LabelGrid
-from mereo.models.model import Answer, Model
+from mereo.models.model import Model
 from mereo.models.network import Network
-from mereo.reconstruction.pipeline import Reconstruction
 from mereo.training.config import PRESETS
 from mereo.visualization.viewer import display, html
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
-from mereo.visualization.viewer.probe import Inspection
+from mereo.visualization.viewer.probe import Inspection, Probed
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome in PATH")
@@ -35,10 +33,10 @@ needs_browser = pytest.mark.skipif(BROWSER is None, reason="no chromium or chrom
 class Told(Inspection):
     """An inspection whose answers are a closed form: the label is the box that holds a point, or nothing."""
 
-    def ask(self, points: np.ndarray) -> Answer:
+    def ask(self, points: np.ndarray) -> Probed:
         label = np.where(np.abs(points[:, 1]) < 6, 1 + np.clip((points[:, 0] + 18) // 12, 0, 2), 0).astype(np.uint8)
         toward = np.tile([0.0, 0.0, -1.0], (len(points), 1))
-        return Answer(label, np.eye(5)[label], points[:, 2] - 150.0, toward)
+        return Probed(label, points[:, 2] - 150.0, toward, np.eye(5)[label], None)
 
 
 def toy_inspection() -> Told:
@@ -46,11 +44,10 @@ def toy_inspection() -> Told:
     T_camera_rest = np.eye(4)
     T_camera_rest[2, 3] = 150.0
     mesh = rest_mesh().transformed(T_camera_rest)
-    grid = LabelGrid(np.zeros((2, 2, 2), dtype=np.uint8), np.zeros(3), np.ones(3), mesh.names)
     points = np.concatenate([segment.vertices[::2] for segment in mesh.segments])
     cloud = PointCloud(points[points[:, 2] <= 162.0])
     model = Model(Network(PRESETS["tiny"].network, 4).eval(), mesh.names, mesh.colors)
-    return Told(cloud, Reconstruction(mesh, grid, (), {}, 0, False, model.encode(cloud), np.eye(4)), model)
+    return Told(mesh, np.eye(4), model, "closed form, of course", cloud, model.encode(cloud))
 
 
 @pytest.fixture
@@ -67,7 +64,8 @@ def test_the_page_of_a_frame_shows_every_segment_and_answers(tmp_path: Path, ser
     with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (760, 480)) as browser:  # type: ignore[attr-defined]
         until(lambda: "toy <frame>" in browser.text())
         browser.still()
-        assert {"box_0", "box_1", "box_2", "ball", "Probe"} <= set(browser.text().split("\n"))
+        words = {"box_0", "box_1", "box_2", "ball", "Probe", "closed form, of course"}
+        assert words <= set(browser.text().split("\n"))
 
         def all_shown() -> bool:
             shown = browser.screenshot()[:, :420]
@@ -165,12 +163,22 @@ def test_without_viser_one_sentence_names_the_extra(
 
 def test_names_cannot_break_the_panels() -> None:
     name = "<script>x</script>"
-    answer = Answer(
-        np.array([1], dtype=np.uint8), np.array([[0.25, 0.75]]), np.array([-2.0]), np.array([[0.0, 1.0, 0.0]])
+    answer = Probed(
+        np.array([1], dtype=np.uint8),
+        np.array([-2.0]),
+        np.array([[0.0, 1.0, 0.0]]),
+        np.array([[0.25, 0.75]]),
+        np.array([[4.0, 5.0, 6.0]]),
     )
     text = html.answer(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), (1.0, 2.0, 3.0), " mm")
     shown = re.sub(r"<[^>]+>", " ", text)
     assert "<script" not in text + html.chips((name,), ((1, 2, 3),)) + html.heading(name, name) + html.message(name)
-    for told in ("0.75", "2 mm inside the nearest surface", "towards 0, 1, 0", "at 1, 2, 3 mm"):
+    for told in (
+        "0.75",
+        "2 mm inside the nearest surface",
+        "towards 0, 1, 0",
+        "at 1, 2, 3 mm",
+        "at rest at 4, 5, 6 scene units",
+    ):
         assert told in shown
     assert shown.index("0.75") < shown.index("0.25")  # the likeliest first

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mereo.evaluation.scoring import evaluate as evaluate
+    from mereo.fitting.answer import answer as answer
+    from mereo.fitting.register import Registrar as Registrar
     from mereo.geometry.camera import Camera as Camera
     from mereo.geometry.camera import DepthImage as DepthImage
     from mereo.geometry.camera import PointCloud as PointCloud
@@ -37,8 +39,10 @@ _HOME = {
     "DepthImage": "geometry.camera",
     "Model": "models.model",
     "PointCloud": "geometry.camera",
+    "Registrar": "fitting.register",
     "Segment": "geometry.mesh",
     "SegmentedMesh": "geometry.mesh",
+    "answer": "fitting.answer",
     "evaluate": "evaluation.scoring",
     "load_model": "models.weights",
     "load_scene": "scenes.registry",

@@ -103,6 +103,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         (scene_commands.SceneNew, "new"),
         (scene_commands.SceneCheck, "check"),
         (scene_commands.ScenePreview, "preview"),
+        (scene_commands.SceneModes, "modes"),
         (scene_commands.SceneExport, "export"),
     )
     assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from mereo.fitting.config import FitChoice
-from mereo.io.config import FilesConfig, InputConfig
+from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
@@ -162,6 +162,8 @@ class Evaluate:
         noise_std: Gaussian noise on the depth, standard deviation in scene units.
         terms: what else is wrong with the depth image.
         inference: where and how exactly the network computes.
+        fit: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the modes'
+            and the draws' own scores beside it; off the network alone; modes leaves the draws out.
     """
 
     weights: Positional[str]
@@ -174,6 +176,7 @@ class Evaluate:
     noise_std: float = 0.1
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
+    fit: FitChoice = "auto"
 
     def run(self) -> None:
         """Write scores and pictures of their errors, and print the table."""
@@ -185,7 +188,8 @@ class Evaluate:
 
             if settings != GenerateConfig():
                 raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
-            evaluate_on_scans(load_for(self.weights, self.inference), self.output, truths=self.scans)
+            model = load_for(self.weights, self.inference)
+            evaluate_on_scans(model, self.output, truths=self.scans, choice=self.fit)
             return
         evaluate_weights(
             self.weights,
@@ -195,6 +199,7 @@ class Evaluate:
             scene=self.scene,
             settings=settings,
             inference=self.inference,
+            choice=self.fit,
         )
 
 
@@ -212,9 +217,13 @@ class Reconstruct:
         isolation: what of the frame is left out.
         inference: where and how exactly the network computes.
         files: which files, and in which unit.
-        fit: register the object's own deformation model to the frame: off leaves the network's answer; auto takes the
-            registered model where it explains the frame; modes and full take it in any case, full by fitting the draws
-            of the scene as well.
+        fit: register the object's own deformation model to the frame: auto takes the registered model where it explains
+            the frame, if the weights carry one; off leaves the network's answer; modes and full take the model in any
+            case, full by fitting the draws of the scene as well.
+        scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
+        carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
+            glTF), points (PLY, PCD, XYZ, NPY) or CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses).
+        carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
         force: replace an existing output folder.
     """
 
@@ -226,7 +235,10 @@ class Reconstruct:
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
     files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
-    fit: FitChoice = "off"
+    fit: FitChoice = "auto"
+    scene: str | None = None
+    carry: UseAppendAction[tuple[Path, ...]] = ()
+    carry_frame: CarryFrame = "source"
     force: bool = False
 
     def run(self) -> None:
@@ -243,6 +255,9 @@ class Reconstruct:
             inference=self.inference,
             files=self.files,
             choice=self.fit,
+            scene=self.scene,
+            carry=self.carry,
+            carry_frame=self.carry_frame,
             force=self.force,
         )
 

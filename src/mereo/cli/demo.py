@@ -1,4 +1,7 @@
-"""``mereo demo``: a real range scan and two rendered depth frames, back to segments, compared with the truth."""
+"""``mereo demo``: a real range scan and two rendered depth frames, back to segments, compared with the truth.
+
+Network and registered model stand side by side; what is written is the answer that `mereo reconstruct` gives.
+"""
 
 import time
 from collections.abc import Callable, Iterator
@@ -6,21 +9,31 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import UInt8
 from rich.console import Console
 from rich.table import Table
 
+from mereo.cli.reconstruct import facts_of
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
+from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import bunny_posed
-from mereo.evaluation.scoring import grid_confusion, predict_grid
+from mereo.evaluation.scoring import predict_grid
+from mereo.fitting.answer import Answer, answer_frame
+from mereo.fitting.register import Registrar, registrar_for
+from mereo.fitting.registration_state import write_state
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.solids import label_grid
+from mereo.io.atomic_files import new_directory
+from mereo.io.config import DEFAULT_FILES
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct, segment_names
+from mereo.reconstruction.pipeline import Reconstruction, encode_frame, extract, segment_names
 from mereo.scenes.assets import AssetUnavailable
-from mereo.visualization.result_files import write_reconstruction
+from mereo.visualization.result_files import write_files
 
 REAL_SCAN = "bun000"
 FRAMES = ("liver", "rope")
@@ -60,6 +73,14 @@ class Case:
     truth: TruthGrid
 
 
+@dataclass(frozen=True, eq=False)
+class Column:
+    """Scores of one answer to a case, and the seconds that it took from the cloud on."""
+
+    scores: Scores
+    seconds: float
+
+
 def main(output: str | Path = Path("out/demo")) -> None:
     """Reconstruct every input that can be had, print tables, and write a folder each below ``output``."""
     console, started = Console(), time.perf_counter()
@@ -97,31 +118,58 @@ def _frame_case(name: str) -> Case:
 
 
 def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
-    result = reconstruct(case.cloud, model, RESOLUTION, case.frame)
+    """Reconstruct a case, print network and fit beside the truth, and write the folder of the default answer."""
+    seen = encode_frame(case.cloud, model, case.frame)
+    network, registrar = extract(seen, model, RESOLUTION), registrar_for(model, "auto")
+    columns = {"network": Column(_scores(case, model, predict_grid(model, seen.code, case.truth)), seconds_of(network))}
+    found, started = Answer(network), time.perf_counter()
+    if registrar is not None:
+        found = answer_frame(seen, model, registrar, RESOLUTION)
+        seconds = sum(seen.timings_s.values()) + time.perf_counter() - started
+        if found.registration is not None:
+            labels = label_grid(found.registration.mesh, *case.truth.grid.axes())
+            columns["fit"] = Column(_scores(case, model, labels), seconds)
+    console.print(_table(case, found.reconstruction, columns))
     started = time.perf_counter()
-    write_reconstruction(
-        result, case.cloud, folder, frame=case.frame, force=True, title=case.title, weights=case.weights
-    )
+    _write(case, found, registrar, folder)
     written_s = time.perf_counter() - started
-    predicted = predict_grid(model, result.code, case.truth)
-    scores = intersection_over_union(
-        grid_confusion(case.truth, predicted, len(segment_names(model)[0])), model.segmented
-    )
-    console.print(_table(case, result, scores))
-    stages = {**result.timings_s, "write": written_s}
-    seconds = ", ".join(f"{stage} {value:.1f} s" for stage, value in stages.items())
-    console.print(f"{len(case.cloud)} points; {seconds}", highlight=False, soft_wrap=True)
-    console.print(f"look at {folder / 'report.html'}\n", highlight=False, soft_wrap=True)
+    line = f"{len(case.cloud)} points; written in {written_s:.1f} s; look at {folder / 'report.html'}\n"
+    console.print(line, highlight=False, soft_wrap=True)
 
 
-def _table(case: Case, result: Reconstruction, scores: Scores) -> Table:
+def _write(case: Case, found: Answer, registrar: Registrar | None, folder: Path) -> None:
+    """Say which answer it is, and write its folder."""
+    facts: dict[str, object] = {"title": case.title, "weights": case.weights}
+    if registrar is None:
+        print(f"the network's answer: the weights {case.weights!r} carry no statistical model that could be registered")
+    else:
+        facts["registration"] = facts_of(found)
+    with new_directory(folder, force=True) as directory:
+        write_files(directory, found.reconstruction, case.cloud, case.frame, DEFAULT_FILES, 1.0, facts)
+        write_state(directory, found, registrar, case.weights, case.frame, 1.0)
+
+
+def _scores(case: Case, model: Model, predicted: UInt8[np.ndarray, "x y z"]) -> Scores:
+    confusion = grid_confusion(case.truth, predicted, len(segment_names(model)[0]))
+    return intersection_over_union(confusion, model.segmented)
+
+
+def seconds_of(result: Reconstruction) -> float:
+    """Seconds of all stages of a reconstruction."""
+    return sum(result.timings_s.values())
+
+
+def _table(case: Case, result: Reconstruction, columns: dict[str, Column]) -> Table:
+    """Table of the scores of each segment by network and fit, and of what is written."""
     table = Table(title=case.title, title_justify="left")
-    table.add_column("segment")
-    for column in ("IoU with the truth", "confidence", "volume"):
+    table.add_column("IoU with the truth")
+    for column in (*columns, "confidence", "volume"):
         table.add_column(column, justify="right")
-    for found, iou in zip(result.segments, scores.per_segment, strict=True):
-        table.add_row(found.name, f"{iou:.3f}", f"{found.confidence:.2f}", f"{found.volume:.4g}")
+    each = [column.scores.per_segment for column in columns.values()]
+    for found, *ious in zip(result.segments, *each, strict=True):
+        table.add_row(found.name, *(f"{iou:.3f}" for iou in ious), f"{found.confidence:.2f}", f"{found.volume:.4g}")
     table.add_section()
-    table.add_row("all as one (IoU)", f"{scores.iou:.3f}", "", "")
-    table.add_row("mean of segments (mIoU)", f"{scores.miou:.3f}", "", "")
+    table.add_row("all as one (IoU)", *(f"{column.scores.iou:.3f}" for column in columns.values()))
+    table.add_row("mean of segments (mIoU)", *(f"{column.scores.miou:.3f}" for column in columns.values()))
+    table.add_row("seconds", *(f"{column.seconds:.1f}" for column in columns.values()))
     return table

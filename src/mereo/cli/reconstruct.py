@@ -1,26 +1,29 @@
 """``mereo reconstruct``: one frame of a sensor to a folder of results."""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
+from mereo.fitting.answer import Answer, answer
+from mereo.fitting.carry import Carried, Placed, place
+from mereo.fitting.carry import carry as carry_one
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import describe, register, registered
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import CloudAxes
+from mereo.fitting.register import Registrar, describe, registrar_for
+from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import new_directory
-from mereo.io.config import DEFAULT_FILES, FilesConfig, InputConfig
+from mereo.io.attachments import read_attachments
+from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
-from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import STRAY_SHARE, stray_share
 from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.reconstruction.pipeline import Reconstruction
 from mereo.visualization.result_files import write_files
 
 
@@ -34,7 +37,10 @@ def reconstruct_file(
     isolation: IsolationConfig = IsolationConfig(),  # noqa: B008
     inference: InferenceConfig = InferenceConfig(),  # noqa: B008
     files: FilesConfig = DEFAULT_FILES,
-    choice: FitChoice = "off",
+    choice: FitChoice = "auto",
+    scene: str | None = None,
+    carry: Sequence[str | Path] = (),
+    carry_frame: CarryFrame = "source",
     force: bool = False,
 ) -> Reconstruction:
     """Read one frame of a sensor, reconstruct it, write a new directory, print what was found: ``mereo reconstruct``.
@@ -49,12 +55,18 @@ def reconstruct_file(
         inference: where and how exactly the network computes.
         files: which files are written, and in which unit.
         choice: whether the network answers, or the registered model.
+        scene: whose draws are fitted, where it is not the built-in one that the weights were trained on.
+        carry: files of what is defined in the rest model, to be brought to where the object is.
+        carry_frame: their frame and unit: of the object's own files, or of its scene.
         force: replace an existing folder.
 
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``read_frame``, ``find_object`` and
-    ``reconstruct`` do.
+    ``reconstruct`` do, and ``ValueError`` for ``carry`` without a registration.
     """
     formats = chosen_formats(files.formats)  # a missing extra is said before the work, not after
+    attachments = read_attachments(carry)
+    if attachments and choice == "off":
+        raise ValueError("--fit is off, but --carry needs a registration, along which things move: use --fit auto")
     with new_directory(output, force) as directory:
         frame = read_frame(input, reading)
         seen = find_object(frame, isolation)
@@ -66,34 +78,65 @@ def reconstruct_file(
         warning = size_warning(seen, model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
-        result = reconstruct(seen.cloud, model, resolution, frame.axes, label_points="points" in formats)
+        registrar = Registrar.of(model, choice, scene) if attachments else registrar_for(model, choice, scene)
+        placed = place(attachments, registrar, carry_frame) if registrar is not None else ()
+        found = answer(
+            seen.cloud,
+            model,
+            registrar,
+            resolution,
+            frame.axes,
+            label_points="points" in formats,
+            stated_unit=None if registrar is None else registrar.stated_unit(frame.unit_m),
+        )
+        result = found.reconstruction
         facts: dict[str, object] = {
             "title": frame.source,
             "weights": str(weights),
             "resolution": resolution,
             "points": len(seen.cloud),
         }
-        if choice != "off":
-            result, facts["registration"] = _registered(result, seen.cloud, model, choice, frame.axes)
+        if registrar is not None:
+            facts["registration"] = facts_of(found)
         facts |= {"device": model.device.type, "precision": model.working_precision}
-        write_files(directory, result, seen.cloud, frame.axes, files, frame.unit_m, {**facts, **seen.facts()})
+        carried = carried_along(placed, found)
+        if carried:
+            facts["carried"] = [one.facts() for one in carried]
+        write_files(directory, result, seen.cloud, frame.axes, files, frame.unit_m, {**facts, **seen.facts()}, carried)
     print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result
 
 
-def _registered(
-    result: Reconstruction, cloud: PointCloud, model: Model, choice: FitChoice, axes: CloudAxes
-) -> tuple[Reconstruction, dict[str, object]]:
-    """The registered model, or the network's answer where "auto" does not believe it; says which, and the facts."""
-    registration = register(result, cloud, model, choice)
-    taken = registration.accepted or choice != "auto"
+def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...]:
+    """What is carried, in the input's frame and unit, one printed line each; ``ValueError`` without a registration."""
+    if placed and (found.registration is None or not found.taken):
+        raise ValueError(
+            "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
+            "cloud what is not the object, or take the registered model in any case with --fit modes"
+        )
+    if found.registration is None:
+        return ()
+    here = found.registration.moved(inverse_rigid(found.reconstruction.T_camera_input))
+    carried = tuple(carry_one(one, here) for one in placed)
+    for one in carried:
+        outside = len(one.content.points) - one.inside
+        away = f"{outside} of them outside, up to {one.farthest:.4g} away" if outside else "all inside"
+        print(f"carried {one.name}: {len(one.content.points)} points, {away}")
+    return carried
+
+
+def facts_of(found: Answer) -> dict[str, object]:
+    """Facts about where an answer comes from, for the summary; also printed in one line."""
+    source, registration = "registration" if found.taken else "network", found.registration
+    if registration is None:
+        print(f"the network's answer, as no registration was found: {found.refusal}")
+        return {"answer": source, "refusal": found.refusal}
     explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
-    print(explained if taken else f"{explained}: too little, the network's answer is kept")
-    if taken and not registration.accepted:
+    print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
+    if found.taken and not registration.accepted:
         print("that is too little to believe it: --fit auto keeps the network's answer")
-    facts = {"answer": "registration" if taken else "network", **describe(registration)}
-    return (registered(result, registration, model, axes) if taken else result), facts
+    return {"answer": source, **describe(registration)}
 
 
 def print_segments(result: Reconstruction, title: str) -> None:

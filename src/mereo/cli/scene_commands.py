@@ -98,6 +98,28 @@ class ScenePreview:
 
 
 @dataclass(frozen=True)
+class SceneModes:
+    """Draw the modes in which an object deforms, and say how many its states need.
+
+    Attributes:
+        scene: a name from `mereo scene list`, a scene file of your own (.yaml, .py), or weights that carry a model
+            (.safetensors).
+        output: the picture, a PNG file; without it only the numbers are printed.
+        states: random states from which the model of a scene is built.
+    """
+
+    scene: Positional[str]
+    output: Path | None = None
+    states: int = 1500
+
+    def run(self) -> None:
+        """Print how many modes are needed, and write the picture."""
+        from mereo.cli.modes import show_modes
+
+        show_modes(self.scene, self.output, self.states)
+
+
+@dataclass(frozen=True)
 class SceneExport:
     """Write a scene's segments at rest, in scene units: to look at, or to pick points in for `mereo align`.
 

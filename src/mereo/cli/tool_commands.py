@@ -5,6 +5,7 @@ See ``mereo.cli.commands`` for how commands are written.
 
 import os
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -72,9 +73,11 @@ class ViewCommand:
     """Look at a frame and its reconstruction in a browser, or move a scene by hand (--scene): needs the extra `view`.
 
     Attributes:
-        input: a point cloud or depth image, as for `mereo reconstruct`; without it (and --scene) a shipped frame.
-        weights: a shipped name or a file; by default those that are shipped for the frame or the scene.
+        input: a point cloud or depth image, as for `mereo reconstruct`, or a result of it with a registered model (the
+            folder, or its state.json); without it (and --scene) a shipped frame.
+        weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
         scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
+        state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
         port: where the page is, on this machine only (127.0.0.1); 0 takes any that is free.
         resolution: grid cells along the longest side.
         reading: how the frame is read.
@@ -85,6 +88,7 @@ class ViewCommand:
     input: Positional[Path | None] = None
     weights: str | None = None
     scene: str | None = None
+    state: Path | None = None
     port: int = 8080
     resolution: int = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
@@ -93,18 +97,20 @@ class ViewCommand:
 
     def run(self) -> None:
         """Open the page of a frame or of a scene, and keep it until Ctrl-C."""
-        from mereo.visualization.viewer.serve import view_frame, view_scene
+        from mereo.fitting.state_file import is_state
+        from mereo.visualization.viewer.serve import view_frame, view_scene, view_state
 
+        input, state = (None, self.input) if self.state is None and is_state(self.input) else (self.input, self.state)
         if self.scene is not None:
-            if self.input is not None:
-                raise ValueError(f"both {self.input} and --scene {self.scene} are given; one can be shown: drop one")
-            view_scene(self.scene, self.weights, port=self.port, inference=self.inference)
+            if input is not None:
+                raise ValueError(f"both {input} and --scene {self.scene} are given; one can be shown: drop one")
+            view_scene(self.scene, self.weights, state=state, port=self.port, inference=self.inference)
             return
-        view_frame(
-            self.input,
+        show = partial(view_frame, resolution=self.resolution) if state is None else partial(view_state, state)
+        show(
+            input,
             self.weights,
             port=self.port,
-            resolution=self.resolution,
             reading=self.reading,
             isolation=self.isolation,
             inference=self.inference,

@@ -3,20 +3,30 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.registration.truth_file import read_truth
+from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scans import SCANS, PosedScan, bunny_posed
-from mereo.evaluation.scoring import CELLS, Evaluation, TestCase, check_names, score_cases
+from mereo.evaluation.scoring import CELLS, TestCase, check_names, score_cases
+from mereo.fitting.config import FitChoice
+from mereo.fitting.register import registrar_for
 from mereo.models.model import Model
+from mereo.scenes.statistical_model import StatisticalModel
 
 
-def evaluate_scans(model: Model, *, truths: Sequence[str | Path] = (), cells: int = CELLS) -> Evaluation:
+def evaluate_scans(
+    model: Model, *, truths: Sequence[str | Path] = (), cells: int = CELLS, choice: FitChoice = "auto"
+) -> Evaluation:
     """Scores of a model on real scans.
 
     Args:
         model: the trained model.
         truths: truth files, or their folders, of ``mereo align``; none means the four scans of the bunny.
         cells: cells of the grid along each axis.
+        choice: which answer is scored: by default what a user gets, and beside it all others that can be had.
 
     Raises ``ValueError`` for another object's model or two scans of one name, ``FileNotFoundError`` for a missing file,
     and ``AssetUnavailable`` where a scan of the bunny cannot be had.
@@ -29,9 +39,16 @@ def evaluate_scans(model: Model, *, truths: Sequence[str | Path] = (), cells: in
         )
     for scan in scans:
         check_names(model, scan.truth.names)
-    return score_cases(model, lambda index: _case(scans[index], cells), len(scans), progress=False)
+    registrar = registrar_for(model, choice)
+    return score_cases(model, lambda index: _case(scans[index], cells), len(scans), False, registrar)
 
 
 def _case(scan: PosedScan, cells: int) -> TestCase:
     cloud, truth, _ = scan.in_camera()
-    return TestCase(scan.name, cloud, truth_grid(truth, cells))
+    vertices = np.concatenate([segment.vertices for segment in truth.segments])
+
+    def material(model: StatisticalModel) -> Float[np.ndarray, "m 3"]:
+        """The vertices, which come first among the material points of a model of the same meshes."""
+        return vertices if sum(model.vertex_counts) == len(vertices) else np.empty((0, 3))
+
+    return TestCase(scan.name, cloud, truth_grid(truth, cells), scan.scene_unit, material)

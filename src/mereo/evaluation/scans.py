@@ -91,12 +91,14 @@ class PosedScan:
         cloud: the scan, in its own frame and unit.
         truth: the segments, in the same.
         frame: axes of both: "camera" (x right, y down, z forward from the camera at the origin) or "scanner".
+        scene_unit: length of a unit of the object's scene in the scan's unit, where it is known.
     """
 
     name: str
     cloud: PointCloud
     truth: SegmentedMesh
     frame: CloudAxes
+    scene_unit: float | None = None
 
     def in_camera(self) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
         """Scan and truth in a camera frame, in the scan's unit, and ``T_camera_scan``."""
@@ -107,7 +109,9 @@ class PosedScan:
 
 def bunny_posed(name: str) -> PosedScan:
     """Real scan of the bunny with its truth; raises as ``bunny_scan`` does."""
-    return PosedScan(name, bunny_scan(name)[0], bunny_truth(name), "scanner")
+    from mereo.scenes.builtin.bunny import model_to_scene
+
+    return PosedScan(name, bunny_scan(name)[0], bunny_truth(name), "scanner", 1 / model_to_scene()[1])
 
 
 def scan_in_camera(name: str) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:

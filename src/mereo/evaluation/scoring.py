@@ -5,28 +5,33 @@ model, and those outside every segment's enlarged box are dropped. One confusion
 IoU and mIoU come from it, and the mean over single examples is reported beside it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from rich.console import Console
 from rich.progress import track
 
+from mereo.evaluation.candidates import Candidates, RegistrationErrors, find_candidates, names_for, network_labels
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import Scores, confusion_matrix, format_score, intersection_over_union
+from mereo.evaluation.metrics import Scores, intersection_over_union
+from mereo.evaluation.results import EvaluatedView, Evaluation, Tally, grid_confusion
+from mereo.fitting.config import FitChoice
+from mereo.fitting.register import Registrar, registrar_for
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
+from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.models.model import EncodedCloud, Model
-from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 from mereo.reconstruction.pipeline import segment_names
+from mereo.scenes.random_states import state_points
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.scene import SCENES, Scene, State
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.examples import sample_view
+from mereo.synthesis.examples import View, sample_view
 
 KEPT_VIEWS = 4
 """Number of examples, the first ones, that keep their labels and are drawn with their errors."""
@@ -46,6 +51,9 @@ class TestCase:
         name: name in tables, different from other cases' of the set.
         cloud: what the model is given.
         truth: true labels on a grid.
+        scene_unit: length of a scene unit in the cloud's unit, where it is known.
+        material: true places of a statistical model's material points, or of the first of them, in the cloud's frame
+            and unit; None where no correspondence is known.
     """
 
     __test__ = False  # not a test, whatever pytest thinks of the name
@@ -53,78 +61,17 @@ class TestCase:
     name: str
     cloud: PointCloud
     truth: TruthGrid
-
-
-@dataclass(frozen=True, eq=False)
-class EvaluatedView:
-    """View with its true and its predicted labels: a row of the paper's figure of reconstructions.
-
-    Attributes:
-        name: label at the left of the row.
-        cloud: what the model was given.
-        reference: true labels; 0 is empty space.
-        predicted: labels by the model, on the same grid.
-        origin: centre of voxel [0, 0, 0] in the cloud's frame; that of [i, j, k] is ``origin + [i, j, k] * spacing``.
-        spacing: distances of the voxels' centres along each axis.
-        colors: colours of the segments; label k has ``colors[k - 1]``.
-    """
-
-    name: str
-    cloud: PointCloud
-    reference: UInt8[np.ndarray, "x y z"]
-    predicted: UInt8[np.ndarray, "x y z"]
-    origin: Float[np.ndarray, "3"]
-    spacing: Float[np.ndarray, "3"]
-    colors: Sequence[Color]
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """Result of a test set: its confusion matrix, from which its scores come, and the scores of each example.
-
-    Attributes:
-        names: names of the segments.
-        confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
-        examples: scores of each test case by its name.
-        views: the first few with their labels, for pictures.
-        segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
-    """
-
-    names: tuple[str, ...]
-    confusion: Int[np.ndarray, "c c"]
-    examples: dict[str, Scores]
-    views: tuple[EvaluatedView, ...] = field(default=())
-    segmented: bool = True
-
-    @property
-    def scores(self) -> Scores:
-        """Scores over the whole set, from its one confusion matrix."""
-        return intersection_over_union(self.confusion, self.segmented)
-
-    @property
-    def example_mean(self) -> tuple[float, float]:
-        """Mean IoU and mean mIoU over the examples; NaN where no example has a mIoU."""
-        each = self.examples.values()
-        mious = [s.miou for s in each if not np.isnan(s.miou)]
-        return float(np.mean([s.iou for s in each])), float(np.mean(mious)) if mious else float("nan")
+    scene_unit: float | None = None
+    material: Callable[[StatisticalModel], Float[np.ndarray, "m 3"]] | None = None
 
 
 # --- one cloud -------------------------------------------------------------------------------------------------------
 
 
 def predict_grid(model: Model, seen: PointCloud | EncodedCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
-    """Labels by the model on the grid of ``truth``, evaluated coarse to fine; ``seen`` is a cloud, or its code."""
+    """Labels by the network on the grid of ``truth``; ``seen`` is a cloud, or its code."""
     code = seen if isinstance(seen, EncodedCloud) else model.encode(seen)
-    logits = partial(model.logits, code)
-    grid = truth.grid
-    x, y, z = grid.labels.shape
-    return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
-
-
-def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segments: int) -> Int[np.ndarray, "c c"]:
-    """Confusion matrix of the points that count; where the model knows one segment, all true ones are taken as one."""
-    labels = np.minimum(truth.grid.labels[truth.kept], segments)
-    return confusion_matrix(labels, predicted[truth.kept], segments + 1)
+    return network_labels(model, code, truth.grid)
 
 
 def grid_scores(model: Model, seen: PointCloud | EncodedCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
@@ -159,6 +106,7 @@ def evaluate(
     cells: int = CELLS,
     progress: bool = False,
     settings: GenerateConfig | None = None,
+    choice: FitChoice = "auto",
 ) -> Evaluation:
     """Scores of a model on synthetic views of a scene, seen as in training: through a noisy depth image.
 
@@ -170,6 +118,7 @@ def evaluate(
         cells: cells of the grid along each axis.
         progress: whether to show a bar with the time left.
         settings: the camera (image size, noise, sensor); by default the paper's.
+        choice: which answer is scored: by default what a user gets, and beside it all others that can be had.
 
     Raises ``ValueError`` for a training seed, no examples, or another object than the model's.
     """
@@ -180,9 +129,9 @@ def evaluate(
     if scene is None or isinstance(scene, str):
         scene = load_scene(scene or trained_scene(model))
     check_names(model, scene.rest.names)
-    return score_cases(
-        model, partial(_scene_case, scene, settings or GenerateConfig(), seed, cells), examples, progress
-    )
+    case = partial(_scene_case, scene, settings or GenerateConfig(), seed, cells)
+    unit_mm = None if scene.unit_m is None else 1000 * scene.unit_m
+    return replace(score_cases(model, case, examples, progress, registrar_for(model, choice, scene)), unit_mm=unit_mm)
 
 
 def trained_scene(model: Model) -> str:
@@ -200,29 +149,68 @@ def trained_scene(model: Model) -> str:
 
 def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, index: int) -> TestCase:
     view = sample_view(scene.for_seed(seed), settings, example_rng(seed, index))
-    return TestCase(f"{scene.name} {index}", view.depth.to_points(), truth_grid(view.mesh, cells))
+    name = f"{scene.name} {index}"
+    return TestCase(name, view.depth.to_points(), truth_grid(view.mesh, cells), 1.0, partial(_true_material, view))
 
 
-def score_cases(model: Model, case: Callable[[int], TestCase], count: int, progress: bool) -> Evaluation:
-    """Scores of a model on ``case(0) ... case(count - 1)``, which are made one at a time, as they may be large."""
+def _true_material(view: View, model: StatisticalModel) -> Float[np.ndarray, "m 3"]:
+    """Where a view's state has moved the material points of its object, camera frame."""
+    state = State(view.mesh.transformed(view.T_world_camera), view.deformations)
+    return transform_points(inverse_rigid(view.T_world_camera), state_points(state, model.nodes, model.node_labels))
+
+
+def score_cases(
+    model: Model,
+    case: Callable[[int], TestCase],
+    count: int,
+    progress: bool,
+    registrar: Registrar | None = None,
+) -> Evaluation:
+    """Scores on ``case(0) ... case(count - 1)``, which are made one at a time, as they may be large.
+
+    Args:
+        model: the trained model.
+        case: test case by its number.
+        count: how many.
+        progress: whether to show a bar with the time left.
+        registrar: of the model's object; None scores the network alone.
+    """
     names, colors = segment_names(model)
-    total = np.zeros((len(names) + 1,) * 2, dtype=np.int64)
     examples: dict[str, Scores] = {}
     views: list[EvaluatedView] = []
-    for one, code, predicted in _predictions(model, case, count, progress):
-        confusion = grid_confusion(one.truth, predicted, len(names))
-        total += confusion
-        examples[one.name] = intersection_over_union(confusion, model.segmented)
+    tallies = {name: Tally() for name in names_for(registrar)}
+    answer, sources, errors = Tally(), [], []
+    for index in track(range(count), "evaluating", console=Console(stderr=True), disable=not progress):
+        one = case(index)
+        found = find_candidates(model, one.cloud, one.truth.grid, registrar, one.scene_unit)
+        for name, tally in tallies.items():
+            tally.add(one.truth, found.each[name], len(names), model.segmented)
+        answer.add(one.truth, found.answer, len(names), model.segmented)
+        examples[one.name] = answer.examples[-1]
+        sources.append(found.source)
+        registration = found.answer.registration
+        if registration is not None and one.material is not None and one.scene_unit is not None:
+            truth = one.material(registration.model)
+            errors.append(RegistrationErrors.of(registration, truth, one.cloud, one.scene_unit))
         if len(views) < KEPT_VIEWS:
-            views.append(_evaluated_view(one, model, code, colors))
-    return Evaluation(names, total, examples, tuple(views), model.segmented)
+            views.append(_evaluated_view(one, model, found, colors))
+    return Evaluation(
+        names=names,
+        confusion=answer.confusion,
+        examples=examples,
+        views=tuple(views),
+        segmented=model.segmented,
+        answers={name: tally.scores for name, tally in tallies.items()},
+        sources=tuple(sources),
+        errors=RegistrationErrors.together(errors) if errors else None,
+    )
 
 
-def _evaluated_view(one: TestCase, model: Model, code: EncodedCloud, colors: Sequence[Color]) -> EvaluatedView:
-    """Truth and prediction on the truth's grid and ``PICTURE_MARGIN`` cells around it."""
+def _evaluated_view(one: TestCase, model: Model, found: Candidates, colors: Sequence[Color]) -> EvaluatedView:
+    """Truth and answer on the truth's grid and ``PICTURE_MARGIN`` cells around it."""
     wide = _widened(one.truth)
     reference = np.minimum(wide.grid.labels, np.uint8(len(colors)))
-    predicted = predict_grid(model, code, wide)
+    predicted = found.answer.labels_on(wide.grid, model, found.code)
     return EvaluatedView(one.name, one.cloud, reference, predicted, wide.grid.origin, wide.grid.spacing, colors)
 
 
@@ -231,46 +219,3 @@ def _widened(truth: TruthGrid) -> TruthGrid:
     grid = truth.grid
     labels, kept = (np.pad(values, PICTURE_MARGIN) for values in (grid.labels, truth.kept))
     return TruthGrid(replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing), kept)
-
-
-def _predictions(
-    model: Model, case: Callable[[int], TestCase], count: int, progress: bool
-) -> Iterator[tuple[TestCase, EncodedCloud, UInt8[np.ndarray, "x y z"]]]:
-    for index in track(range(count), "evaluating", console=Console(stderr=True), disable=not progress):
-        one = case(index)
-        code = model.encode(one.cloud)
-        yield one, code, predict_grid(model, code, one.truth)
-
-
-# --- results ---------------------------------------------------------------------------------------------------------
-
-
-def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
-    """Content of ``metrics.json``: ``facts`` first, then definition, scores and confusion matrix."""
-    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
-    return {
-        **facts,
-        "examples": len(evaluation.examples),
-        "definition": f"{CELLS}^3 cell centres of the joint box, kept inside any segment's box enlarged by 50 %; one "
-        "confusion matrix over the set; miou is the mean over the segments without empty space",
-        "iou": scores.iou,
-        "miou": scores.miou,
-        "per_segment": dict(zip(evaluation.names, scores.per_segment.tolist(), strict=True)),
-        "example_mean": {"iou": iou, "miou": miou},
-        "per_example": {name: {"iou": each.iou, "miou": each.miou} for name, each in evaluation.examples.items()},
-        "confusion": evaluation.confusion,
-    }
-
-
-def markdown_table(evaluation: Evaluation) -> str:
-    """Markdown table of the whole set and the mean over its examples; a dash where a score is undefined."""
-    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
-    names = " | ".join(evaluation.names)
-    values = " | ".join(format_score(value) for value in scores.per_segment)
-    blank = " | ".join("" for _ in evaluation.names)
-    return (
-        f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
-        f"|---|---|---|{'---|' * len(evaluation.names)}\n"
-        f"| whole set | {format_score(scores.iou)} | {format_score(scores.miou)} | {values} |\n"
-        f"| mean over examples | {format_score(iou)} | {format_score(miou)} | {blank} |\n"
-    )

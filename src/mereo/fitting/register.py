@@ -1,52 +1,152 @@
-"""From a network's reconstruction to the registered one: the model's own segments, where the frame shows them.
+"""The object's own deformation model, registered to frames: set up once for an object, asked for every frame.
 
-Reconstruction -fit-> Registration -segments, labels-> Reconstruction
+EncodedFrame -Registrar-> Registration
 """
 
-from dataclasses import replace
-
-import numpy as np
-from jaxtyping import Float, UInt8
+from dataclasses import dataclass
+from functools import cached_property
 
 from mereo.fitting.config import FitChoice
-from mereo.fitting.fit import fit
+from mereo.fitting.fit import ModesFit, fit_frame
 from mereo.fitting.playback import DrawnStates
-from mereo.fitting.registration import Registration, nearest_labels
+from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import transform_points
-from mereo.models.model import Model
-from mereo.reconstruction.isosurfaces import Extraction
-from mereo.reconstruction.pipeline import Reconstruction, turned_back
-from mereo.reconstruction.segment_statistics import measure
+from mereo.models.model import EncodedCloud, Model
+from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.random_states import built_in_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES
+from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 
-def register(
-    result: Reconstruction, cloud: PointCloud | Float[np.ndarray, "n 3"], model: Model, choice: FitChoice = "auto"
-) -> Registration:
-    """Registration of the object's own deformation model to the cloud of a reconstruction.
+@dataclass(frozen=True, eq=False)
+class Registrar:
+    """Registers one object's deformation model to frames.
 
-    Args:
-        result: of ``mereo.reconstruct``, whose encoded cloud is asked again.
-        cloud: the same points, in the input's frame and unit.
-        model: the weights.
-        choice: "full" fits the draws of the weights' built-in scene as well; all others the modes alone.
-
-    Returns the registration in the camera frame (``result.T_camera_input``), in the input's unit. Raises ``ValueError``
-    where the weights carry no statistical model and know no built-in scene.
+    Attributes:
+        network: the weights, from whose correspondences a fit starts.
+        model: statistical model of the same object.
+        choice: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
+            misfit; "auto" the draws only where the modes do not explain the cloud and the scene is at hand.
+        given: the object's scene, where it is not the built-in one that the weights were trained on.
     """
-    points = np.asarray(cloud.points if isinstance(cloud, PointCloud) else cloud, dtype=np.float64)
-    seen = PointCloud(transform_points(result.T_camera_input, points))
-    states = statistical_model_of(model)
-    drawn = DrawnStates.of(load_scene(_scene_name(model)), states) if choice == "full" else None
-    return fit(seen, model, states, states=drawn, code=result.code)
+
+    network: Model
+    model: StatisticalModel
+    choice: FitChoice = "auto"
+    given: Scene | None = None
+
+    @classmethod
+    def of(cls, network: Model, choice: FitChoice = "auto", scene: Scene | str | None = None) -> "Registrar":
+        """Registrar of the model that the weights carry, or of that of their built-in scene, which takes seconds.
+
+        Args:
+            network: the weights.
+            choice: which description of the states is fitted.
+            scene: the object's scene, its name or its file, where it is not the built-in one of the weights.
+
+        Raises ``ValueError`` where the weights carry no statistical model and know no built-in scene, and where
+        ``choice`` is "full" without a scene or with one of another object.
+        """
+        given = load_scene(scene) if isinstance(scene, str) else scene
+        result = cls(network, statistical_model_of(network), choice, given)
+        if choice == "full" and result.scene is None:
+            raise ValueError(
+                f"the weights were trained on {network.provenance.get('scene')!r}, which is no built-in scene; the fit "
+                "of a scene's draws plays it: name its file with --scene, or use --fit modes"
+            )
+        return result
+
+    @cached_property
+    def scene(self) -> Scene | None:
+        """Scene whose draws can be played: the given one, or the built-in one of the weights; None where neither is.
+
+        Raises ``ValueError`` for a given scene of another object, and ``AssetUnavailable`` where its mesh cannot be
+        had.
+        """
+        name = str(self.network.provenance.get("scene"))
+        scene = self.given if self.given is not None else load_scene(name) if name in SCENES else None
+        if scene is not None and not same_topology(scene, self.model):
+            if self.given is None:
+                return None
+            raise ValueError(
+                f"the scene {scene.name!r} has other segments or meshes than the weights' own model; its draws move "
+                "other vertices: name the scene that the weights were trained on, or use --fit modes"
+            )
+        return scene
+
+    @cached_property
+    def states(self) -> DrawnStates | None:
+        """Random states of the scene, among which a fit of its draws starts; they take seconds once."""
+        return None if self.scene is None else DrawnStates.of(self.scene, self.model)
+
+    def stated_unit(self, unit_m: float) -> float | None:
+        """Length of a scene unit in a cloud's unit of ``unit_m`` metres; None where the object's size is not known."""
+        frame = self.model.source_frame
+        return None if frame is None or frame.unit_m is None else frame.unit_m / unit_m
+
+    def fit_modes(
+        self,
+        seen: PointCloud,
+        code: EncodedCloud | None = None,
+        scene_unit: float | None = None,
+        stated_unit: float | None = None,
+    ) -> ModesFit:
+        """Fit of the modes; raises ``ValueError`` as ``fit_frame`` does."""
+        return fit_frame(seen, self.network, self.model, scene_unit, code=code, stated_unit=stated_unit)
+
+    def register(
+        self,
+        seen: PointCloud,
+        code: EncodedCloud | None = None,
+        scene_unit: float | None = None,
+        stated_unit: float | None = None,
+    ) -> Registration:
+        """Registration of the model to a cloud, as ``choice`` says.
+
+        Args:
+            seen: observed points, camera frame, any unit.
+            code: what ``network`` made of them, where it is known already.
+            scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
+            stated_unit: the same as the input states it, believed only where the network's own estimate agrees.
+
+        Raises ``ValueError`` as ``fit_frame`` does.
+        """
+        return self.finish(self.fit_modes(seen, code, scene_unit, stated_unit))
+
+    def finish(self, fitted: ModesFit) -> Registration:
+        """The answer from a fit of the modes: the draws too where ``choice`` asks for them."""
+        if self.choice == "full":
+            states = self.states
+        else:
+            states = self._at_hand if self.choice == "auto" and not fitted.explains else None
+        return fitted.registration() if states is None else fitted.with_draws(states)
+
+    @cached_property
+    def _at_hand(self) -> DrawnStates | None:
+        try:
+            return self.states
+        except AssetUnavailable:  # the weights carry all that the modes need; without the scene's mesh they have to do
+            return None
+
+
+def registrar_for(model: Model, choice: FitChoice, scene: Scene | str | None = None) -> Registrar | None:
+    """Registrar for a choice; None where the network alone answers: "auto" needs weights that carry a model."""
+    if choice == "off" or (choice == "auto" and model.statistical_model is None):
+        return None
+    return Registrar.of(model, choice, scene)
+
+
+def same_topology(scene: Scene, model: StatisticalModel) -> bool:
+    """Whether a scene's rest meshes have the names and numbers of vertices and faces of a model's."""
+
+    def sizes(mesh: SegmentedMesh) -> list[tuple[str, int, int]]:
+        return [
+            (name, len(part.vertices), len(part.faces)) for name, part in zip(mesh.names, mesh.segments, strict=True)
+        ]
+
+    return sizes(scene.rest) == sizes(model.rest)
 
 
 def statistical_model_of(model: Model) -> StatisticalModel:
@@ -55,55 +155,10 @@ def statistical_model_of(model: Model) -> StatisticalModel:
     if found is None:
         raise ValueError(
             f"the weights of {', '.join(model.names)} carry no statistical model of their object's states; a "
-            "registration needs one: finish the dataset with `mereo generate ... --resume` and train again, or leave "
-            "out --fit"
+            "registration needs one: finish the dataset with `mereo generate ... --resume` and train again, or use "
+            "--fit off"
         )
     return found
-
-
-def _scene_name(model: Model) -> str:
-    name = str(model.provenance.get("scene"))
-    if name not in SCENES:
-        raise ValueError(
-            f"the weights were trained on {name!r}, which is no built-in scene; --fit full plays the draws of one: "
-            "use --fit modes"
-        )
-    return name
-
-
-def registered(
-    result: Reconstruction, registration: Registration, model: Model, frame: CloudAxes = "camera"
-) -> Reconstruction:
-    """Reconstruction that is the registered model itself, with the resolution and in the frame of ``result``.
-
-    Confidence stays the network's: its mean probability of a segment over the voxels that the registration gives it.
-    """
-    grid = _label_grid(registration.mesh, float(result.labels.spacing.max()))
-    found = Extraction(registration.mesh, grid, 0)
-    observed = result.observed
-    if observed is not None:
-        seen = transform_points(result.T_camera_input, observed.points)
-        observed = replace(observed, labels=nearest_labels(registration.solids, seen))
-    answer = replace(
-        result,
-        surfaces=registration.mesh,
-        labels=grid,
-        segments=measure(found, model, result.code),
-        timings_s={**result.timings_s, "fit": registration.seconds},
-        clipped=False,
-        observed=observed,
-    )
-    return answer if frame == "camera" else turned_back(answer)
-
-
-def _label_grid(mesh: SegmentedMesh, spacing: float) -> LabelGrid:
-    """Labels of a mesh on a grid with one empty voxel around it."""
-    low, high = mesh.bounds
-    counts = np.ceil((high - low) / spacing).astype(int) + 3
-    origin = (low + high - (counts - 1) * spacing) / 2
-    x, y, z = (origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3))
-    labels: UInt8[np.ndarray, "x y z"] = label_grid(mesh, x, y, z)
-    return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)
 
 
 def describe(registration: Registration) -> dict[str, object]:
@@ -113,6 +168,7 @@ def describe(registration: Registration) -> dict[str, object]:
         "explained": registration.explained,
         "accepted": registration.accepted,
         "scene_unit": registration.scene_unit,
+        "unit": "known" if registration.unit_known else "found",
         "coefficients": registration.z.tolist(),
         "seconds": registration.seconds,
     }

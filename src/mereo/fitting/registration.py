@@ -9,11 +9,14 @@ from jaxtyping import Float, UInt8
 
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
+from mereo.fitting.playback import Drawn
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, signed_distance_and_direction
 from mereo.scenes.statistical_model import StatisticalModel, following
 
 Method = Literal["modes", "draws"]
+
+AT_ONCE = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +58,11 @@ class Registration:
         method: which description of the states it was found in.
         z: coefficients of the modes, or standard normal draws of the scene.
         scene_unit: length of a scene unit in the input's.
+        unit_known: whether that was known beforehand; otherwise it was found together with the pose.
         explained: share of the observed points that lie on the model's facing surface, up to the tolerance.
         accepted: whether that is enough to believe it.
         seconds: of the fit alone.
+        drawn: the scene's draws where ``method`` is "draws", with their seed: what plays the state again.
     """
 
     model: StatisticalModel
@@ -65,9 +70,11 @@ class Registration:
     method: Method
     z: Float[np.ndarray, " k"]
     scene_unit: float
+    unit_known: bool
     explained: float
     accepted: bool
     seconds: float
+    drawn: Drawn | None = None
 
     @cached_property
     def mesh(self) -> SegmentedMesh:
@@ -95,7 +102,11 @@ class Registration:
                 nearest.
         """
         labels = nearest_labels(self.rest_solids, points) if labels is None else labels
-        return self.model.weights(points, labels)(self.material)
+        result = np.empty_like(points)
+        for first in range(0, len(points), AT_ONCE):  # the weights of a large mesh would take gigabytes
+            rows = slice(first, first + AT_ONCE)
+            result[rows] = self.model.weights(points[rows], labels[rows])(self.material)
+        return result
 
     def to_rest(
         self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"] | None = None

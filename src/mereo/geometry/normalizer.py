@@ -41,6 +41,13 @@ class Normalizer:
         return points / self.scale + self.center
 
     @property
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """Homogeneous transform that ``apply`` is."""
+        result = np.diag([self.scale, self.scale, self.scale, 1.0])
+        result[:3, 3] = -self.scale * self.center
+        return result
+
+    @property
     def viewpoint(self) -> Float[np.ndarray, "3"]:
         """Position of the camera (the origin of the camera frame) in normalized coordinates."""
         return -self.center * self.scale

@@ -24,6 +24,9 @@ class FilesConfig:
     millimetres: bool = False
 
 
+CarryFrame = Literal["source", "scene"]
+"""Frame and unit of files that are carried: those of the object's own files, or scene units."""
+
 DEFAULT_FILES = FilesConfig()
 
 

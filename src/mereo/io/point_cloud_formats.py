@@ -57,6 +57,12 @@ def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
 
 
+def ply_counts(path: Path) -> dict[str, int]:
+    """Number of each kind of element (vertex, face) that a PLY file's header states."""
+    with path.open("rb") as file:
+        return {name: count for name, count, _ in _ply_header(file.read(65536))[1]}
+
+
 def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str]]]], int]:
     """Header of a PLY file: format, name, count and properties (type and name) of each element, start of the data."""
     match = re.search(rb"^end_header[ \t]*\r?\n?", content[:65536], re.MULTILINE)

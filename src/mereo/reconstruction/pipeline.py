@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from jaxtyping import Float
@@ -59,6 +59,42 @@ class Reconstruction:
     observed: SegmentedCloud | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class EncodedFrame:
+    """Cloud as a model has understood it: what both the network's surfaces and a registration start from.
+
+    Attributes:
+        points: the cloud, in the input's frame and unit.
+        axes: of that frame.
+        T_camera_input: into the camera frame.
+        code: what the model made of the cloud.
+        timings_s: seconds of each stage so far.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    axes: CloudAxes
+    T_camera_input: Float[np.ndarray, "4 4"]
+    code: EncodedCloud
+    timings_s: dict[str, float]
+
+    @cached_property
+    def seen(self) -> PointCloud:
+        """The cloud in the camera frame."""
+        return PointCloud(transform_points(self.T_camera_input, self.points))
+
+
+def encode_frame(
+    cloud: PointCloud | Float[np.ndarray, "n 3"], model: Model, axes: CloudAxes = "camera"
+) -> EncodedFrame:
+    """The first step of ``reconstruct``, with its arguments; raises ``ValueError`` for unusable clouds."""
+    points = np.asarray(cloud.points if isinstance(cloud, PointCloud) else cloud, dtype=np.float64)
+    T_camera_input = into_camera(points, axes)
+    seconds: dict[str, float] = {}
+    with timed(seconds, "encode"):
+        code = model.encode(PointCloud(transform_points(T_camera_input, points)))
+    return EncodedFrame(points, axes, T_camera_input, code, seconds)
+
+
 def reconstruct(
     cloud: PointCloud | Float[np.ndarray, "n 3"],
     model: Model,
@@ -66,7 +102,7 @@ def reconstruct(
     frame: CloudAxes = "camera",
     label_points: bool = False,
 ) -> Reconstruction:
-    """All segments of the object that a cloud shows, hidden side included.
+    """All segments of the object that a cloud shows, hidden side included, as the network alone finds them.
 
     Args:
         cloud: points on the object, any unit and density.
@@ -78,24 +114,24 @@ def reconstruct(
 
     Raises ``ValueError`` for unusable clouds, and where the model finds no segment at all.
     """
-    points = np.asarray(cloud.points if isinstance(cloud, PointCloud) else cloud, dtype=np.float64)
-    T_camera_input = into_camera(points, frame)
+    return extract(encode_frame(cloud, model, frame), model, resolution, label_points)
+
+
+def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_points: bool = False) -> Reconstruction:
+    """The other steps of ``reconstruct``, with its arguments; raises ``ValueError`` where no segment is found."""
     names, colors = segment_names(model)
-    seconds: dict[str, float] = {}
-    with _timed(seconds, "encode"):
-        seen = transform_points(T_camera_input, points)
-        code = model.encode(PointCloud(seen))
+    seconds, code = dict(seen.timings_s), seen.code
     field: Field = partial(model.logits, code)
-    with _timed(seconds, "locate"):
+    with timed(seconds, "locate"):
         box = locate(field, code.normalizer.invert(SEARCH_BOX))
-    with _timed(seconds, "extract"):
+    with timed(seconds, "extract"):
         found = extract_whole(field, box, resolution, names, colors, model.nested if model.segmented else ())
-    with _timed(seconds, "measure"):
+    with timed(seconds, "measure"):
         segments = measure(found, model, code)
     observed = None
     if label_points:
-        with _timed(seconds, "points"):
-            observed = segment_points(field(seen), points, names, colors)
+        with timed(seconds, "points"):
+            observed = segment_points(field(seen.seen.points), seen.points, names, colors)
     result = Reconstruction(
         surfaces=found.surfaces,
         labels=found.grid,
@@ -104,14 +140,15 @@ def reconstruct(
         evaluated=found.evaluated,
         clipped=bool(found.grid.touched_sides().any()),
         code=code,
-        T_camera_input=T_camera_input,
+        T_camera_input=seen.T_camera_input,
         observed=observed,
     )
-    return result if frame == "camera" else turned_back(result)
+    return result if seen.axes == "camera" else turned_back(result)
 
 
 @contextmanager
-def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+def timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the seconds of a block to ``timings`` under the name of its stage."""
     start = time.perf_counter()
     yield
     timings[stage] = time.perf_counter() - start

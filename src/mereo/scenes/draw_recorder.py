@@ -93,14 +93,16 @@ class Recorder(NamedGenerator):
         key = (place, self._seen[place])
         self._seen[place] += 1
         size = int(np.prod(shape))
-        shares = self._given.get(key)
-        if shares is None or len(shares) != size:
-            shares = self._fresh.random(size)
-        shares = np.clip(shares, SMALLEST_SHARE, 1 - SMALLEST_SHARE)
+        shares = np.clip(self._chosen(key, size), SMALLEST_SHARE, 1 - SMALLEST_SHARE)
         bounds = [np.broadcast_to(np.asarray(bound, dtype=float), shape).ravel() for bound in (low, high)]
         self.calls.append(Call(key, trail, name, kind, shares, bounds[0], bounds[1], shape, self._ends))
         self._ends = None
         return shares
+
+    def _chosen(self, key: Key, size: int) -> Shares:
+        """Shares of a draw: those that are given for it, where they are as many, else fresh ones."""
+        shares = self._given.get(key)
+        return self._fresh.random(size) if shares is None or len(shares) != size else shares
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
         """Uniform numbers between two bounds, which may be given in either order; recorded."""

@@ -93,12 +93,9 @@ def random_state(scene: Scene, seed: int) -> Played:
     return _played(scene, seed, {}, {}, None)
 
 
-def play(
-    scene: Scene, seed: int, given: Mapping[Key, Shares], most: int | None
-) -> tuple[Recorder, tuple[Deformation, ...]]:
-    """Recorder and deformations of one run of a scene; ``scenes.draw_recorder`` counts the calls from here on."""
-    recorder = Recorder(seed, given, most)
-    return recorder, scene.sample_deformations(recorder)
+def play(scene: Scene, recorder: Recorder) -> tuple[Deformation, ...]:
+    """Deformations of one run of a scene; ``scenes.draw_recorder`` counts the calls from here on."""
+    return scene.sample_deformations(recorder)
 
 
 def _played(
@@ -109,7 +106,8 @@ def _played(
     before: Played | None,
 ) -> Played:
     most = None if before is None else RETRIES * (len(before.calls) + 10)
-    recorder, deformations = play(scene, seed, given, most)
+    recorder = Recorder(seed, given, most)
+    deformations = play(scene, recorder)
     calls = tuple(recorder.calls)
     if before is None or tuple(call.key for call in calls) != before.keys:
         calls = _without_refused(scene, seed, calls, deformations)
@@ -152,9 +150,9 @@ def _without_refused(
 
 def _plays_alike(scene: Scene, seed: int, calls: tuple[Call, ...], wanted: Float[np.ndarray, "w 3"]) -> bool:
     renumbered = _renumbered(calls)
-    given = {call.key: call.shares for call in renumbered}
+    recorder = Recorder(seed, {call.key: call.shares for call in renumbered}, len(calls))
     try:
-        recorder, deformations = play(scene, seed, given, len(calls))
+        deformations = play(scene, recorder)
     except (OutOfDraws, ValueError):
         return False
     same_draws = [call.key for call in recorder.calls] == [call.key for call in renumbered]

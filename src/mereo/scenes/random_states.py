@@ -1,5 +1,7 @@
 """Random states of a scene as material points: what its statistical model is built from."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from threadpoolctl import threadpool_limits
@@ -7,6 +9,7 @@ from threadpoolctl import threadpool_limits
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
+from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene, State
 from mereo.scenes.seeds import example_rng
@@ -67,6 +70,17 @@ def built_in_model(name: str, segments: tuple[str, ...]) -> StatisticalModel | N
     return scene_model(scene) if scene is not None and scene.rest.names == segments else None
 
 
+def with_frame(model: StatisticalModel, name: str) -> StatisticalModel:
+    """The model with the frame of its built-in scene's own files, where it is from before models kept that."""
+    if model.source_frame is not None or name not in SCENES:
+        return model
+    try:
+        scene = load_scene(name)
+    except AssetUnavailable:
+        return model
+    return replace(model, source_frame=scene.source_frame) if scene.rest.names == model.rest.names else model
+
+
 def states_for(examples: int) -> int:
     """Number of states that the model of a dataset is built from: as many as it has examples, within limits."""
     return min(max(examples, LEAST_STATES), STATES)
@@ -74,8 +88,9 @@ def states_for(examples: int) -> int:
 
 def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED) -> StatisticalModel:
     """Statistical model of a scene, from ``count`` states of a training seed; the same bits on any number of cores."""
-    scene = scene.for_seed(seed)
+    frame, scene = scene.source_frame, scene.for_seed(seed)
     nodes, labels = interior_nodes(scene.rest)
     states = sample_states(scene, nodes, labels, count, seed)
     with threadpool_limits(1, "blas"):  # threads add in another order
-        return build_model(scene.rest, nodes, labels, states)
+        model = build_model(scene.rest, nodes, labels, states)
+    return replace(model, source_frame=frame)

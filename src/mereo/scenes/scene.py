@@ -10,6 +10,7 @@ from mereo.deformation.maps import Deformation
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import look_at, rotation_along
 from mereo.scenes.seeds import TEST_SEED_START
+from mereo.scenes.source_frame import SourceFrame
 
 SCENES = (
     *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
@@ -83,6 +84,8 @@ class Scene:
         source: where the mesh comes from, and its licence.
         held_out: the same object in states that are kept for testing; None where states are drawn without end.
         unit_m: metres per scene unit; None where the object's true size is not known.
+        T_scene_source: similarity from the frame and unit of the files that the object was read from to the scene's;
+            the identity where it is defined in scene units.
         definition: what a scene from a file states, in a text that changes exactly when its meaning does. Empty for
             built-in scenes: the version of mereo stands for it.
     """
@@ -94,6 +97,7 @@ class Scene:
     source: str = "modelled in mereo's own code, MIT licence"
     held_out: "Scene | None" = None
     unit_m: float | None = None
+    T_scene_source: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     definition: str = ""
 
     def __post_init__(self) -> None:
@@ -102,6 +106,11 @@ class Scene:
                 f"scene {self.name!r} has the segments {', '.join(self.rest.names)} but its held-out states "
                 f"{', '.join(self.held_out.rest.names)}; they must be one object: give both the same rest mesh"
             )
+
+    @property
+    def source_frame(self) -> SourceFrame:
+        """Frame of the object's own files."""
+        return SourceFrame(self.T_scene_source, self.unit_m)
 
     def for_seed(self, seed: int) -> "Scene":
         """Scene that a seed draws from: its held-out states for testing (``TEST_SEED_START`` up), or itself."""

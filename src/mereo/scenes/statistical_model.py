@@ -19,6 +19,7 @@ from mereo.geometry.procrustes import align_all
 from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.pair_distances import PairDistances, kept_distances
 from mereo.scenes.rest_pose import rest_frame
+from mereo.scenes.source_frame import SourceFrame
 
 PROCRUSTES_ROUNDS = 100
 PROCRUSTES_POINTS = 600
@@ -65,6 +66,7 @@ class StatisticalModel:
         library: coefficients of the states that the model was built from.
         residue: root mean square distance of held-out states from the model.
         pairs: distances that the states keep, which the linear model alone does not.
+        source_frame: frame of the object's own files; None in models from before it was kept.
     """
 
     rest: SegmentedMesh
@@ -75,6 +77,7 @@ class StatisticalModel:
     library: Float32[np.ndarray, "n k"]
     residue: float
     pairs: PairDistances
+    source_frame: SourceFrame | None = None
 
     @property
     def count(self) -> int:
@@ -160,6 +163,23 @@ class StatisticalModel:
         """Root mean square motion of the material points for one standard deviation of each mode."""
         squared: np.ndarray = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
         return np.sqrt(squared / len(self.modes))
+
+    @cached_property
+    def explained(self) -> Float[np.ndarray, " k"]:
+        """Share of the states' variance that the first 1 ... k modes explain together."""
+        variance = np.cumsum(self.motion**2)
+        return variance / (variance[-1] + self.residue**2) if self.count else variance
+
+    @cached_property
+    def residues(self) -> Float[np.ndarray, " n"]:
+        """Root mean square distance of a state that the model has not seen, by its first 0 ... k modes."""
+        left = np.concatenate([np.cumsum(self.motion[::-1] ** 2)[::-1], [0.0]])
+        return np.sqrt(left + self.residue**2)
+
+    def modes_for(self, residue: float) -> int | None:
+        """Fewest modes that leave no more than this root mean square distance; None where all leave more."""
+        enough = np.flatnonzero(self.residues <= residue)
+        return int(enough[0]) if len(enough) else None
 
     def mesh(self, material: Float[np.ndarray, "m 3"]) -> SegmentedMesh:
         """The segments, with the rest mesh's faces, at these positions."""

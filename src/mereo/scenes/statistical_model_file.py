@@ -22,6 +22,7 @@ from safetensors.numpy import save
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
 from mereo.scenes.pair_distances import PairDistances
+from mereo.scenes.source_frame import SourceFrame
 from mereo.scenes.statistical_model import StatisticalModel
 
 LIBRARY_STEP = 1 / 32
@@ -63,6 +64,7 @@ def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], dict[str
         "vertices": [len(segment.vertices) for segment in segments],
         "faces": [len(segment.faces) for segment in segments],
         "residue": model.residue,
+        "frame": None if model.source_frame is None else model.source_frame.facts(),
     }
     return {name: np.ascontiguousarray(value) for name, value in tensors.items()}, facts
 
@@ -80,6 +82,7 @@ def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel
         library=tensors["library"].astype(np.float32) * np.float32(LIBRARY_STEP),
         residue=float(facts["residue"]),
         pairs=PairDistances(index[0], index[1], mean, std),
+        source_frame=SourceFrame.of_facts(facts.get("frame")),  # older files have none
     )
 
 

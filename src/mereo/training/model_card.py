@@ -18,7 +18,7 @@ from mereo.io.atomic_files import new_directory
 from mereo.models.config import NetworkConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model, weights_bytes
-from mereo.scenes.random_states import built_in_model
+from mereo.scenes.random_states import built_in_model, with_frame
 from mereo.scenes.statistical_model_file import modes_within, with_fewer_modes
 from mereo.training.config import PRESETS
 
@@ -170,9 +170,11 @@ def _with_statistical_model(model: Model) -> Model:
 
     Older weights hold none: they get those of the built-in scene that they were trained on.
     """
-    found = model.statistical_model or built_in_model(str(model.provenance.get("scene")), model.names)
+    scene = str(model.provenance.get("scene"))
+    found = model.statistical_model or built_in_model(scene, model.names)
     if found is None:
         return model
+    found = with_frame(found, scene)
     left = MOST_BYTES - HEADER_BYTES - len(weights_bytes(replace(model, statistical_model=None), torch.float16))
     return replace(model, statistical_model=with_fewer_modes(found, modes_within(found, left)))
 

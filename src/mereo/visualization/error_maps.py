@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import gaussian_filter
 
-from mereo.evaluation.scoring import EvaluatedView
+from mereo.evaluation.results import EvaluatedView
 from mereo.geometry.mesh import Color
 from mereo.visualization.contact_sheets import Picture, cloud_picture, contact_sheet, name_plate, save_png, scale_bar
 from mereo.visualization.renderer import Canvas, Triangles, Viewpoint

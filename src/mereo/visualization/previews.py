@@ -197,15 +197,15 @@ def scene_row(scene: Scene, seed: int) -> list[Picture]:
     """Pictures of a scene at rest and in two random states, from ``SCENE_VIEWS``, and the depth image of the second."""
     views = [sample_view(scene, GenerateConfig(), example_rng(seed, index)) for index in (0, 1)]
     meshes = [scene.rest, *(view.mesh.transformed(view.T_world_camera) for view in views)]
-    viewpoint = _common_viewpoint(meshes, *SCENE_VIEWS[scene.name])
+    viewpoint = common_viewpoint(meshes, *SCENE_VIEWS[scene.name])
     return [
         *(shade(mesh, viewpoint, (TILE_PX, TILE_PX)) for mesh in meshes),
         enlarge(depth_to_rgb(views[1].depth), TILE_PX),
     ]
 
 
-def _common_viewpoint(meshes: list[SegmentedMesh], direction: Vector, up: Vector) -> Viewpoint:
-    """Orthographic, and just large enough for all meshes."""
+def common_viewpoint(meshes: list[SegmentedMesh], direction: Vector, up: Vector) -> Viewpoint:
+    """Orthographic viewpoint from a direction, just large enough for all meshes."""
     points = np.concatenate([segment.vertices for mesh in meshes for segment in mesh.segments])
     turned = Viewpoint.along(meshes[0].bounds, direction, up).T_view_world
     seen = transform_points(turned, points)

@@ -6,16 +6,24 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scan_scoring import evaluate_scans
-from mereo.evaluation.scoring import CELLS, Evaluation, evaluate, markdown_table, metrics, trained_scene
+from mereo.evaluation.scoring import CELLS, evaluate, trained_scene
+from mereo.evaluation.tables import markdown_table, metrics
+from mereo.fitting.carry import Carried
+from mereo.fitting.config import FitChoice
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import new_directory, write_json
+from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.writers.formats import Results, chosen_formats, write_formats
-from mereo.io.writers.glb import viewer_rotation
+from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_for
@@ -25,7 +33,13 @@ from mereo.synthesis.config import GenerateConfig
 from mereo.visualization.error_maps import error_picture
 from mereo.visualization.evaluation_report import write_evaluation_report
 from mereo.visualization.previews import render_cloud_and_segments
-from mereo.visualization.reconstruction_report import write_report
+from mereo.visualization.reconstruction_report import cluster, write_report
+
+PICTURED_FACES = 100_000
+"""A mesh of more faces is coarsened for pictures: shading takes seconds for each hundred thousand."""
+
+PICTURED_CELLS = 150
+"""Cells along the longest side to which it is coarsened."""
 
 
 def evaluate_weights(
@@ -38,12 +52,22 @@ def evaluate_weights(
     cells: int = CELLS,
     settings: GenerateConfig | None = None,
     inference: InferenceConfig = EXACT,
+    choice: FitChoice = "auto",
 ) -> Evaluation:
     """Score weights, write metrics.json, table.md, errors.png, report.html, and print the table: ``mereo evaluate``."""
     with new_directory(output) as directory:
         model = load_for(weights, inference)
         settings = settings or GenerateConfig()
-        evaluation = evaluate(model, scene, examples=examples, seed=seed, cells=cells, progress=True, settings=settings)
+        evaluation = evaluate(
+            model,
+            scene,
+            examples=examples,
+            seed=seed,
+            cells=cells,
+            progress=True,
+            settings=settings,
+            choice=choice,
+        )
         facts = {
             "weights": str(weights),
             "scene": scene or trained_scene(model),
@@ -61,11 +85,16 @@ def evaluate_weights(
 
 
 def evaluate_on_scans(
-    model: Model, output: str | Path, *, truths: Sequence[str | Path] = (), cells: int = CELLS
+    model: Model,
+    output: str | Path,
+    *,
+    truths: Sequence[str | Path] = (),
+    cells: int = CELLS,
+    choice: FitChoice = "auto",
 ) -> Evaluation:
     """Score a model on real scans, with the same files as ``evaluate_weights``: ``mereo evaluate --scans``."""
     with new_directory(output) as directory:
-        evaluation = evaluate_scans(model, truths=truths, cells=cells)
+        evaluation = evaluate_scans(model, truths=truths, cells=cells, choice=choice)
         facts = {"scans": list(evaluation.examples), "truths": [str(path) for path in truths]}
         write_evaluation(directory, evaluation, {**facts, "trained": model.provenance})
     print(markdown_table(evaluation))
@@ -138,8 +167,13 @@ def write_files(
     files: FilesConfig,
     unit_m: float,
     facts: dict[str, object],
+    carried: Sequence[Carried] = (),
 ) -> None:
-    """Write what ``write_reconstruction`` does into a directory that is there; ``facts`` go into the summary."""
+    """Write what ``write_reconstruction`` does into a directory that is there; ``facts`` go into the summary.
+
+    What is carried goes into ``carried/`` under its files' own names; its surfaces also into pictures and report, and
+    together with the segments into ``carried.glb``, where GLB is asked for.
+    """
     started = time.perf_counter()
     formats = chosen_formats(files.formats)
     to_viewer = viewer_rotation(frame)
@@ -148,8 +182,41 @@ def write_files(
     to_camera = camera_axes(frame)
     seen = PointCloud(transform_points(to_camera, cloud.points))
     title = str(facts.get("title", "mereo reconstruction"))
-    render_cloud_and_segments(directory / "preview.png", seen, result.surfaces.transformed(to_camera), title)
+    for one in carried:
+        write_attachment(directory / "carried" / one.name, one.content, results.factor, to_viewer, unit_m)
+    shown = with_carried(result.surfaces, carried)
+    if "glb" in formats and len(shown.segments) > len(result.surfaces.segments):
+        write_segments_glb(directory / "carried.glb", shown, to_viewer, unit_m)
+    pictured = replace(shown, segments=tuple(_pictured(segment) for segment in shown.segments))
+    render_cloud_and_segments(directory / "preview.png", seen, pictured.transformed(to_camera), title)
     timings_s = {**result.timings_s, "write": time.perf_counter() - started}
     summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
-    write_report(directory / "report.html", cloud, result.surfaces, summary, to_viewer)
+    extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
+    told = [*({"name": part.name} for part in extra), *summary["segments"]]
+    write_report(directory / "report.html", cloud, pictured, {**summary, "segments": told}, to_viewer)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
+
+
+def _pictured(segment: Segment) -> Segment:
+    """A segment as pictures need it."""
+    if len(segment.faces) <= PICTURED_FACES:
+        return segment
+    return cluster(segment, float(np.ptp(segment.vertices, axis=0).max()) / PICTURED_CELLS)
+
+
+def with_carried(surfaces: SegmentedMesh, carried: Sequence[Carried]) -> SegmentedMesh:
+    """Segments with all carried surfaces before them, declared to lie inside them, so that they are seen through them.
+
+    Their names are those of their files, with that of the part where a file has several; their colours differ from the
+    segments'.
+    """
+    parts: list[Segment] = []
+    for one in carried:
+        if isinstance(one.content, Surfaces):
+            mesh = one.content.mesh
+            several = len(mesh.segments) > 1
+            parts += [replace(s, name=f"{one.name}: {s.name}" if several else one.name) for s in mesh.segments]
+    free = [color for color in reversed(PALETTE) if color not in surfaces.colors] or list(PALETTE)
+    parts = [replace(part, color=free[index % len(free)]) for index, part in enumerate(parts)]
+    nested = tuple((part.name, name) for part in parts for name in surfaces.names)
+    return SegmentedMesh((*parts, *surfaces.segments), (*surfaces.nested, *nested))

@@ -12,7 +12,7 @@ import numpy as np
 from mereo.evaluation.registration.placement import Placement
 from mereo.evaluation.registration.visible_surface import diagonal, moved
 from mereo.evaluation.scans import PosedScan
-from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.conventions import UNITS_M, CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import write_json
 from mereo.io.errors import readable
@@ -101,7 +101,8 @@ def read_truth(path: str | Path) -> PosedScan:
         boxes = {name: _array(entry["rest_box"], (2, 3)) for name, entry in facts["segments"].items()}
         scan = ScanFile(path.parent / facts["scan"], facts["unit"], facts["frame"], facts["drop_invalid"])
         scene, scan_sha256 = facts["scene"], facts["scan_sha256"]
-    rest = load_scene(scene if scene in SCENES else path.parent / scene).rest
+    loaded = load_scene(scene if scene in SCENES else path.parent / scene)
+    rest, unit_m = loaded.rest, loaded.unit_m
     if rest.names != tuple(poses) or not _same_place(rest, boxes):
         raise ValueError(f"the meshes of the scene {scene!r} are not those that {path} was made with: align again")
     if not scan.path.exists():
@@ -110,7 +111,8 @@ def read_truth(path: str | Path) -> PosedScan:
         raise ValueError(f"{scan.path} is not the file that {path} was made from (another SHA-256): align it again")
     cloud = read_point_cloud(scan.path, scan.drop_invalid)
     name = path.resolve().parent.name if path.name == TRUTH else path.stem
-    return PosedScan(name, cloud, moved(rest, np.stack(list(poses.values()))), scan.frame)
+    scene_unit = None if unit_m is None else unit_m / UNITS_M[scan.unit]
+    return PosedScan(name, cloud, moved(rest, np.stack(list(poses.values()))), scan.frame, scene_unit)
 
 
 def _array(value: Any, shape: tuple[int, int]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Reconstruction and segmentation of every object (paper, section 4.2 and appendix A)."""
 
-from mereo.evaluation.scoring import EvaluatedView
+from mereo.evaluation.results import EvaluatedView
 from mereo.experiments.paper.result import Claim, Result, Row, published
 from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store, example_view

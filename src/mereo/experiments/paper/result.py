@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mereo.evaluation.metrics import format_score
-from mereo.evaluation.scoring import EvaluatedView
+from mereo.evaluation.results import EvaluatedView
 from mereo.experiments.paper.store import Score
 from mereo.io.atomic_files import atomic_file, new_directory, write_json
 from mereo.visualization.error_maps import error_picture

@@ -11,7 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mereo.evaluation.scoring import EvaluatedView, evaluate
+from mereo.evaluation.results import EvaluatedView
+from mereo.evaluation.scoring import evaluate
 from mereo.experiments.paper.scales import TRAINING_SEED
 from mereo.io.atomic_files import write_json
 from mereo.models.weights import load_model

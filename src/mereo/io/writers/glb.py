@@ -1,5 +1,6 @@
 """GLB: binary glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html), metres and y up."""
 
+import base64
 import json
 import struct
 from pathlib import Path
@@ -45,6 +46,32 @@ def write_segments_glb(
 
     Raises ``ValueError`` where no segment has faces.
     """
+    document, binary = _gltf_document(surfaces, frame_rotation, unit_m)
+    text = json.dumps(document, ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 4)
+    with atomic_file(path) as partial, partial.open("wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+
+
+def write_segments_gltf(
+    path: str | Path,
+    surfaces: SegmentedMesh,
+    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
+    unit_m: float = 1.0,
+) -> None:
+    """Write what ``write_segments_glb`` does as a text file, with the arrays in it as base64."""
+    document, binary = _gltf_document(surfaces, frame_rotation, unit_m)
+    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode("ascii")
+    with atomic_file(path) as partial:
+        partial.write_text(json.dumps(document, ensure_ascii=False), encoding="utf-8")
+
+
+def _gltf_document(
+    surfaces: SegmentedMesh, frame_rotation: Float[np.ndarray, "3 3"], unit_m: float
+) -> tuple[dict[str, Any], bytes]:
+    """Document and its one buffer."""
     solid = with_faces(surfaces)
     chunks: list[bytes] = []
     document = _gltf_skeleton(solid, surfaces.opaque, np.asarray(frame_rotation) * unit_m)
@@ -53,12 +80,7 @@ def write_segments_glb(
         _add_array(document, chunks, segment.faces.astype("<u4").reshape(-1, 1), "SCALAR", 34963)
     binary = b"".join(chunks)
     document["buffers"] = [{"byteLength": len(binary)}]
-    text = json.dumps(document, ensure_ascii=False).encode()
-    text += b" " * (-len(text) % 4)
-    with atomic_file(path) as partial, partial.open("wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    return document, binary
 
 
 def _gltf_skeleton(

@@ -45,6 +45,11 @@ def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
     _write(path, comment_lines(cloud.names, cloud.colors), {"vertex": vertices})
 
 
+def write_positions_ply(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
+    """Write a cloud's positions alone, as float32."""
+    _write(path, [], {"vertex": _records(_positions(points))})
+
+
 Columns = dict[str, tuple[str, np.ndarray]]
 """Type and values of each property, in the order of the file."""
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.io.atomic_files import new_directory
+from mereo.io.atomic_files import atomic_file, new_directory
 from mereo.io.writers.segment_table import with_faces
 
 RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -23,6 +23,13 @@ def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bo
     with new_directory(directory, force) as partial:
         for label, segment in found:
             (partial / stl_name(label, segment.name)).write_bytes(_binary(segment))
+
+
+def write_surface_stl(path: str | Path, surfaces: SegmentedMesh) -> None:
+    """Write all segments as one nameless surface; positions are float32, in the mesh's frame and unit."""
+    vertices, faces, _ = surfaces.merged()
+    with atomic_file(path) as partial:
+        partial.write_bytes(_binary(Segment("all", surfaces.colors[0], vertices, faces)))
 
 
 def stl_name(label: int, name: str) -> str:

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.read_only import read_only
 from mereo.scenes import assets
 from mereo.scenes.builtin._real_meshes import simplified
@@ -99,16 +100,15 @@ def base() -> Base:
 
 
 @cache
-def _model_center() -> Float[np.ndarray, "3"]:
-    """Middle of the body's box."""
+def model_to_scene() -> Normalizer:
+    """Map from model to scene coordinates, which takes the middle of the body's box to the origin."""
     body = base().vertices[base().faces.ravel()]
-    center: Float[np.ndarray, "3"] = (body.min(axis=0) + body.max(axis=0)) / 2
-    return read_only(center)
+    return Normalizer(read_only((body.min(axis=0) + body.max(axis=0)) / 2), SCALE)
 
 
 def to_scene(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Points from model to scene coordinates."""
-    return (points - _model_center()) * SCALE
+    return model_to_scene().apply(points)
 
 
 @cache

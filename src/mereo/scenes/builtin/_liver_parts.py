@@ -17,6 +17,7 @@ from mereo.deformation.warps import Bend, FreeFormLattice, Squash, Twist
 from mereo.geometry.manifold import Faces, Vertices, solid_of
 from mereo.geometry.mesh import PALETTE, Segment, vertex_normals
 from mereo.geometry.mesh_repair import close_holes, largest_piece
+from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.read_only import read_only
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes import assets
@@ -33,6 +34,9 @@ UNIT_M = 0.001 / MM
 
 CENTER_MM = (-3.333, -3.867, 0.0)
 """Middle of the liver's box in the frame of the source."""
+
+PLACEMENT = Normalizer(read_only(np.array(CENTER_MM)), MM)
+"""Map from the source's frame in millimetres to the scene's."""
 
 LIVER_FACES, GALLBLADDER_FACES = 5000, 2000
 """The source has 28,560 and 14,700; this many keep the surface to within 0.01 and 0.1 mm, before the cut."""
@@ -53,7 +57,7 @@ def repaired_liver() -> tuple[Vertices, Faces]:
 
 def to_scene(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Points from the source's frame in millimetres to the scene's."""
-    return (points_mm - np.array(CENTER_MM)) * MM
+    return PLACEMENT.apply(points_mm)
 
 
 @cache

@@ -20,6 +20,7 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, smooth_step, turn
 from mereo.deformation.warps import SmoothField, Squash
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.read_only import read_only
 from mereo.scenes import assets
 from mereo.scenes.builtin._solids import Vector
@@ -206,4 +207,5 @@ def scene() -> Scene:
         workspace=Workspace(aperture_rad=WHOLE_SPHERE_RAD, any_roll=True, fov_rad=float(np.deg2rad(26.0))),
         source="Stanford Computer Graphics Laboratory, Stanford 3D Scanning Repository: research use, not commercial",
         unit_m=1 / model_to_scene()[1],
+        T_scene_source=Normalizer(*model_to_scene()).matrix,
     )

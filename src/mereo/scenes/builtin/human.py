@@ -41,7 +41,7 @@ from mereo.deformation.warps import SmoothField
 from mereo.geometry.read_only import read_only
 from mereo.geometry.solids import label_grid
 from mereo.scenes.builtin._human_joints import JOINTS, NAMES, part_axes, rotations, turn_limits, turn_names
-from mereo.scenes.builtin._human_parts import SCALE, base, rest_mesh, to_scene
+from mereo.scenes.builtin._human_parts import SCALE, base, model_to_scene, rest_mesh, to_scene
 from mereo.scenes.builtin._human_skin import PosedBody, share_field
 from mereo.scenes.scene import Scene, Workspace
 
@@ -149,4 +149,5 @@ def scene() -> Scene:
         workspace=Workspace(fov_rad=float(np.deg2rad(50.0))),
         source="MakeHuman base mesh, default skeleton and skin weights, MakeHuman community: CC0 1.0",
         unit_m=0.1 / SCALE,
+        T_scene_source=model_to_scene().matrix,
     )

@@ -23,7 +23,7 @@ import numpy as np
 
 from mereo.deformation.maps import Deformation
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.scenes.builtin._liver_parts import SOURCE, UNIT_M, WORKSPACE, organs, sample_field
+from mereo.scenes.builtin._liver_parts import PLACEMENT, SOURCE, UNIT_M, WORKSPACE, organs, sample_field
 from mereo.scenes.scene import Scene
 
 
@@ -40,4 +40,5 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 def scene() -> Scene:
     """Scene Liver & Gallbladder; needs `liver/lapgym_liver_visual.stl` and `lapgym_gallbladder_visual.stl`."""
-    return Scene("liver", rest_mesh(), sample_deformations, WORKSPACE, SOURCE, unit_m=UNIT_M)
+    T = PLACEMENT.matrix
+    return Scene("liver", rest_mesh(), sample_deformations, WORKSPACE, SOURCE, unit_m=UNIT_M, T_scene_source=T)

@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.scenes.builtin._liver_parts import MM, SOURCE, UNIT_M, WORKSPACE, organs
+from mereo.scenes.builtin._liver_parts import MM, PLACEMENT, SOURCE, UNIT_M, WORKSPACE, organs
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import Scene
 
@@ -35,4 +35,4 @@ def scene() -> Scene:
     rest = SegmentedMesh(organs())
     states = load_states(STATES, rest, scale=MM)
     liver = states.scene("liver-simulated", rest, WORKSPACE, f"{SOURCE}; states simulated with MuJoCo")
-    return replace(liver, unit_m=UNIT_M)
+    return replace(liver, unit_m=UNIT_M, T_scene_source=PLACEMENT.matrix)

@@ -31,6 +31,8 @@ from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.geometry.manifold import solid_of
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.mesh_repair import close_holes, largest_piece
+from mereo.geometry.read_only import read_only
+from mereo.geometry.transforms import rigid
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes import assets
 from mereo.scenes.builtin._real_meshes import main_part, simplified
@@ -42,6 +44,9 @@ UNITS = 3.2342
 
 UNIT_M = 0.008
 """The source gives no size; so, the skull is 16 cm wide, as an adult's."""
+
+SOURCE_AXES = read_only(np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))
+"""Rotation from the source's axes to the scene's."""
 
 CENTER = (7.825, -0.298, 0.237)
 """Middle of the skull's box in scene units, before it is moved to the origin."""
@@ -144,7 +149,7 @@ def _source() -> dict[str, Segment]:
     parts = read_segmented_mesh(assets.get("skull/sofa_skull_and_teeth_coarse.obj")).segments
     short = [part.name.split(":")[2].split()[0] for part in parts]
     return {
-        name: Segment(name, part.color, -UNITS * part.vertices[:, [1, 0, 2]], part.faces)
+        name: Segment(name, part.color, UNITS * part.vertices @ SOURCE_AXES.T, part.faces)
         for name, part in zip(short, parts, strict=True)
     }
 
@@ -212,4 +217,5 @@ def scene() -> Scene:
         workspace=Workspace(fov_rad=float(np.deg2rad(22.0))),
         source="SOFA framework, LGPL-2.1-or-later; teeth seated and jaw closed by mereo",
         unit_m=UNIT_M,
+        T_scene_source=rigid(UNITS * SOURCE_AXES, -np.array(CENTER)),
     )

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.scenes.builtin._liver_parts import MM, SOURCE, UNIT_M, WORKSPACE, organs, sample_field, to_scene
+from mereo.scenes.builtin._liver_parts import MM, PLACEMENT, SOURCE, UNIT_M, WORKSPACE, organs, sample_field, to_scene
 from mereo.scenes.scene import Scene
 
 CENTER_MM = (-18.7, 24.0, 57.0)
@@ -99,4 +99,5 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 def scene() -> Scene:
     """Scene of the tumour in the liver; needs the same assets as the scene `liver`."""
     source = f"{SOURCE}; the tumour is modelled in mereo"
-    return Scene("tumor", rest_mesh(), sample_deformations, WORKSPACE, source, unit_m=UNIT_M)
+    T = PLACEMENT.matrix
+    return Scene("tumor", rest_mesh(), sample_deformations, WORKSPACE, source, unit_m=UNIT_M, T_scene_source=T)

@@ -78,7 +78,7 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     else:
         motions = _random_motion(document, placement, rest, file.deformations)
         scene = Scene(file.name, rest, motions, workspace, file.source)
-    return replace(scene, unit_m=unit_m, definition=definition)
+    return replace(scene, unit_m=unit_m, T_scene_source=placement.matrix, definition=definition)
 
 
 def _recorded(

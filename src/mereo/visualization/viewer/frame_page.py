@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mereo.reconstruction.pipeline import segment_names
+from mereo.geometry.camera import PointCloud
 from mereo.visualization.vertex_colors import CONFIDENCE, confidence, distance_scale, observed_distance
 from mereo.visualization.viewer import html
 from mereo.visualization.viewer.display import CLOUD_COLOR, CLOUD_SIZE, Display, SegmentControls, SegmentLayer
 from mereo.visualization.viewer.probe import Inspection, first_hit
 
-COLORINGS = ("segment", "confidence", "distance")
 EMPTY_COLOR = (150, 156, 168)
 
 
@@ -21,9 +20,9 @@ class FramePage:
 
     def __init__(self, server: Any, inspection: Inspection, title: str, facts: str, unit: str = "") -> None:
         self.server, self.inspection, self.unit = server, inspection, f" {unit}" if unit else ""
-        self.mesh = inspection.result.surfaces
+        self.mesh = inspection.surfaces
         self._drawing = threading.Lock()
-        scanner = not np.allclose(inspection.result.T_camera_input, np.eye(4))
+        scanner = not np.allclose(inspection.T_camera_input, np.eye(4))
         y, self.toward = (1.0, np.array([0.0, 0.0, 1.0])) if scanner else (-1.0, np.array([0.0, 0.0, -1.0]))
         self.stage = Display(server, self._bounds(), np.array([0.0, y, 0.0]))
         self.layer = SegmentLayer(self.stage, "/segments")
@@ -34,29 +33,41 @@ class FramePage:
 
     def _bounds(self) -> Float[np.ndarray, "2 3"]:
         corners = [s.vertices for s in self.mesh.segments if len(s.vertices)]
-        joint = np.concatenate([self.inspection.cloud.points, *corners])
+        cloud = self.inspection.cloud
+        joint = np.concatenate([*([] if cloud is None else [cloud.points]), *corners])
         return np.stack([joint.min(axis=0), joint.max(axis=0)])
 
     def _build(self, title: str, facts: str) -> None:
         gui = self.server.gui
         gui.add_html(html.heading(title, facts))
+        gui.add_html(html.message(self.inspection.source))
         gui.add_html(html.chips(self.mesh.names, self.mesh.colors))
-        self.coloring = gui.add_dropdown("Colour", COLORINGS, initial_value="segment")
+        self.coloring = gui.add_dropdown("Colour", self._colorings(), initial_value="segment")
         self.legend = gui.add_html("", visible=False)
         self.coloring.on_update(lambda _: self._draw())
         self.controls = SegmentControls(gui, self.mesh, self._draw)
+        if self.inspection.cloud is not None:
+            self._build_cloud(self.inspection.cloud)
+        view = gui.add_button_group("View", ("camera", "side", "behind"))
+        view.on_click(lambda _: self._turn(view.value))
+        self._build_probe()
+
+    def _colorings(self) -> tuple[str, ...]:
+        """What surfaces can be coloured by: confidence is the network's, distance needs what was seen."""
+        has_code, has_cloud = self.inspection.code is not None, self.inspection.cloud is not None
+        return ("segment", *(["confidence"] if has_code else []), *(["distance"] if has_cloud else []))
+
+    def _build_cloud(self, seen: PointCloud) -> None:
+        gui = self.server.gui
         with gui.add_folder("Observed points"):
             cloud_on = gui.add_checkbox("show", True)
             size = gui.add_slider("size", 0.002, 0.04, 0.001, CLOUD_SIZE)
-        points = self.stage.place(self.inspection.cloud.points)
+        points = self.stage.place(seen.points)
         cloud = self.server.scene.add_point_cloud(
             "/cloud", points, CLOUD_COLOR, point_size=size.value, point_shape="circle", precision="float32"
         )
         cloud_on.on_update(lambda _: setattr(cloud, "visible", cloud_on.value))
         size.on_update(lambda _: setattr(cloud, "point_size", size.value))
-        view = gui.add_button_group("View", ("camera", "side", "behind"))
-        view.on_click(lambda _: self._turn(view.value))
-        self._build_probe()
 
     def _build_probe(self) -> None:
         gui = self.server.gui
@@ -89,8 +100,9 @@ class FramePage:
         """Computed when first asked for."""
         if mode not in self._painted:
             if mode == "confidence":
-                values, scale = confidence(self.mesh, self.inspection.ask), CONFIDENCE
+                values, scale = confidence(self.mesh, self.inspection.network), CONFIDENCE
             else:
+                assert self.inspection.cloud is not None
                 values = observed_distance(self.mesh, self.inspection.cloud.points)
                 scale = distance_scale(values, self.unit)
             self._painted[mode] = [scale.colors(value) for value in values], html.color_bar(scale)
@@ -125,9 +137,9 @@ class FramePage:
         self.probe(place)
 
     def probe(self, place: Float[np.ndarray, "3"]) -> None:
-        """Say what the model answers at a place of the input's frame, and draw the way to the nearest surface."""
+        """Say what is known of a place of the input's frame, and draw the way to the nearest surface."""
         answer = self.inspection.ask(place[None])
-        colors = (EMPTY_COLOR, *segment_names(self.inspection.model)[1])
+        colors = (EMPTY_COLOR, *self.inspection.colors)
         self.told.content = html.answer(answer, self.inspection.names, colors, tuple(place), self.unit)
         distance, direction = float(answer.distance[0]), answer.direction[0]
         if np.isnan(distance) or np.isnan(direction).any():

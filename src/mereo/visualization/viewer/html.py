@@ -7,8 +7,8 @@ import numpy as np
 
 from mereo.evaluation.metrics import Scores, format_score
 from mereo.geometry.mesh import Color
-from mereo.models.model import Answer
 from mereo.visualization.vertex_colors import ColorScale
+from mereo.visualization.viewer.probe import Probed
 
 SOFT = "opacity:.62"
 BOX = "padding:2px 0.9em 6px;font-size:0.82em;line-height:1.5"
@@ -79,19 +79,26 @@ def scores(found: Scores, names: Sequence[str], colors: Sequence[Color]) -> str:
     return head + bars(rows)
 
 
-def answer(found: Answer, names: Sequence[str], colors: Sequence[Color], place: Sequence[float], unit: str) -> str:
-    """Answer of the model at one place: the likeliest classes, distance and direction."""
-    label, probability = int(found.label[0]), found.probability[0]
-    order = np.argsort(-probability, kind="stable")[:4]
-    rows = [(names[k], colors[k], float(probability[k])) for k in order]
-    distance, direction = float(found.distance[0]), found.direction[0]
+def answer(found: Probed, names: Sequence[str], colors: Sequence[Color], place: Sequence[float], unit: str) -> str:
+    """Facts about one place: its segment, the network's likeliest classes, distance, direction, and where it rests."""
+    label, distance, direction = int(found.label[0]), float(found.distance[0]), found.direction[0]
     where = "inside" if distance < 0 else "outside"
     said = "distance not trained" if np.isnan(distance) else f"{abs(distance):.3g}{unit} {where} the nearest surface"
     toward = "" if np.isnan(direction).any() else f"towards {_vector(direction.tolist())}"
+    rest = "" if found.rest is None else f"<br>at rest at {_vector(found.rest[0].tolist())} scene units"
     return (
         f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">at {_vector(place)}{unit}</span></div>'
-        f'{bars(rows)}<div style="{BOX}">{escape(said)}<br><span style="{SOFT}">{toward}</span></div>'
+        f'{_likeliest(found, names, colors)}<div style="{BOX}">{escape(said)}<br><span style="{SOFT}">{toward}{rest}'
+        "</span></div>"
     )
+
+
+def _likeliest(found: Probed, names: Sequence[str], colors: Sequence[Color]) -> str:
+    """Bars of the network's likeliest classes at one place; nothing where it was not asked."""
+    if found.probability is None:
+        return ""
+    order = np.argsort(-found.probability[0], kind="stable")[:4]
+    return bars([(names[k], colors[k], float(found.probability[0, k])) for k in order])
 
 
 def _vector(values: Sequence[float]) -> str:

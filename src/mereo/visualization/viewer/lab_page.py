@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
-from mereo.scenes.parameters import Parameter, Played, Refused, parameters, random_state, set_value
+from mereo.scenes.parameters import Parameter, Refused
 from mereo.synthesis.examples import View
 from mereo.visualization.vertex_colors import (
     CONFIDENCE,
@@ -57,9 +57,10 @@ class LabPage:
         self._drawing, self._wishing = threading.Lock(), threading.Lock()
         self._seeds = np.random.default_rng(seed)
         self._wishes: dict[tuple[Any, int | None], tuple[Parameter, float]] = {}
-        self._new_seed: int | None = seed
+        self._first_seed = seed
+        self._new_seed: int | None = None
         self._scores: list[tuple[float, float]] = []
-        self.played: Played | None = None
+        self.shape: Any = None
         self.moment: Moment | None = None
         rest = laboratory.scene.rest
         self.stage = Display(server, rest.bounds, np.asarray(laboratory.scene.workspace.axis, dtype=float))
@@ -144,35 +145,33 @@ class LabPage:
             self._new_seed = int(self._seeds.integers(2**31))
         self.worker.submit(None)
 
-    def _fulfil(self) -> tuple[Played, Refused | None]:
-        """The state that is wished for. Values that the scene refuses are left out, and the last of them is told."""
+    def _fulfil(self) -> tuple[Any, Refused | None]:
+        """The shape that is wished for. Values that are refused are left out, and the last of them is told."""
         with self._wishing:
             wishes, seed = list(self._wishes.values()), self._new_seed
             self._wishes, self._new_seed = {}, None
-        scene, refusal = self.laboratory.scene, None
-        if seed is not None or self.played is None:
-            return random_state(scene, seed or 0), None
-        played = self.played
+        freedom, refusal = self.laboratory.freedom, None
+        if seed is not None:
+            return freedom.random(seed), None
+        shape = freedom.first(self._first_seed) if self.shape is None else self.shape
         for parameter, value in wishes:
-            if parameter.key not in played.keys:
-                continue  # a slider of a part that has just gone has nothing left to move
             try:
-                played = set_value(scene, played, parameter, value)
+                shape = freedom.moved(shape, parameter, value)
             except Refused as error:
                 refusal = error
-        return played, refusal
+        return shape, refusal
 
     # --- the worker's thread ------------------------------------------------------------------------------------------
 
     def _quick(self, _: None) -> None:
-        self.played, refusal = self._fulfil()
-        self._sliders.show(parameters(self.played))
-        view, is_first = self.laboratory.look(self.played, self._camera.place()), self.moment is None
+        self.shape, refusal = self._fulfil()
+        self._sliders.show(self.laboratory.freedom.parameters(self.shape))
+        view, is_first = self.laboratory.look(self.shape, self._camera.place()), self.moment is None
         self.moment = Moment(view)
         if is_first:
             self._look()
         self._picture.image = depth_picture(view.depth, 3)
-        self._rebuild(*QUICK)
+        self._rebuild(*QUICK, quick=True)
         if refusal is not None:
             raise refusal
 
@@ -180,12 +179,12 @@ class LabPage:
         if self.laboratory.model is not None:
             self._rebuild(*FINE)
 
-    def _rebuild(self, resolution: int, cells: int) -> None:
+    def _rebuild(self, resolution: int, cells: int, quick: bool = False) -> None:
         assert self.moment is not None
         if self.laboratory.model is None:
             self._say(f"{len(self.moment.view.depth.to_points())} points seen; no weights, no reconstruction")
         else:
-            trial = self.laboratory.rebuild(self.moment.view, resolution, cells)
+            trial = self.laboratory.rebuild(self.moment.view, resolution, cells, quick)
             self.moment = replace(self.moment, trial=trial)
             self._tell(trial)
         self._draw()
@@ -208,7 +207,7 @@ class LabPage:
             self._curve.data = (np.arange(len(self._scores), dtype=float), columns[0], columns[1])
             self._curve.visible = True
         resolution = int(max(trial.result.labels.labels.shape)) - 1
-        self._say(f"{resolution} cells in {trial.seconds:.2f} s; scored on {trial.cells}³ points")
+        self._say(f"{trial.source}; {resolution} cells in {trial.seconds:.2f} s; scored on {trial.cells}³ points")
 
     def _draw(self) -> None:
         """Callbacks and the worker draw; one at a time."""

@@ -1,29 +1,38 @@
 """Laboratory of a scene: any state, seen by any camera of its workspace, reconstructed and compared with the truth.
 
-    Played (see ``mereo.scenes.parameters``), CameraPlace -look-> View -rebuild-> Trial (reconstruction, scores)
+    shape (see ``freedom``), CameraPlace -look-> View -rebuild-> Trial (default answer, scores)
 
 No page is needed for it; ``mereo.visualization.viewer`` puts sliders to it.
 """
 
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mereo.evaluation.metrics import Scores
-from mereo.evaluation.scoring import check_names, grid_scores
+from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.metrics import Scores, intersection_over_union
+from mereo.evaluation.results import grid_confusion
+from mereo.evaluation.scoring import check_names, predict_grid
+from mereo.fitting.answer import answer
+from mereo.fitting.fit import ModesFit
+from mereo.fitting.register import Registrar
+from mereo.fitting.registration import Registration
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
-from mereo.geometry.solids import Solids
+from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.transforms import inverse_rigid
 from mereo.models.model import Model
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct
-from mereo.scenes.parameters import Played
+from mereo.reconstruction.pipeline import Reconstruction, segment_names
 from mereo.scenes.scene import Scene
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View
+from mereo.visualization.viewer.freedom import DrawnShapes, Freedom
+from mereo.visualization.viewer.probe import default_registrar, source_of
 
 NEAR: tuple[int, int, int] = (255, 236, 190)
 FAR: tuple[int, int, int] = (38, 30, 84)
@@ -54,20 +63,36 @@ class Trial:
 
     Attributes:
         result: in the camera frame.
+        source: where it comes from, in a phrase.
         scores: against the truth, on ``cells`` ** 3 cells.
         cells: the paper takes 100; fewer are faster and a little off.
         seconds: of the reconstruction.
     """
 
     result: Reconstruction
+    source: str
     scores: Scores
     cells: int
     seconds: float
 
 
+class QuickRegistrar(Registrar):
+    """Registrar for frames that change while they are looked at: it fits the modes alone."""
+
+    def finish(self, fitted: ModesFit) -> Registration:
+        """The answer of the modes."""
+        return fitted.registration()
+
+
 @dataclass(frozen=True, eq=False)
 class Laboratory:
     """Scene, and the model that is to reconstruct it; without one there is only the view.
+
+    Attributes:
+        scene: the object, and where its camera may be.
+        model: the weights.
+        settings: how a frame is made.
+        shapes: what the sliders move; the scene's own draws by default.
 
     Raises ``ValueError`` for a model of another object.
     """
@@ -75,10 +100,27 @@ class Laboratory:
     scene: Scene
     model: Model | None
     settings: GenerateConfig = field(default_factory=GenerateConfig)
+    shapes: Freedom[Any] | None = None
 
     def __post_init__(self) -> None:
         if self.model is not None:
             check_names(self.model, self.scene.rest.names)
+
+    @cached_property
+    def freedom(self) -> Freedom[Any]:
+        """What the sliders move."""
+        return DrawnShapes(self.scene) if self.shapes is None else self.shapes
+
+    @cached_property
+    def registrar(self) -> Registrar | None:
+        """Registrar of the default answer, set up once."""
+        return None if self.model is None else default_registrar(self.model, self.scene)
+
+    @cached_property
+    def quick_registrar(self) -> Registrar | None:
+        """The same for while a slider moves."""
+        full = self.registrar
+        return None if full is None else QuickRegistrar(full.network, full.model, full.choice, full.given)
 
     @property
     def camera(self) -> Camera:
@@ -102,12 +144,12 @@ class Laboratory:
         cosine = float(np.cos(place.tilt_rad))
         return self.scene.workspace.pose(target, cosine, place.azimuth_rad, place.distance, place.roll_rad)
 
-    def look(self, played: Played, place: CameraPlace) -> View:
-        """State as the camera sees it; its noise is the same every time, so that pictures do not flicker.
+    def look(self, shape: Any, place: CameraPlace) -> View:
+        """Shape of ``freedom`` as the camera sees it; noise is the same every time, so that pictures do not flicker.
 
         Raises ``ValueError`` where fewer than ``MIN_POINTS`` points of the object are seen.
         """
-        state = self.scene.deform(played.deformations)
+        state = self.freedom.state(shape)
         T_world_camera = self.pose(state.mesh.bounds.mean(axis=0), place)
         mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
         rng = np.random.default_rng(0)
@@ -119,18 +161,26 @@ class Laboratory:
             )
         return View(mesh, seen.image, T_world_camera, state.deformations)
 
-    def rebuild(self, view: View, resolution: int, cells: int) -> Trial:
-        """Reconstruct what is seen, and score it on a grid of ``cells`` cells a side.
+    def rebuild(self, view: View, resolution: int, cells: int, quick: bool = False) -> Trial:
+        """Answer to what is seen, as `mereo reconstruct` gives it, scored on a grid of ``cells`` cells a side.
 
-        Raises ``ValueError`` without a model, and where the model finds nothing.
+        ``quick`` never fits the scene's own draws, which takes seconds. Raises ``ValueError`` without a model, and
+        where the model finds nothing.
         """
         if self.model is None:
             raise ValueError("there are no weights; a reconstruction needs them: name them with --weights")
-        cloud = view.depth.to_points()
+        cloud, registrar = view.depth.to_points(), self.quick_registrar if quick else self.registrar
         start = time.perf_counter()
-        result = reconstruct(cloud, self.model, resolution)
+        found = answer(cloud, self.model, registrar, resolution)
         seconds = time.perf_counter() - start
-        return Trial(result, grid_scores(self.model, result.code, view.mesh, cells), cells, seconds)
+        truth = truth_grid(view.mesh, cells)
+        if found.taken:
+            predicted = label_grid(found.reconstruction.surfaces, *truth.grid.axes())
+        else:
+            predicted = predict_grid(self.model, found.reconstruction.code, truth)
+        confusion = grid_confusion(truth, predicted, len(segment_names(self.model)[0]))
+        scores = intersection_over_union(confusion, self.model.segmented)
+        return Trial(found.reconstruction, source_of(found, registrar), scores, cells, seconds)
 
 
 def depth_picture(depth: DepthImage, factor: int = 1) -> UInt8[np.ndarray, "h w 3"]:

@@ -1,49 +1,156 @@
-"""Probe of a reconstruction, in the input's frame: what the model says at a place, and which place a look meets."""
+"""Probe of an answer, in the input's frame: what is known of a place, and which place a look meets."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
+from mereo.fitting.answer import Answer as FrameAnswer
+from mereo.fitting.answer import answer
+from mereo.fitting.register import Registrar
+from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
-from mereo.models.model import Answer, Model
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct, segment_names
+from mereo.models.model import Answer, EncodedCloud, Model
+from mereo.scenes.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Probed:
+    """Facts about points of the input's frame, in its unit.
+
+    Attributes:
+        label: 0 for empty space, i + 1 for segment i.
+        distance: to the nearest segment surface, negative inside; NaN where that is not known.
+        direction: unit vector towards it; NaN where that is not known.
+        probability: of empty space and each segment, by the network; None where no frame was given to it.
+        rest: where the point was at rest, scene units; None where no model is registered.
+    """
+
+    label: UInt8[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]
+    direction: Float[np.ndarray, "n 3"]
+    probability: Float[np.ndarray, "n c"] | None
+    rest: Float[np.ndarray, "n 3"] | None
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Cloud that was seen, what was made of it, and the model that knows more.
+    """Answer to a frame, and who is asked for more.
 
     Attributes:
-        cloud: what was seen, in the input's frame.
-        result: its reconstruction, in the same frame.
-        model: what made the result, and is asked for more.
+        surfaces: all segments, in the input's frame.
+        T_camera_input: from the input's frame to the camera frame.
+        model: the weights.
+        source: where the answer comes from, in a phrase.
+        cloud: what was seen, in the input's frame; None for a state without its frame.
+        code: what the weights made of the cloud, camera frame.
+        registration: of the object's own model, camera frame, where the surfaces are that model.
     """
 
-    cloud: PointCloud
-    result: Reconstruction
+    surfaces: SegmentedMesh
+    T_camera_input: Float[np.ndarray, "4 4"]
     model: Model
+    source: str
+    cloud: PointCloud | None = None
+    code: EncodedCloud | None = None
+    registration: Registration | None = None
 
     @classmethod
-    def of(cls, cloud: PointCloud, model: Model, resolution: int = 128, frame: CloudAxes = "camera") -> "Inspection":
-        """Reconstruction of a cloud, to be asked. Raises as ``reconstruct`` does."""
-        return cls(cloud, reconstruct(cloud, model, resolution, frame), model)
+    def of(
+        cls,
+        cloud: PointCloud,
+        model: Model,
+        resolution: int = 128,
+        frame: CloudAxes = "camera",
+        registrar: Registrar | None = None,
+    ) -> "Inspection":
+        """Default answer to a cloud, to be asked; raises as ``fitting.answer.answer`` does."""
+        found = answer(cloud, model, registrar, resolution, frame)
+        result = found.reconstruction
+        return cls(
+            surfaces=result.surfaces,
+            T_camera_input=result.T_camera_input,
+            model=model,
+            source=source_of(found, registrar),
+            cloud=cloud,
+            code=result.code,
+            registration=found.registration if found.taken else None,
+        )
+
+    @classmethod
+    def of_registration(
+        cls,
+        registration: Registration,
+        model: Model,
+        T_camera_input: Float[np.ndarray, "4 4"],
+        cloud: PointCloud | None = None,
+    ) -> "Inspection":
+        """Registration as a file has it, with the cloud that it belongs to, where that is at hand."""
+        seen = None if cloud is None else PointCloud(transform_points(T_camera_input, cloud.points))
+        return cls(
+            surfaces=registration.mesh.transformed(inverse_rigid(T_camera_input)),
+            T_camera_input=T_camera_input,
+            model=model,
+            source=explained(registration),
+            cloud=cloud,
+            code=None if seen is None else model.encode(seen),
+            registration=registration,
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of empty space and the segments, by label."""
-        return ("empty space", *segment_names(self.model)[0])
+        return ("empty space", *self.surfaces.names)
 
-    def ask(self, points: Float[np.ndarray, "n 3"]) -> Answer:
-        """Answers of the model at points of the input's frame, in that frame."""
-        T_camera_input = self.result.T_camera_input
-        answer = self.model.query(self.result.code, transform_points(T_camera_input, points))
-        turn = inverse_rigid(T_camera_input)[:3, :3]
-        return replace(answer, direction=answer.direction @ turn.T)
+    @property
+    def colors(self) -> tuple[Color, ...]:
+        """Colours of the segments."""
+        return self.surfaces.colors
+
+    def network(self, points: Float[np.ndarray, "n 3"]) -> Answer:
+        """Answers of the network at points of the input's frame, in that frame; ``ValueError`` without a frame."""
+        if self.code is None:
+            raise ValueError("there is no frame that the network has seen; name its depth image or point cloud")
+        found = self.model.query(self.code, transform_points(self.T_camera_input, points))
+        return Answer(found.label, found.probability, found.distance, self._turned(found.direction))
+
+    def ask(self, points: Float[np.ndarray, "n 3"]) -> Probed:
+        """Facts about points of the input's frame: those of the registered model where it is the answer."""
+        told = None if self.code is None else self.network(points)
+        if self.registration is not None:
+            found = self.registration.query(transform_points(self.T_camera_input, points))
+            chances = None if told is None else told.probability
+            return Probed(found.label, found.distance, self._turned(found.direction), chances, found.rest)
+        told = self.network(points) if told is None else told
+        return Probed(told.label, told.distance, told.direction, told.probability, None)
+
+    def _turned(self, direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Directions of the camera frame in the input's."""
+        return direction @ self.T_camera_input[:3, :3]
+
+
+def default_registrar(model: Model, scene: Scene | None = None) -> Registrar | None:
+    """Registrar of the answer that `mereo reconstruct` gives by default; None where the weights carry no model."""
+    return None if model.statistical_model is None else Registrar.of(model, scene=scene)
+
+
+def source_of(found: FrameAnswer, registrar: Registrar | None) -> str:
+    """Where an answer comes from, in a phrase for people."""
+    if registrar is None:
+        return "network alone: the weights carry no statistical model"
+    if found.registration is None:
+        return f"network alone: {found.refusal}"
+    told = explained(found.registration)
+    return told if found.taken else f"network alone: the {told}, too few"
+
+
+def explained(registration: Registration) -> str:
+    """How well a registration explains its frame, in a phrase for people."""
+    return f"registered model ({registration.method}) explains {registration.explained:.1%} of the observed points"
 
 
 def first_hit(

@@ -1,26 +1,57 @@
 """``mereo view``: load what is to be shown, start the page, keep it until Ctrl-C."""
 
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mereo.evaluation.sample_views import load_view, shipped_views
+from mereo.fitting.register import statistical_model_of
+from mereo.fitting.registration_state import played_state, restored
+from mereo.fitting.state_file import RegistrationState, read_state
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
-from mereo.models.weights import load_for, shipped_names
+from mereo.models.model import Model
+from mereo.models.weights import find_weights, load_for, shipped_names
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
 from mereo.visualization.viewer.display import import_viser, start_server, stop_server
 from mereo.visualization.viewer.frame_page import FramePage
+from mereo.visualization.viewer.freedom import DrawnShapes, Freedom, ModeShapes
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
-from mereo.visualization.viewer.probe import Inspection
+from mereo.visualization.viewer.probe import Inspection, default_registrar
 
 PORT = 8080
 """Port of the page where none is chosen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Frame to be shown: what was seen of the object, its axes, and metres per unit where they are known."""
+
+    cloud: PointCloud
+    title: str
+    axes: CloudAxes
+    unit_m: float | None
+
+    @classmethod
+    def read(cls, path: Path, reading: InputConfig | None, isolation: IsolationConfig | None) -> "Frame":
+        """Frame of a file, without what is not the object."""
+        read = read_frame(path, reading or InputConfig())
+        return cls(find_object(read, isolation or IsolationConfig()).cloud, read.source, read.axes, read.unit_m)
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit, or "" where it is not metres."""
+        return "m" if self.unit_m == 1.0 else ""
 
 
 def view_frame(
@@ -33,9 +64,8 @@ def view_frame(
     isolation: IsolationConfig | None = None,
     inference: InferenceConfig | None = None,
 ) -> None:
-    """Show a frame and its reconstruction; without ``input`` the shipped frame of the weights."""
+    """Show a frame and the default answer to it; without ``input`` the shipped frame of the weights."""
     import_viser()
-    frame: CloudAxes
     if input is None:
         name = weights or shipped_views()[0]
         if name not in shipped_views():
@@ -43,33 +73,102 @@ def view_frame(
                 f"there is no frame to show and none is shipped for {name!r}; name a depth image or a point cloud, or "
                 f"take the weights of a shipped frame: {', '.join(shipped_views())}"
             )
-        cloud, title, weights = load_view(name).depth.to_points(), f"{name}, shipped frame", name
-        frame, unit = "camera", ""
+        frame, weights = Frame(load_view(name).depth.to_points(), f"{name}, shipped frame", "camera", None), name
     elif weights is None:
         raise ValueError(
             f"{input} is given without weights; the model of its object is needed: give --weights, a file or one of "
             f"{', '.join(shipped_names())}"
         )
     else:
-        read = read_frame(input, reading or InputConfig())
-        cloud = find_object(read, isolation or IsolationConfig()).cloud
-        title, frame, unit = read.source, read.axes, "m" if read.unit_m == 1.0 else ""
-    inspection = Inspection.of(cloud, load_for(weights, inference or InferenceConfig()), resolution, frame)
+        frame = Frame.read(input, reading, isolation)
+    model = load_for(weights, inference or InferenceConfig())
+    inspection = Inspection.of(frame.cloud, model, resolution, frame.axes, default_registrar(model))
     server = start_server(port, "mereo")
-    FramePage(server, inspection, title, f"{len(cloud):,} points · weights {weights}", unit)
+    FramePage(server, inspection, frame.title, f"{len(frame.cloud):,} points · weights {weights}", frame.unit)
     _serve(server)
 
 
-def view_scene(name: str, weights: str | None, *, port: int = PORT, inference: InferenceConfig | None = None) -> None:
-    """Show the laboratory of a scene; without ``weights`` the shipped ones, where there are any."""
+def view_state(
+    path: Path,
+    input: Path | None,
+    weights: str | None,
+    *,
+    port: int = PORT,
+    reading: InputConfig | None = None,
+    isolation: IsolationConfig | None = None,
+    inference: InferenceConfig | None = None,
+) -> None:
+    """Show a registration by its state (a file, or a folder of results), with its frame where ``input`` names it."""
+    import_viser()
+    state = read_state(path)
+    frame = None if input is None else Frame.read(input, reading, isolation)
+    if frame is not None and (frame.axes, frame.unit_m) != (state.frame, state.unit_m):
+        raise ValueError(
+            f"{input} is read with {frame.axes} axes and {frame.unit_m:g} m per unit, but the state has {state.frame} "
+            f"axes and {state.unit_m:g} m; they must be of one frame: give the same --frame and --unit-m as before"
+        )
+    weights = weights_of(state, weights)
+    model = load_for(weights, inference or InferenceConfig())
+    registration = restored(state, statistical_model_of(model))
+    cloud = None if frame is None else frame.cloud
+    inspection = Inspection.of_registration(registration, model, np.array(state.T_camera_input), cloud)
+    server = start_server(port, "mereo")
+    title = str(path) if frame is None else frame.title
+    FramePage(server, inspection, title, f"{state.scene} · weights {weights}", "m" if state.unit_m == 1.0 else "")
+    _serve(server)
+
+
+def view_scene(
+    name: str,
+    weights: str | None,
+    *,
+    state: Path | None = None,
+    port: int = PORT,
+    inference: InferenceConfig | None = None,
+) -> None:
+    """Show the laboratory of a scene, in a state where one is given.
+
+    Without ``weights`` it takes those of the state, or the shipped ones where there are any.
+    """
     import_viser()
     scene = load_scene(name)
-    known = weights or (scene.name if scene.name in shipped_names() else None)
-    laboratory = Laboratory(scene, None if known is None else load_for(known, inference or InferenceConfig()))
+    chosen = None if state is None else read_state(state)
+    known = weights_of(chosen, weights) if chosen is not None else weights
+    known = known or (scene.name if scene.name in shipped_names() else None)
+    model = None if known is None else load_for(known, inference or InferenceConfig())
+    laboratory = Laboratory(scene, model, shapes=None if chosen is None else shapes_of(chosen, scene, model))
     facts = f"weights {known}" if known else "no weights: states and depth images only"
     server = start_server(port, "mereo")
     page = LabPage(server, laboratory, f"Laboratory: {scene.name}", facts)
     _serve(server, page)
+
+
+def shapes_of(state: RegistrationState, scene: Scene, model: Model | None) -> Freedom[Any]:
+    """What the sliders of a state move: the scene's draws, or the modes of the weights' statistical model.
+
+    Raises ``ValueError`` as ``played_state`` does, and for the modes of other weights.
+    """
+    if state.draws is not None:
+        return DrawnShapes(scene, played_state(state, scene))
+    if model is None:
+        raise ValueError(
+            f"the state is one of the modes of weights {state.weights!r}, which are needed: name them with --weights"
+        )
+    registration = restored(state, statistical_model_of(model))
+    return ModeShapes(registration.model, registration.z)
+
+
+def weights_of(state: RegistrationState, weights: str | None) -> str:
+    """Weights to be loaded for a state: the given ones, else those that it names."""
+    if weights is not None:
+        return weights
+    try:
+        find_weights(state.weights)
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"the state was made with the weights {state.weights!r}, which are not here: name them with --weights"
+        ) from None
+    return state.weights
 
 
 def _serve(server: Any, page: LabPage | None = None) -> None:

@@ -1,0 +1,164 @@
+"""Answers to one test case: the network's, that of the modes, that of the scene's own draws, and which a user gets."""
+
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
+
+from mereo.fitting.register import Registrar
+from mereo.fitting.registration import Registration
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.labels import LabelGrid
+from mereo.geometry.solids import label_grid
+from mereo.models.model import EncodedCloud, Model
+from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
+
+AnswerName = Literal["network", "modes", "full"]
+"""Who answers: the network alone, the registered modes, the better of these and the scene's own draws."""
+
+SEEN_WITHIN = 1.5
+"""Distance in scene units up to which a material point counts as seen: that of the nearest observed point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One answer to a frame.
+
+    Attributes:
+        labels: on the grid of the truth.
+        seconds: from the cloud to the answer.
+        registration: behind it; None for the network's.
+    """
+
+    labels: UInt8[np.ndarray, "x y z"]
+    seconds: float
+    registration: Registration | None = None
+
+    def labels_on(self, grid: LabelGrid, model: Model, code: EncodedCloud) -> UInt8[np.ndarray, "x y z"]:
+        """Labels on another grid."""
+        if self.registration is None:
+            return network_labels(model, code, grid)
+        return label_grid(self.registration.mesh, *grid.axes())
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """All answers to a frame.
+
+    Attributes:
+        code: what the network made of the cloud.
+        each: answers by who gives them.
+        default: whose answer a user gets.
+    """
+
+    code: EncodedCloud
+    each: dict[AnswerName, Candidate]
+    default: AnswerName
+
+    @property
+    def answer(self) -> Candidate:
+        """The answer that a user gets."""
+        return self.each[self.default]
+
+    @property
+    def source(self) -> str:
+        """Where that answer comes from: network, modes or draws."""
+        found = self.answer.registration
+        return "network" if found is None else found.method
+
+
+def network_labels(model: Model, code: EncodedCloud, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
+    """Labels by the network at the voxels of a grid, evaluated coarse to fine."""
+    x, y, z = grid.labels.shape
+
+    def logits(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+        return model.logits(code, points)
+
+    return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
+
+
+def find_candidates(
+    model: Model, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
+) -> Candidates:
+    """Answers to a frame; ``registrar`` None asks the network alone, "modes" leaves the draws out."""
+    started = time.perf_counter()
+    code = model.encode(cloud)
+    encoding = time.perf_counter() - started
+    labels = network_labels(model, code, grid)
+    each: dict[AnswerName, Candidate] = {"network": Candidate(labels, time.perf_counter() - started)}
+    if registrar is None:
+        return Candidates(code, each, "network")
+    try:
+        fitted = registrar.fit_modes(cloud, code, scene_unit)
+    except ValueError:  # too little is found; then the network's answer is what a user gets, whoever is asked
+        return Candidates(code, dict.fromkeys(names_for(registrar), each["network"]), "network")
+    each["modes"] = _registered(fitted.registration(), grid, encoding)
+    default: AnswerName = "modes"
+    if "full" in names_for(registrar):
+        assert registrar.states is not None
+        each["full"] = _registered(fitted.with_draws(registrar.states), grid, encoding)
+        default = "modes" if registrar.choice == "auto" and fitted.explains else "full"
+    found = each[default].registration
+    if registrar.choice == "auto" and found is not None and not found.accepted:
+        default = "network"
+    return Candidates(code, each, default)
+
+
+def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
+    """Names of the answers that can be had: the draws only of an object whose scene is at hand."""
+    if registrar is None:
+        return ("network",)
+    if registrar.choice == "modes" or registrar.states is None:
+        return ("network", "modes")
+    return ("network", "modes", "full")
+
+
+def _registered(registration: Registration, grid: LabelGrid, encoding: float) -> Candidate:
+    labels = label_grid(registration.mesh, *grid.axes())
+    return Candidate(labels, encoding + registration.seconds, registration)
+
+
+@dataclass(frozen=True, eq=False)
+class RegistrationErrors:
+    """Distances of registered material points from where they truly are, scene units.
+
+    Attributes:
+        seen: of those near an observed point.
+        hidden: of all others.
+    """
+
+    seen: Float[np.ndarray, " n"]
+    hidden: Float[np.ndarray, " m"]
+
+    @classmethod
+    def of(
+        cls, registration: Registration, truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float
+    ) -> "RegistrationErrors":
+        """Errors at the material points whose true places are given, the first ones, in the cloud's unit."""
+        error = np.linalg.norm(registration.material[: len(truth)] - truth, axis=1) / scene_unit
+        near = cKDTree(cloud.points).query(truth)[0] <= SEEN_WITHIN * scene_unit
+        return cls(error[near], error[~near])
+
+    @classmethod
+    def together(cls, each: list["RegistrationErrors"]) -> "RegistrationErrors":
+        """Errors of several frames as one set."""
+        nothing = [np.empty(0)]
+        return cls(
+            np.concatenate([*nothing, *(one.seen for one in each)]),
+            np.concatenate([*nothing, *(one.hidden for one in each)]),
+        )
+
+    def summary(self, unit_mm: float | None) -> dict[str, dict[str, float | None]]:
+        """Median and 95 % quantile of the seen and of the hidden points, in scene units, and in mm where known."""
+        return {"seen": _quantiles(self.seen, unit_mm), "hidden": _quantiles(self.hidden, unit_mm)}
+
+
+def _quantiles(errors: Float[np.ndarray, " n"], unit_mm: float | None) -> dict[str, float | None]:
+    if len(errors) == 0:
+        return {"median": None, "p95": None, "median_mm": None, "p95_mm": None}
+    median, p95 = (float(value) for value in np.quantile(errors, [0.5, 0.95]))
+    millimetres = [None if unit_mm is None else value * unit_mm for value in (median, p95)]
+    return {"median": median, "p95": p95, "median_mm": millimetres[0], "p95_mm": millimetres[1]}

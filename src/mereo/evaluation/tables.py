@@ -1,0 +1,90 @@
+"""Results of an evaluation as ``metrics.json`` and as a table."""
+
+from typing import Any
+
+import numpy as np
+
+from mereo.evaluation.metrics import Scores, format_score, intersection_over_union
+from mereo.evaluation.results import AnswerScores, Evaluation
+from mereo.evaluation.scoring import CELLS
+
+CLEARLY = 0.01
+"""Least difference in mIoU (in IoU where there is no mIoU) by which another answer counts as clearly better."""
+
+
+def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
+    """Content of ``metrics.json``: ``facts`` first, then definition, scores and confusion matrix."""
+    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
+    return {
+        **facts,
+        "examples": len(evaluation.examples),
+        "definition": f"{CELLS}^3 cell centres of the joint box, kept inside any segment's box enlarged by 50 %; one "
+        "confusion matrix over the set; miou is the mean over the segments without empty space",
+        "iou": scores.iou,
+        "miou": scores.miou,
+        "per_segment": dict(zip(evaluation.names, scores.per_segment.tolist(), strict=True)),
+        "example_mean": {"iou": iou, "miou": miou},
+        "per_example": {name: {"iou": each.iou, "miou": each.miou} for name, each in evaluation.examples.items()},
+        "confusion": evaluation.confusion,
+        **answers(evaluation),
+    }
+
+
+def answers(evaluation: Evaluation) -> dict[str, Any]:
+    """Part of ``metrics.json`` that compares who could have answered: network, modes, full.
+
+    ``chosen`` has the share of examples by where the scored answer came from, ``better`` the share in which another
+    answer would have been better than it by more than ``CLEARLY``. ``registration_error`` is None where none was taken.
+    """
+    count = max(1, len(evaluation.sources))
+    sources = {name: evaluation.sources.count(name) / count for name in ("network", "modes", "draws")}
+    taken = list(evaluation.examples.values())
+    better = {
+        name: float(
+            np.mean([_value(other) > _value(one) + CLEARLY for other, one in zip(all_.examples, taken, strict=True)])
+        )
+        for name, all_ in evaluation.answers.items()
+    }
+    errors = None if evaluation.errors is None else evaluation.errors.summary(evaluation.unit_mm)
+    return {
+        **{name: _answer(found, evaluation.segmented) for name, found in evaluation.answers.items()},
+        "chosen": sources,
+        "better": better,
+        "registration_error": errors,
+    }
+
+
+def _value(scores: Scores) -> float:
+    return scores.iou if np.isnan(scores.miou) else scores.miou
+
+
+def _answer(found: AnswerScores, segmented: bool) -> dict[str, float]:
+    scores = intersection_over_union(found.confusion, segmented)
+    return {"iou": scores.iou, "miou": scores.miou, "seconds": float(np.median(found.seconds))}
+
+
+def markdown_table(evaluation: Evaluation) -> str:
+    """Markdown table of the whole set and the mean over its examples; a dash where a score is undefined."""
+    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
+    names = " | ".join(evaluation.names)
+    values = " | ".join(format_score(value) for value in scores.per_segment)
+    blank = " | ".join("" for _ in evaluation.names)
+    return (
+        f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
+        f"|---|---|---|{'---|' * len(evaluation.names)}\n"
+        f"| whole set | {format_score(scores.iou)} | {format_score(scores.miou)} | {values} |\n"
+        f"| mean over examples | {format_score(iou)} | {format_score(miou)} | {blank} |\n"
+        + _answer_rows(evaluation, blank)
+    )
+
+
+def _answer_rows(evaluation: Evaluation, blank: str) -> str:
+    """Rows of the whole set by who answers, where more than the network could."""
+    if len(evaluation.answers) < 2:
+        return ""
+    rows = ""
+    for name, found in evaluation.answers.items():
+        each = _answer(found, evaluation.segmented)
+        title = f"{name} alone, {each['seconds']:.2f} s"
+        rows += f"| {title} | {format_score(each['iou'])} | {format_score(each['miou'])} | {blank} |\n"
+    return rows

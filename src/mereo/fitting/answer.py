@@ -1,0 +1,149 @@
+"""Answer to one frame: the registered model itself where it explains the frame, else the network's surfaces.
+
+EncodedFrame -register-> Registration -segments, labels-> Reconstruction
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mereo.fitting.config import FitChoice
+from mereo.fitting.register import Registrar, registrar_for
+from mereo.fitting.registration import Registration, nearest_labels
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import label_grid
+from mereo.models.model import Model
+from mereo.reconstruction.isosurfaces import Extraction
+from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, encode_frame, extract, timed, turned_back
+from mereo.reconstruction.segment_statistics import measure, segment_points
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Answer to one frame, and where it comes from.
+
+    Attributes:
+        reconstruction: all segments, in the input's frame and unit.
+        registration: of the object's deformation model, in the camera frame (``reconstruction.T_camera_input``) and the
+            input's unit; None where none was asked for or none was found.
+        taken: whether the reconstruction is the registered model; otherwise it is the network's.
+        refusal: why no registration was found, where one was asked for.
+    """
+
+    reconstruction: Reconstruction
+    registration: Registration | None = None
+    taken: bool = False
+    refusal: str | None = None
+
+
+def answer(
+    cloud: PointCloud | Float[np.ndarray, "n 3"],
+    model: Model,
+    registrar: Registrar | FitChoice | None = "auto",
+    resolution: int = 128,
+    frame: CloudAxes = "camera",
+    label_points: bool = False,
+    scene_unit: float | None = None,
+    stated_unit: float | None = None,
+) -> Answer:
+    """Answer to the frame that a cloud shows.
+
+    Args:
+        cloud: points on the object, any unit and density.
+        model: the weights.
+        registrar: of the same object, to be set up once for many frames, or the choice of one that is set up here; None
+            asks the network alone. With "auto" a registration that does not explain the cloud leaves the answer to the
+            network, with other choices it is taken all the same.
+        resolution: cells along the longest side of the object's box.
+        frame: the cloud's axes, as in ``mereo.reconstruct``.
+        label_points: also say on which segment each point of the cloud lies.
+        scene_unit: length of a scene unit in the cloud's unit, where it is known.
+        stated_unit: the same as the input states it (``Registrar.stated_unit``), believed only where the network's own
+            estimate agrees.
+
+    Raises ``ValueError`` as ``mereo.reconstruct`` does, and for other choices than "auto" as ``fit_frame`` does.
+    """
+    if isinstance(registrar, str):
+        registrar = registrar_for(model, registrar)
+    seen = encode_frame(cloud, model, frame)
+    return answer_frame(seen, model, registrar, resolution, label_points, scene_unit, stated_unit)
+
+
+def answer_frame(
+    seen: EncodedFrame,
+    model: Model,
+    registrar: Registrar | None,
+    resolution: int = 128,
+    label_points: bool = False,
+    scene_unit: float | None = None,
+    stated_unit: float | None = None,
+) -> Answer:
+    """``answer`` to a frame that the model has understood already, with its arguments."""
+    if registrar is None:
+        return Answer(extract(seen, model, resolution, label_points))
+    auto = registrar.choice == "auto"
+    try:
+        registration = registrar.register(seen.seen, seen.code, scene_unit, stated_unit)
+    except ValueError as error:
+        if not auto:
+            raise
+        return Answer(extract(seen, model, resolution, label_points), refusal=str(error))
+    taken = registration.accepted or not auto
+    if taken:
+        result = registered(seen, registration, model, resolution, label_points)
+    else:
+        result = extract(seen, model, resolution, label_points)
+    return Answer(result, registration, taken)
+
+
+def registered(
+    seen: EncodedFrame, registration: Registration, model: Model, resolution: int = 128, label_points: bool = False
+) -> Reconstruction:
+    """Reconstruction that is the registered model itself, in the input's frame.
+
+    Confidence stays the network's: its mean probability of a segment over the voxels that the registration gives it.
+    """
+    seconds = {**seen.timings_s, "fit": registration.seconds}
+    mesh = registration.mesh
+    with timed(seconds, "label"):
+        low, high = mesh.bounds
+        grid = padded_label_grid(mesh, float((high - low).max()) / resolution)
+    with timed(seconds, "measure"):
+        segments = measure(Extraction(mesh, grid, 0), model, seen.code)
+    observed = None
+    if label_points:
+        with timed(seconds, "points"):
+            observed = _observed(seen, registration, model)
+    result = Reconstruction(
+        surfaces=mesh,
+        labels=grid,
+        segments=segments,
+        timings_s=seconds,
+        evaluated=0,
+        clipped=False,
+        code=seen.code,
+        T_camera_input=seen.T_camera_input,
+        observed=observed,
+    )
+    return result if seen.axes == "camera" else turned_back(result)
+
+
+def _observed(seen: EncodedFrame, registration: Registration, model: Model) -> SegmentedCloud:
+    """Segment of each observed point by the registration, with the network's probabilities of it."""
+    points = seen.seen.points
+    cloud = segment_points(model.logits(seen.code, points), seen.points, model.names, model.colors)
+    return replace(cloud, labels=nearest_labels(registration.solids, points))
+
+
+def padded_label_grid(mesh: SegmentedMesh, spacing: float) -> LabelGrid:
+    """Labels of a mesh on a grid with one empty voxel around it."""
+    low, high = mesh.bounds
+    counts = np.ceil((high - low) / spacing).astype(int) + 3
+    origin = (low + high - (counts - 1) * spacing) / 2
+    x, y, z = (origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3))
+    labels: UInt8[np.ndarray, "x y z"] = label_grid(mesh, x, y, z)
+    return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)

@@ -1,0 +1,146 @@
+"""Files that are carried: read, moved, and written in their own format again."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+from shapes import ball, box
+
+from mereo.geometry.subdivision import split_long_edges
+from mereo.io.attachments import Positions, Surfaces, read_attachments, write_attachment
+from mereo.io.pose_tables import PoseTable, read_pose_table
+from mereo.io.writers.glb import viewer_rotation
+
+POINTS = np.random.default_rng(0).normal(size=(20, 3))
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["stl", "ply", "obj", "glb", "gltf"])
+def test_a_mesh_keeps_its_format_and_its_surface(tmp_path: Path, suffix: str) -> None:
+    part = ball((3.0, 1.0, 2.0), 1.5, "vessel", level=2)
+    exported = trimesh.Trimesh(part.vertices, part.faces).export(file_type=suffix)
+    files = exported if isinstance(exported, dict) else {f"vessel.{suffix}": exported}
+    for name, content in files.items():  # glTF in text comes with its arrays beside it
+        place = tmp_path / name.replace("model.gltf", "vessel.gltf")
+        place.write_bytes(content if isinstance(content, bytes) else content.encode())
+    (found,) = read_attachments([tmp_path / f"vessel.{suffix}"])
+    assert isinstance(found.content, Surfaces) and found.name == f"vessel.{suffix}"
+    moved = found.content.at(found.content.points + 1.0, None)
+    path = tmp_path / "out" / found.name
+    write_attachment(path, moved, 1.0, viewer_rotation("camera"), 0.001)
+    (again,) = read_attachments([path])
+    np.testing.assert_allclose(np.sort(again.content.points, axis=0), np.sort(part.vertices + 1.0, axis=0), atol=1e-5)
+    assert isinstance(again.content, Surfaces)
+    again.content.mesh.check()
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz", "npy", "txt"])
+def test_a_cloud_keeps_its_format_and_its_points(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cloud.{suffix}"
+    write_attachment(path, Positions(POINTS), 1000.0, np.eye(3), 1.0)
+    (found,) = read_attachments([path])
+    assert isinstance(found.content, Positions)
+    np.testing.assert_allclose(found.content.points, 1000.0 * POINTS, rtol=1e-6)
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_a_table_keeps_its_other_columns(tmp_path: Path, mark: str) -> None:
+    rows = ["Z,note,X,y", '3,"a, b",1,2', "6,,4,5", "", "9,c,7,8"]
+    text = "\n".join(rows) if mark == "," else "\n".join(rows).replace("a, b", "a b").replace(",", mark)
+    table = read_pose_table(written(tmp_path / "t.csv", text))
+    np.testing.assert_array_equal(table.points, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])
+    again = read_pose_table(written(tmp_path / "u.csv", table.at(table.points + 0.5, None).text(10.0)))
+    np.testing.assert_allclose(again.points, 10 * (table.points + 0.5))
+    assert again.header == ("Z", "note", "X", "y")
+    assert [row[1] for row in again.rows] == [row[1] for row in table.rows]
+
+
+def test_both_forms_of_a_pose_mean_the_same(tmp_path: Path) -> None:
+    turns = Rotation.random(4, rng=np.random.default_rng(1))
+    by_quaternion = ["grasp,x,y,z,qx,qy,qz,qw"]
+    by_matrix = [",".join([f"m{row}{column}" for row in range(4) for column in range(4)] + ["grasp"])]
+    for index, (turn, point) in enumerate(zip(turns, POINTS, strict=False)):
+        by_quaternion.append(",".join(map(str, [f"g{index}", *point, *turn.as_quat()])))
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), point
+        by_matrix.append(",".join(map(str, [*matrix.ravel(), f"g{index}"])))
+    tables = [read_pose_table(written(tmp_path / "p.csv", "\n".join(rows))) for rows in (by_quaternion, by_matrix)]
+    about = Rotation.from_rotvec([0.2, 0.5, -1.0]).as_matrix()
+    for table in tables:
+        assert table.rotations is not None
+        np.testing.assert_allclose(table.rotations, turns.as_matrix(), atol=1e-12)
+        again = read_pose_table(written(tmp_path / "q.csv", table.at(table.points, about @ table.rotations).text()))
+        assert again.rotations is not None
+        np.testing.assert_allclose(again.rotations, about @ turns.as_matrix(), atol=1e-9)
+        np.testing.assert_allclose(again.points, POINTS[:4], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b,c\n1,2,3\n", "its columns are a, b, c, with neither of x, y, z and m03, m13, m23"),
+        ("x,y,z,m03,m13,m23\n1,2,3,1,2,3\n", "with both of x, y, z and m03, m13, m23"),
+        ("x,y,z\n", "it has a header and no row"),
+        ("x,y,z\n1,2,3\n1,two,3\n", "line 3 has 'two' in the column y, which is no finite number"),
+        ("x,y,z\n1,2,nan\n", "line 2 has 'nan' in the column z"),
+        ("x,y,z\n1,2\n", "line 2 has 2 cells and the header 3"),
+        ("x,y,z,qx,qy,qz\n1,2,3,0,0,0\n", "it has a column 'qx' but no 'qw'"),
+        ("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n1,2,3,0,0,0,0\n", "line 3 has an orientation that is no rotation"),
+        ("", "is empty"),
+    ],
+)
+def test_a_table_that_cannot_be_used_says_why(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read_pose_table(written(tmp_path / "t.csv", text))
+
+
+def test_a_mirroring_matrix_is_no_pose(tmp_path: Path) -> None:
+    header = ",".join(f"m{row}{column}" for row in range(3) for column in range(4))
+    path = written(tmp_path / "t.csv", header + "\n1,0,0,5,0,1,0,5,0,0,-1,5\n")
+    with pytest.raises(ValueError, match="line 2 has an orientation that is no rotation"):
+        read_pose_table(path)
+
+
+def test_files_that_cannot_be_carried_say_why(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"missing\.stl does not exist"):
+        read_attachments([tmp_path / "missing.stl"])
+    with pytest.raises(ValueError, match=r"is empty \(0 bytes\)"):
+        read_attachments([written(tmp_path / "empty.ply", "")])
+    with pytest.raises(ValueError, match=r"has the suffix '.dae'; what is carried is one of .stl, .ply"):
+        read_attachments([written(tmp_path / "plan.dae", "x")])
+    with pytest.raises(ValueError, match="cannot be read as a mesh"):
+        read_attachments([written(tmp_path / "plan.stl", "no mesh at all")])
+    (tmp_path / "sub").mkdir()
+    twice = [written(folder / "a.csv", "x,y,z\n1,2,3\n") for folder in (tmp_path, tmp_path / "sub")]
+    with pytest.raises(ValueError, match=r"two files to carry are called 'a.csv'"):
+        read_attachments(twice)
+    np.save(tmp_path / "nan.npy", np.full((4, 3), np.nan))
+    with pytest.raises(ValueError, match="has NaN or infinite positions"):
+        read_attachments([tmp_path / "nan.npy"])
+
+
+def test_a_table_without_orientations_has_none(tmp_path: Path) -> None:
+    (found,) = read_attachments([written(tmp_path / "a.csv", "x,y,z\n1,2,3\n")])
+    assert isinstance(found.content, PoseTable) and found.content.rotations is None
+
+
+def test_splitting_long_edges_keeps_the_surface() -> None:
+    """No edge is long, the body stays closed with its volume, and the given vertices stay where they are."""
+    part = box((0, 0, 0), (8, 3, 1), "a")
+    vertices, faces = split_long_edges(part.vertices, part.faces, 0.7, 100_000)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.edges_unique_length.max() <= 0.7 and mesh.is_watertight
+    assert mesh.volume == pytest.approx(24.0) and mesh.area == pytest.approx(70.0)
+    np.testing.assert_array_equal(vertices[: len(part.vertices)], part.vertices)
+    same = split_long_edges(part.vertices, part.faces, 100.0, 12)
+    assert same[0] is part.vertices and len(same[1]) == len(part.faces)
+    with pytest.raises(
+        ValueError, match="would take 1,000 triangles or more to have no edge over 0.05; it is too larg"
+    ):
+        split_long_edges(part.vertices, part.faces, 0.05, 1000)

@@ -1,0 +1,96 @@
+"""Who could have answered a frame: network, modes, draws; which answer is scored, and how far it is off."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mereo.evaluation.candidates import RegistrationErrors, find_candidates
+from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.scoring import evaluate
+from mereo.evaluation.tables import markdown_table, metrics
+from mereo.fitting.register import Registrar
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.io.atomic_files import write_json
+from mereo.models.model import Model
+from mereo.models.weights import load_model
+from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import State
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import View, sample_view
+
+SEED = 1_000_021
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return replace(load_model("engine"), statistical_model=scene_model(load_scene("engine"), 100))
+
+
+@pytest.fixture(scope="module")
+def view() -> View:
+    return sample_view(load_scene("engine").for_seed(SEED), GenerateConfig(), example_rng(SEED, 0))
+
+
+def test_a_user_gets_what_is_scored(model: Model, view: View) -> None:
+    cloud, grid = view.depth.to_points(), truth_grid(view.mesh, 24).grid
+    alone = find_candidates(model, cloud, grid, None, 1.0)
+    assert list(alone.each) == ["network"] and alone.source == "network"
+    modes = find_candidates(model, cloud, grid, Registrar.of(model, "modes"), 1.0)
+    assert list(modes.each) == ["network", "modes"] and modes.default == "modes"
+    every = find_candidates(model, cloud, grid, Registrar.of(model, "auto"), 1.0)
+    assert list(every.each) == ["network", "modes", "full"]
+    for name in ("network", "modes"):
+        np.testing.assert_array_equal(every.each[name].labels, modes.each[name].labels)
+    assert every.each["full"].seconds > every.each["modes"].seconds
+    stretched = PointCloud(cloud.points * np.array([1.0, 1.8, 1.0]))
+    assert find_candidates(model, stretched, grid, Registrar.of(model, "auto"), 1.0).source == "network"
+    forced = find_candidates(model, stretched, grid, Registrar.of(model, "modes"), 1.0)
+    assert forced.source == "modes" and forced.answer.registration is not None
+    assert not forced.answer.registration.accepted
+
+
+def test_a_registration_is_as_far_off_as_its_points_are(model: Model, view: View) -> None:
+    statistical = model.statistical_model
+    assert statistical is not None
+    state = State(view.mesh.transformed(view.T_world_camera), view.deformations)
+    truth = state_points(state, statistical.nodes, statistical.node_labels)
+    truth = transform_points(inverse_rigid(view.T_world_camera), truth)
+    cloud = view.depth.to_points()
+    found = Registrar.of(model, "modes").register(cloud, scene_unit=1.0)
+    exact = RegistrationErrors.of(replace(found, material=truth), truth, cloud, 1.0)
+    assert exact.seen.max() == exact.hidden.max() == 0.0
+    assert len(exact.seen) + len(exact.hidden) == len(truth) and len(exact.seen) > 0 < len(exact.hidden)
+    shifted = RegistrationErrors.of(replace(found, material=truth + np.array([0.0, 3.0, 0.0])), truth, cloud, 1.0)
+    parts = shifted.summary(unit_mm=2.0)
+    for part in ("seen", "hidden"):
+        assert parts[part] == pytest.approx({"median": 3.0, "p95": 3.0, "median_mm": 6.0, "p95_mm": 6.0})
+    # the same in another unit of length
+    large = RegistrationErrors.of(
+        replace(found, material=5 * truth + np.array([0.0, 15.0, 0.0])), 5 * truth, PointCloud(5 * cloud.points), 5.0
+    )
+    np.testing.assert_allclose(large.hidden, shifted.hidden)
+
+
+def test_an_evaluation_compares_all_who_could_answer(model: Model, tmp_path: Path) -> None:
+    found = evaluate(model, "engine", examples=2, seed=SEED, cells=24)
+    values = metrics(found, {})
+    assert sum(values["chosen"].values()) == pytest.approx(1.0)
+    only = {name for name, share in values["chosen"].items() if share == 1.0}
+    if only:  # then the scored answer is one of the three
+        same = values["network" if only == {"network"} else "modes" if only == {"modes"} else "full"]
+        assert (values["iou"], values["miou"]) == (same["iou"], same["miou"])
+    assert values["modes"]["miou"] > values["network"]["miou"] and values["full"]["seconds"] > 0
+    assert 0 <= values["registration_error"]["hidden"]["median"] <= values["registration_error"]["hidden"]["p95"]
+    assert values["registration_error"]["seen"]["median_mm"] is None  # the engine has no true size
+    write_json(tmp_path / "metrics.json", values)
+    assert json.loads((tmp_path / "metrics.json").read_text())["chosen"] == values["chosen"]
+    assert "modes alone" in markdown_table(found)
+    off = evaluate(model, "engine", examples=2, seed=SEED, cells=24, choice="off")
+    assert (off.scores.iou, off.scores.miou) == (values["network"]["iou"], values["network"]["miou"])
+    assert "alone" not in markdown_table(off) and metrics(off, {})["registration_error"] is None

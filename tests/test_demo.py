@@ -1,0 +1,65 @@
+"""The demo shows network and fit side by side, and writes the answer that a user gets by default."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mereo.cli import demo
+from mereo.evaluation.sample_views import load_view
+from mereo.fitting.registration_state import load_state
+from mereo.fitting.state_file import STATE
+from mereo.geometry.solids import Solids
+from mereo.models.model import EncodedCloud, Model
+from mereo.models.weights import load_model
+from mereo.scenes.random_states import scene_model
+from mereo.scenes.registry import load_scene
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return replace(load_model("rope"), statistical_model=scene_model(load_scene("rope"), 300))
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch) -> list[EncodedCloud]:
+    """One case, coarsely; and every cloud that is encoded for it."""
+    monkeypatch.setattr(demo, "_inputs", lambda: iter([partial(demo._frame_case, "rope")]))
+    monkeypatch.setattr(demo, "RESOLUTION", 32)
+    encoded: list[EncodedCloud] = []
+    encode = Model.encode
+    monkeypatch.setattr(Model, "encode", lambda *given: encoded.append(encode(*given)) or encoded[-1])  # type: ignore[func-returns-value]
+    return encoded
+
+
+def test_weights_with_a_statistical_model_show_the_fit_and_write_it(
+    model: Model,
+    shown: list[EncodedCloud],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(demo, "load_model", lambda _: model)
+    demo.main(tmp_path)
+    out = capsys.readouterr().out
+    (scores,) = (line.split("│")[2:4] for line in out.splitlines() if "(mIoU)" in line)
+    network, fit = (float(score) for score in scores)
+    assert fit > network and "network" in out and "fit" in out
+    assert "the registered model explains" in out and len(shown) == 1
+    assert model.statistical_model is not None
+    again = load_state(tmp_path / "rope", model.statistical_model)
+    seen = load_view("rope").depth.to_points().points
+    assert np.median(Solids(again.mesh).nearest(seen).distance) < 0.3
+
+
+def test_weights_without_one_show_the_network_alone_and_say_so(
+    shown: list[EncodedCloud], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(demo, "load_model", lambda name: replace(load_model(name), statistical_model=None))
+    demo.main(tmp_path)
+    out = capsys.readouterr().out
+    assert out.count("the network's answer: the weights 'rope' carry no statistical model") == 1
+    assert "fit" not in out.splitlines()[2] and len(shown) == 1
+    assert (tmp_path / "rope/summary.json").is_file() and not (tmp_path / "rope" / STATE).exists()

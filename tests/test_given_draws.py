@@ -1,0 +1,41 @@
+"""Draws in the order of the calls lead to the same state again, with the same sliders."""
+
+import numpy as np
+import pytest
+from toy_scene import toy_scene
+
+from mereo.scenes.given_draws import draw_names, played_back
+from mereo.scenes.parameters import Played, Refused, parameters, random_state, set_value
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+
+
+def places(scene: Scene, played: Played) -> np.ndarray:
+    return scene.deform(played.deformations).mesh.merged()[0]
+
+
+@pytest.mark.parametrize("name", ["toy", "rope", "robot"])
+def test_the_same_draws_give_the_same_state_and_sliders_that_move_it(name: str) -> None:
+    scene = toy_scene() if name == "toy" else load_scene(name)
+    before = random_state(scene, 7)
+    again = played_back(scene, 7, [call.shares for call in before.calls])
+    np.testing.assert_array_equal(places(scene, again), places(scene, before))
+    assert again.keys == before.keys and parameters(again) == parameters(before)
+    slider = parameters(again)[0]
+    middle = (slider.low + slider.high) / 2
+    np.testing.assert_array_equal(
+        places(scene, set_value(scene, again, slider, middle)), places(scene, set_value(scene, before, slider, middle))
+    )
+
+
+def test_every_number_has_the_name_of_its_slider() -> None:
+    assert draw_names(random_state(toy_scene(), 0)) == (
+        *("whole: shear x", "whole: shear y", "whole: shear z"),
+        "ball: lift",
+    )
+
+
+@pytest.mark.parametrize("sizes", [(3,), (3, 2), (4, 1), ()])
+def test_other_draws_than_the_scene_makes_are_refused(sizes: tuple[int, ...]) -> None:
+    with pytest.raises(Refused, match=f"the scene 'toy' does not take these {len(sizes)} draws; .* register the frame"):
+        played_back(toy_scene(), 0, [np.full(size, 0.5) for size in sizes])

@@ -1,0 +1,61 @@
+"""How many modes an object needs, and their picture."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import untrained
+from PIL import Image
+
+from mereo import __main__ as command_line
+from mereo.cli.modes import show_modes
+from mereo.models.weights import save_model
+from mereo.scenes.random_states import scene_model
+from mereo.scenes.registry import load_scene
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.statistical_model_file import with_fewer_modes
+
+
+@pytest.fixture(scope="module")
+def model() -> StatisticalModel:
+    return scene_model(load_scene("rope"), 100)
+
+
+def test_the_residue_of_fewer_modes_is_that_of_the_model_without_the_others(model: StatisticalModel) -> None:
+    for count in (0, 1, model.count // 2, model.count):
+        assert model.residues[count] == pytest.approx(with_fewer_modes(model, count).residue, rel=1e-6)
+    assert (np.diff(model.residues) < 0).all() and (np.diff(model.explained) > 0).all()
+
+
+def test_the_number_of_modes_needed_is_the_smallest_that_is_enough(model: StatisticalModel) -> None:
+    count = model.modes_for(1.0)
+    assert count is not None and model.residues[count] <= 1.0 < model.residues[count - 1]
+    assert model.modes_for(np.inf) == 0 and model.modes_for(model.residue / 2) is None
+
+
+def test_the_command_says_how_many_and_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "modes.png"
+    assert command_line.main(["scene", "modes", "rope", "--states", "100", "--output", str(picture)]) == 0
+    assert "modes leave" in capsys.readouterr().out
+    drawn = np.asarray(Image.open(picture).convert("RGB"))
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 100
+
+
+def test_weights_show_the_model_that_they_carry(
+    model: StatisticalModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = replace(untrained(model.rest.names), provenance={"scene": "rope"})
+    save_model(replace(network, statistical_model=model), tmp_path / "with.safetensors")
+    show_modes(str(tmp_path / "with.safetensors"), None, 100)
+    assert f"{model.count} modes" in capsys.readouterr().out
+    save_model(network, tmp_path / "without.safetensors")
+    with pytest.raises(ValueError, match="carries no statistical model: name the scene"):
+        show_modes(str(tmp_path / "without.safetensors"), None, 100)
+
+
+def test_bad_wishes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="fewer than 100 say little"):
+        show_modes("rope", None, 5)
+    with pytest.raises(ValueError, match="the picture is a PNG file"):
+        show_modes("rope", tmp_path / "modes.jpg", 100)
