@@ -12,7 +12,15 @@ from mereo.fitting.evidence import PARTNERS, Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed
 from mereo.fitting.joints import Joints
 from mereo.fitting.priors import PairTerm, Prior
-from mereo.fitting.residuals import ROBUST, WITNESS_WEIGHT, NetworkTerm, Surface, add_cloud, add_witnesses, robust_square
+from mereo.fitting.residuals import (
+    ROBUST,
+    WITNESS_WEIGHT,
+    NetworkTerm,
+    Surface,
+    add_cloud,
+    add_witnesses,
+    robust_square,
+)
 from mereo.fitting.sampled_surface import SampledSurface
 from mereo.scenes.statistical_model import WITNESSES, StatisticalModel
 
