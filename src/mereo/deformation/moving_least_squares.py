@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from mereo.geometry.farthest_point_sampling import farthest_point_order
@@ -41,7 +42,9 @@ class PointWeights:
     def __call__(self, material: Float[np.ndarray, "m *c"]) -> Float[np.ndarray, "n *c"]:
         """Values at the points, from values at the material points."""
         flat = material.reshape(len(material), -1)
-        result: np.ndarray = np.matmul(self.weight[:, None].astype(flat.dtype), flat[self.index])[:, 0]
+        rows = np.repeat(np.arange(len(self.index)), self.index.shape[1])
+        entries = (self.weight.ravel().astype(flat.dtype), (rows, self.index.ravel()))
+        result: np.ndarray = csr_array(entries, shape=(len(self.index), len(flat))) @ flat
         return result.reshape(len(self.index), *material.shape[1:])
 
     def rows(self, chosen: np.ndarray) -> "PointWeights":

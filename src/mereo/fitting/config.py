@@ -27,8 +27,14 @@ class FitConfig:
         neighbor_std: standard deviation of each coefficient that is added to theirs.
         refine_sigma, refine_steps: the cloud's first sigma, and steps, under the prior of the neighbours.
         explained: the cloud's misfit, in squared standard deviations of a partner, above which other states are tried.
-        tries, refined, rounds: states that are tried, refined and how often.
+        tries, places: states of the library that are tried, and states in which one joint is elsewhere, of each joint.
+        screened, screen_steps: how many of either are drawn towards the frame by few points, and in how many steps.
+        refined, last_widening, last_refine: how many are refined, from which ``refine_sigma`` and in how many steps.
+        rounds: how often other states are tried.
         curved: other states are tried only where this many distances are kept: smooth bending has one optimum.
+        samples, coarse_samples: points of the surface that stand for it in most steps, and in the choice of states.
+        witnesses: how many of them are compared with what the frame rules out.
+        exact_steps: last steps, which ask the faces themselves.
         scale_std: standard deviation of the scale's logarithm where the unit is not known.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface,
             in scene units.
@@ -41,8 +47,8 @@ class FitConfig:
     last_steps: int = 15
     cooling: float = 0.75
     cloud_sigma: float = 0.2
-    cloud_worth: float = 1500.0
-    network_worth: tuple[float, float] = (100.0, 30.0)
+    cloud_worth: float = 3000.0
+    network_worth: tuple[float, float] = (60.0, 10.0)
     pair_worth: float = 100.0
     pair_slack: float = 0.05
     pair_cooling: float = 0.7
@@ -53,10 +59,19 @@ class FitConfig:
     refine_steps: int = 10
     explained: float = 0.147
     tries: int = 12
-    refined: int = 3
+    places: int = 4
+    screened: int = 8
+    screen_steps: int = 4
+    last_widening: float = 1.0
+    last_refine: int = 8
+    refined: int = 2
     rounds: int = 2
     curved: int = 300
     scale_std: float = 0.1
+    samples: int = 3000
+    coarse_samples: int = 1000
+    witnesses: int = 500
+    exact_steps: int = 3
     accepted: float = 0.95
     tolerance: float = 0.45
 

@@ -42,6 +42,7 @@ class Evidence:
         partners: some of them, evenly spread.
         sight: search tree over the unit vectors towards ``points``.
         ranges: distance of each point from the camera.
+        front: nearest of these among each line of sight and those around it.
         pitch: angle between neighbouring lines of sight.
     """
 
@@ -49,6 +50,7 @@ class Evidence:
     partners: Float[np.ndarray, "p 3"]
     sight: cKDTree
     ranges: Float[np.ndarray, " n"]
+    front: Float[np.ndarray, " n"]
     pitch: float
 
     @classmethod
@@ -57,9 +59,11 @@ class Evidence:
         points = random_subset(points, MOST_POINTS)
         ranges = np.linalg.norm(points, axis=1)
         sight = cKDTree(points / ranges[:, None])
+        angle, near = sight.query(sight.data, k=range(1, min(AROUND, len(points)) + 1))
         # the fourth neighbour of a pixel is one pitch away, as the first is; irregular clouds are not so lucky
-        pitch = float(np.median(sight.query(sight.data, k=[min(4, len(points))])[0]))
-        return cls(points, points[spread(points, PARTNERS)], sight, ranges, pitch)
+        pitch = float(np.median(angle[:, min(4, len(points)) - 1]))
+        front = np.where(angle <= AROUND_PITCHES * pitch, ranges[near], np.inf).min(axis=1)
+        return cls(points, points[spread(points, PARTNERS)], sight, ranges, front, pitch)
 
     def violations(
         self, vertices: Float[np.ndarray, "n 3"], slack: float
@@ -70,18 +74,11 @@ class Evidence:
         """
         distance = np.linalg.norm(vertices, axis=1)
         toward = vertices / distance[:, None]
-        angle, near = self.sight.query(toward, k=AROUND)
-        beside = angle[:, 0] > SILHOUETTE_PITCHES * self.pitch
-        front = np.where(
-            angle <= AROUND_PITCHES * self.pitch, self.ranges[np.minimum(near, len(self.ranges) - 1)], np.inf
-        )
-        ahead = front.min(axis=1) - slack - distance
-        goal = self.sight.data[near[:, 0]] * distance[:, None]
-        sideways = goal - vertices
-        length = np.linalg.norm(sideways, axis=1)
+        angle, near = self.sight.query(toward)
+        beside = angle > SILHOUETTE_PITCHES * self.pitch
+        sideways = self.sight.data[near] * distance[:, None] - vertices
+        length = np.sqrt(np.einsum("ni,ni->n", sideways, sideways))
         out = sideways / np.maximum(length, 1e-12)[:, None]
+        ahead = self.front[near] - slack - distance
         direction = np.where(beside[:, None], out, toward)
-        amount = np.where(
-            beside, length - self.pitch * distance, np.where(np.isfinite(ahead), np.maximum(ahead, 0.0), 0.0)
-        )
-        return direction, np.maximum(amount, 0.0)
+        return direction, np.maximum(np.where(beside, length - self.pitch * distance, ahead), 0.0)

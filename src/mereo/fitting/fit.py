@@ -107,7 +107,8 @@ class ModesFit:
         material: Float[np.ndarray, "m 3"],
         seconds: float,
     ) -> Registration:
-        explained = explained_share(self.problem, material)
+        distance = Surface.through(self.problem.model, material).nearest(self.problem.evidence.partners)[0]
+        explained = float((distance <= self.problem.config.tolerance).mean())
         return Registration(
             model=self.problem.model,
             material=material * self.unit,
@@ -118,6 +119,7 @@ class ModesFit:
             explained=explained,
             accepted=explained >= self.problem.config.accepted,
             seconds=seconds,
+            residual=float(np.sqrt((distance**2).mean())) * self.unit,
         )
 
 
@@ -188,12 +190,6 @@ def fit_correspondences(
     """``fit`` from given correspondences; ``points`` are the observed cloud, seen from the origin."""
     fitted = ModesFit.of(points, found, model, scene_unit, config)
     return fitted.registration() if states is None else fitted.with_draws(states)
-
-
-def explained_share(problem: Problem, material: Float[np.ndarray, "m 3"]) -> float:
-    """Share of the observed points within the tolerance of the surface that faces the camera."""
-    distance = Surface.through(problem.model, material).nearest(problem.evidence.partners)[0]
-    return float((distance <= problem.config.tolerance).mean())
 
 
 def agree(one: float, other: float) -> bool:

@@ -16,6 +16,12 @@ RANKED_BY = 64
 POOL = 80
 """States most alike, among which different ones are chosen."""
 
+SEARCHED = 700
+"""States of the library among which they are searched."""
+
+FEWER = 64
+"""Material points that find this pool."""
+
 ALIKE = 0.03
 """Tolerance, of half the rest box's longest side: points nearer than this agree."""
 
@@ -45,6 +51,7 @@ def by_network(problem: Problem, count: int) -> list[Posed]:
     """The states of the library that explain the correspondences best, posed on them."""
     network, library = problem.network, problem.model.library
     few = np.arange(0, len(network.target), max(1, len(network.target) // RANKED_BY))
+    library = library[:: max(1, len(library) // SEARCHED)]
     motion = library @ network.modes[few].reshape(-1, library.shape[1]).T
     states = network.mean[few].astype(np.float32) + motion.reshape(len(library), -1, 3)
     target, weight = network.target[few].astype(np.float32), network.confidence[few].astype(np.float32)
@@ -62,12 +69,15 @@ def by_likeness(problem: Problem, posed: Posed, count: int) -> list[Posed]:
     model = problem.model
     goal = model.material(posed.z)[model.sparse].astype(np.float32)
     equal = np.ones(len(goal), dtype=np.float32)
-    cost, rotation, translation = robust_poses(model.sparse_library, goal, equal, ALIKE * model.half)
-    alike = np.argsort(cost)[:POOL]
-    shapes = np.matmul(model.sparse_library[alike], rotation[alike].transpose(0, 2, 1)) + translation[alike][:, None]
+    step = max(1, len(model.library) // SEARCHED)
+    few = model.sparse_library[::step, :FEWER]
+    alike = step * np.argsort(robust_poses(few, goal[:FEWER], equal[:FEWER], ALIKE * model.half)[0])[:POOL]
+    _, rotation, translation = robust_poses(model.sparse_library[alike], goal, equal, ALIKE * model.half)
+    shapes = np.matmul(model.sparse_library[alike], rotation.transpose(0, 2, 1)) + translation[:, None]
+    place, z = posed.place(translation), model.library[alike].astype(np.float64)
     return [
-        Posed(posed.rotation @ rotation[i], posed.place(translation[i][None])[0], model.library[i].astype(np.float64))
-        for i in alike[_different(shapes.reshape(len(alike), -1), count)]
+        Posed(posed.rotation @ rotation[i], place[i], z[i], posed.log_scale)
+        for i in _different(shapes.reshape(len(alike), -1), count)
     ]
 
 

@@ -7,35 +7,80 @@
 4. While the cloud is not explained, other states of the library, where the states lie on a curved set at all.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from mereo.fitting.gauss_newton import Posed
-from mereo.fitting.hypotheses import by_likeness, by_network
+from mereo.fitting.hypotheses import ALIKE, by_likeness, by_network
+from mereo.fitting.joints import positions
 from mereo.fitting.priors import Prior
-from mereo.fitting.problem import Problem
+from mereo.fitting.problem import Misfit, Problem
 from mereo.geometry.procrustes import robust_rigid
 
 
 def fit_modes(problem: Problem) -> Posed:
     """The whole fit."""
-    first = fit_whole(problem)
-    best = better(problem, first, refine(problem, first))
     config = problem.config
-    curved = len(problem.model.pairs) >= config.curved
-    for number in range(config.rounds if curved else 0):
-        if problem.misfit(best).cloud < config.explained:
+    first = fit_whole(problem)
+    best = Judged.of(problem, first).better(problem, refine(problem, first))
+    for number in range(config.rounds if len(problem.model.pairs) >= config.curved else 0):
+        if best.misfit.cloud < config.explained:
             break
-        others = by_likeness(problem, best, config.tries) + (by_network(problem, config.refined) if number == 0 else [])
-        sigma = config.refine_sigma * problem.model.half
-        likely = np.argsort([problem.misfit(other, sigma).total for other in others])
-        for index in likely[: config.refined]:
-            best = better(problem, best, refine(problem, others[index], widening=2.0))
-    return best
+        before = best
+        for other in likely(problem, best.posed, number):
+            best = best.better(problem, refine(problem, other, config.last_widening, config.last_refine))
+        if best is before:
+            break
+    return best.posed
 
 
-def better(problem: Problem, one: Posed, other: Posed) -> Posed:
-    """The one with the lower misfit."""
-    return one if problem.misfit(one).total <= problem.misfit(other).total else other
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A state and its misfit."""
+
+    posed: Posed
+    misfit: Misfit
+
+    @classmethod
+    def of(cls, problem: Problem, posed: Posed) -> "Judged":
+        """Judge a state."""
+        return cls(posed, problem.misfit(posed))
+
+    def better(self, problem: Problem, other: Posed) -> "Judged":
+        """This, or the other where its misfit is lower."""
+        judged = Judged.of(problem, other)
+        return judged if judged.misfit.total < self.misfit.total else self
+
+
+def likely(problem: Problem, best: Posed, number: int) -> list[Posed]:
+    """Other states that may explain the frame: chosen by few points, drawn towards the frame, chosen again."""
+    config, coarse = problem.config, problem.coarse
+    library = by_likeness(problem, best, config.tries) + (by_network(problem, config.refined) if number == 0 else [])
+    groups = (library, problem.joints.others(best, config.places))
+    sigma = config.refine_sigma * problem.model.half
+    screened = [
+        group[index]
+        for group in groups
+        for index in np.argsort([coarse.screen(other, sigma) for other in group])[: config.screened]
+    ]
+    drawn = distinct(problem, best, [refine(coarse, other, 2.0, config.screen_steps) for other in screened])
+    order = np.argsort([problem.screen(other, sigma) for other in drawn])
+    return [drawn[index] for index in order[: config.refined]]
+
+
+def distinct(problem: Problem, best: Posed, others: list[Posed]) -> list[Posed]:
+    """Those that differ from ``best`` and from all before them: from alike starts a fit ends alike."""
+    model = problem.model
+    z = np.stack([posed.z for posed in (best, *others)]).astype(np.float32)
+    unposed = positions(model, problem.joints.corners, z).reshape(len(z), -1, 3)
+    places = [posed.place(points) for posed, points in zip((best, *others), unposed, strict=True)]
+    kept = [0]
+    for index in range(1, len(places)):
+        apart = [np.linalg.norm(places[index] - places[other], axis=1).max() for other in kept]
+        if min(apart) > ALIKE * model.half:
+            kept.append(index)
+    return [others[index - 1] for index in kept[1:]]
 
 
 def fit_whole(problem: Problem) -> Posed:
@@ -48,11 +93,12 @@ def fit_whole(problem: Problem) -> Posed:
     return fit_cloud(problem, posed, prior, config.start_sigma, config.last_steps, config.pair_slack)
 
 
-def refine(problem: Problem, posed: Posed, widening: float = 1.0) -> Posed:
+def refine(problem: Problem, posed: Posed, widening: float = 1.0, steps: int | None = None) -> Posed:
     """Refined state, from nearby, under the prior of the library's states around ``posed``."""
     config = problem.config
+    steps = config.refine_steps if steps is None else steps
     prior = Prior.near(problem.model, posed.z, config.neighbors, config.neighbor_std)
-    return fit_cloud(problem, posed, prior, widening * config.refine_sigma, config.refine_steps, 0.0)
+    return fit_cloud(problem, posed, prior, widening * config.refine_sigma, steps, 0.0)
 
 
 def fit_network(problem: Problem, posed: Posed, prior: Prior) -> Posed:
@@ -76,5 +122,6 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
         sigma = max(start * half * config.cooling**step, config.cloud_sigma)
         worth = config.network_worth[0] * (1 - share) + config.network_worth[1] * share
         normal = problem.known(posed, prior, slack * half * config.pair_cooling**step)
-        posed = posed.moved(problem.seen(normal, posed, sigma, worth).step(config.damping))
+        exact = steps - step <= config.exact_steps and sigma <= 2 * config.cloud_sigma
+        posed = posed.moved(problem.seen(normal, posed, sigma, worth, exact).step(config.damping))
     return posed

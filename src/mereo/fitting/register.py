@@ -167,6 +167,8 @@ def describe(registration: Registration) -> dict[str, object]:
         "method": registration.method,
         "explained": registration.explained,
         "accepted": registration.accepted,
+        "residual": registration.residual,
+        "beyond_states": registration.beyond_states,
         "scene_unit": registration.scene_unit,
         "unit": "known" if registration.unit_known else "found",
         "coefficients": registration.z.tolist(),

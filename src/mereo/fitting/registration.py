@@ -62,6 +62,8 @@ class Registration:
         explained: share of the observed points that lie on the model's facing surface, up to the tolerance.
         accepted: whether that is enough to believe it.
         seconds: of the fit alone.
+        residual: root mean square distance of the observed points from the model's facing surface, input unit; None
+            where the registration was read from a file.
         drawn: the scene's draws where ``method`` is "draws", with their seed: what plays the state again.
     """
 
@@ -75,6 +77,13 @@ class Registration:
     accepted: bool
     seconds: float
     drawn: Drawn | None = None
+    residual: float | None = None
+
+    @cached_property
+    def beyond_states(self) -> float:
+        """How far the state lies outside all that the model has seen (``StatisticalModel.beyond``), scene units."""
+        z = self.z if self.method == "modes" else self.model.project(self.material / self.scene_unit)[1]
+        return self.model.beyond(z)
 
     @cached_property
     def mesh(self) -> SegmentedMesh:

@@ -13,7 +13,8 @@ from jaxtyping import Float, Float32, Int
 
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
-from mereo.fitting.gauss_newton import NormalEquations, Posed, along, geman_mcclure, in_space
+from mereo.fitting.gauss_newton import NormalEquations, Posed, along, cross, geman_mcclure, in_space
+from mereo.fitting.sampled_surface import PosedSamples
 from mereo.geometry.mesh import barycentric
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -54,7 +55,7 @@ class Surface:
     def through(cls, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> "Surface":
         """Surface through posed material points."""
         a, b, c = (material[model.faces[:, i]] for i in range(3))
-        normal = np.cross(b - a, c - a)
+        normal = cross(b - a, c - a)
         facing = np.flatnonzero(np.einsum("fi,fi->f", normal, a) < 0)
         normal = normal[facing]
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
@@ -75,18 +76,15 @@ class Surface:
         squared, face, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         return np.sqrt(squared), face.astype(np.int64), place
 
-    def cloud_term(
-        self, posed: Posed, points: Float[np.ndarray, "p 3"], sigma: float, worth: float
-    ) -> tuple[Float[np.ndarray, "p q"], Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-        """Jacobian, residual and weight of each point's distance to the plane of its nearest facing face."""
+    def planes(
+        self, points: Float[np.ndarray, "p 3"]
+    ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float32[np.ndarray, "p 3 k"]]:
+        """Nearest place of the facing surface to each point, its normal and its modes."""
         _, face, place = self.nearest(points)
         corners = self.model.faces[self.facing[face]]
         weight = barycentric(self.material[corners], place).astype(np.float32)
         modes = np.matmul(weight[:, None], self.model.modes[corners].reshape(len(points), 3, -1))
-        normal = self.normals[face]
-        residual = np.einsum("pi,pi->p", normal, place - points)
-        jacobian = along(posed, place, modes.reshape(len(points), 3, -1), normal)
-        return jacobian, residual, geman_mcclure(residual, ROBUST * sigma) * (worth / len(points) / sigma**2)
+        return place, self.normals[face], modes.reshape(len(points), 3, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,23 +126,34 @@ class NetworkTerm:
         weight = self.confidence / self.confidence.sum() * (worth / sigma**2)
         if robust:
             weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
-        return normal.add(in_space(posed, points, self.modes), offset.T.ravel(), np.tile(weight, 3))
+        return normal.add(in_space(posed, points, self.modes), offset.ravel(), np.repeat(weight, 3))
+
+
+def add_cloud(
+    normal: NormalEquations,
+    posed: Posed,
+    points: Float[np.ndarray, "p 3"],
+    surface: "Surface | PosedSamples",
+    sigma: float,
+    worth: float,
+) -> NormalEquations:
+    """Sum with each point's distance to the plane of the facing surface nearest to it."""
+    place, across, modes = surface.planes(points)
+    residual = np.einsum("pi,pi->p", across, place - points)
+    weight = geman_mcclure(residual, ROBUST * sigma) * (worth / len(points) / sigma**2)
+    return normal.add(along(posed, place, modes, across), residual, weight)
 
 
 def add_witnesses(
-    normal: NormalEquations,
-    surface: Surface,
-    posed: Posed,
-    evidence: Evidence,
-    chosen: Int[np.ndarray, " w"],
-    sigma: float,
+    normal: NormalEquations, posed: Posed, samples: PosedSamples, evidence: Evidence, sigma: float
 ) -> NormalEquations:
-    """Sum with the chosen vertices that are outside the silhouette or in free space."""
-    direction, amount = evidence.violations(surface.material[chosen], ROBUST * sigma)
+    """Sum with the samples of the surface that are outside the silhouette or in free space."""
+    place = samples.place.astype(np.float64)
+    direction, amount = evidence.violations(place, ROBUST * sigma)
     rows = np.flatnonzero(amount > 0)
     if len(rows) == 0:
         return normal
     rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
-    jacobian = along(posed, surface.material[chosen[rows]], surface.model.modes[chosen[rows]], direction[rows])
+    jacobian = along(posed, place[rows], samples.surface.modes[rows, 0], direction[rows])
     weight = WITNESS_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
     return normal.add(jacobian, -amount[rows], weight)

@@ -181,6 +181,15 @@ class StatisticalModel:
         enough = np.flatnonzero(self.residues <= residue)
         return int(enough[0]) if len(enough) else None
 
+    def beyond(self, z: Float[np.ndarray, " k"]) -> float:
+        """How far a state lies outside the range of the library's states: root mean square of the material points.
+
+        A coefficient that any state of the library reaches is within; lengths are scene units.
+        """
+        low, high = self.library.min(axis=0), self.library.max(axis=0)
+        excess = np.maximum(np.maximum(z - high, low - z), 0.0) * self.motion
+        return float(np.sqrt((excess**2).sum()))
+
     def mesh(self, material: Float[np.ndarray, "m 3"]) -> SegmentedMesh:
         """The segments, with the rest mesh's faces, at these positions."""
         ends = np.cumsum(self.vertex_counts)

@@ -1,0 +1,83 @@
+"""Theorems on the fit of the modes: what it must find, and what it must say, of frames whose truth is known."""
+
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from toy_scene import Lift, Shear, toy_scene
+
+from mereo.fitting.correspondences import Correspondences
+from mereo.fitting.fit import fit_correspondences
+from mereo.geometry.camera import Camera
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.transforms import rigid, transform_points
+from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.synthesis.depth_rendering import render_depth
+
+SCENE = toy_scene()
+IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matrix(), np.array([1.0, 2.0, 120.0]))
+"""``T_camera_world`` of an object around the world's origin."""
+
+
+@pytest.fixture(scope="module")
+def model() -> StatisticalModel:
+    return scene_model(SCENE, count=200)
+
+
+def said(model: StatisticalModel, material: np.ndarray, error: float = 0.5) -> Correspondences:
+    """What a network might say of a state: 200 material points, wrong by ``error`` units."""
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(model.labels), 200, replace=False)
+    rest = model.rest_points[chosen] + rng.normal(scale=error, size=(200, 3))
+    return Correspondences(material[chosen], rest, model.labels[chosen], np.ones(200), np.arange(200) < 100)
+
+
+def seen(mesh: SegmentedMesh) -> np.ndarray:
+    """Cloud of a noiseless depth image, from the origin along z."""
+    return render_depth(mesh, Camera.from_fov(128, 128, 0.6)).to_points().points
+
+
+def shown(model: StatisticalModel, excess: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cloud and material points of a state whose draws are ``excess`` times the scene's bounds, camera frame."""
+    shear = Shear(3.0 * excess, 0.3 * excess, 0.2 * excess)
+    state = SCENE.deform((shear, shear, shear, Lift(1.0, shear)))
+    material = transform_points(IN_FRONT, state_points(state, model.nodes, model.node_labels))
+    return seen(state.mesh.transformed(IN_FRONT)), material
+
+
+def test_more_noise_never_makes_the_residual_smaller(model: StatisticalModel) -> None:
+    """The same directions of noise, more and more of it."""
+    points, material = shown(model, 0.5)
+    noise = np.random.default_rng(0).normal(size=(len(points), 1)) * points / np.linalg.norm(points, axis=1)[:, None]
+    residuals = []
+    for std in (0.0, 0.05, 0.1, 0.2, 0.4, 0.8):
+        registration = fit_correspondences(points + std * noise, said(model, material), model, 1.0)
+        assert registration.residual is not None
+        residuals.append(registration.residual)
+    assert (np.diff(residuals) > 0).all()
+    assert residuals[0] < 0.05 and residuals[-1] > 0.3
+
+
+@pytest.mark.parametrize(("excess", "outside"), [(0.5, False), (1.5, True), (2.0, True)])
+def test_a_state_outside_the_bounds_is_said_to_be_outside(
+    model: StatisticalModel, excess: float, outside: bool
+) -> None:
+    """A state that no seed of the scene can have: the cloud shows it, and the registration says so."""
+    points, material = shown(model, excess)
+    registration = fit_correspondences(points, said(model, material), model, 1.0)
+    if outside:
+        assert registration.beyond_states > 0.2
+    else:
+        assert registration.beyond_states == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_modes_reproduce_their_own_states(model: StatisticalModel, seed: int) -> None:
+    """A state of the library, in any pose, is expressed in modes without loss, and seen in a frame it is found."""
+    material = transform_points(IN_FRONT, model.material(model.library[seed]))
+    T, z = model.project(material)
+    np.testing.assert_allclose(transform_points(T, model.material(z)), material, atol=1e-2)
+    registration = fit_correspondences(seen(model.mesh(material)), said(model, material, 1e-3), model, 1.0)
+    assert np.median(np.linalg.norm(registration.material - material, axis=1)) < 0.1
+    assert registration.beyond_states < 0.02
