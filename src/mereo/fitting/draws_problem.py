@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from mereo.deformation.moving_least_squares import PointWeights
@@ -16,12 +15,12 @@ from mereo.fitting.config import MANY_DRAWS, DrawsConfig
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.modes_fit import fit_cloud
-from mereo.fitting.playback import Drawn, DrawnStates, anchors_moved, material_moved
+from mereo.fitting.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.priors import Prior
 from mereo.fitting.problem import Problem
 from mereo.fitting.residuals import NetworkTerm
 from mereo.scenes.scene import Scene
-from mereo.scenes.statistical_model import StatisticalModel, following
+from mereo.scenes.statistical_model import StatisticalModel
 
 DIFFERENCE = 0.02
 """Step of finite differences, in standard deviations of a draw."""
@@ -39,14 +38,12 @@ class DrawsProblem:
         states: random states of the scene.
         found: correspondences, scene units.
         weights: how their rest positions follow the material points.
-        spread: how all material points follow the anchors, as a sparse matrix.
     """
 
     base: Problem
     states: DrawnStates
     found: Correspondences
     weights: PointWeights
-    spread: csr_array
     config: DrawsConfig
 
     @property
@@ -67,11 +64,7 @@ class DrawsProblem:
         model = base.model
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= DrawsConfig().few else MANY_DRAWS
-        every = following(model.rest_anchors, model.rest_points, model.labels)
-        rows = np.repeat(np.arange(len(every.index)), every.index.shape[1])
-        entries = (every.weight.ravel().astype(np.float32), (rows, every.index.ravel()))
-        spread = csr_array(entries, shape=(len(model.rest_points),) * 2)
-        return cls(base, states, found, model.weights(found.rest, found.labels), spread, config)
+        return cls(base, states, found, model.weights(found.rest, found.labels), config)
 
     def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> Problem:
         """The problem in the linear neighbourhood of a state."""
@@ -147,16 +140,16 @@ def linear_step(
 
 
 def jacobian(problem: DrawsProblem, fit: DrawsFit) -> Float32[np.ndarray, "m 3 d"]:
-    """Motion of all material points for a standard deviation of each draw: at the anchors, which the others follow."""
-    model, drawn = problem.model, fit.drawn
-    order = np.concatenate(model.anchors)
-    change = np.zeros((len(model.rest_points), 3, len(fit.z)), dtype=np.float32)
-    for number in np.flatnonzero(drawn.smooth):
+    """Motion of all material points for a standard deviation of each draw: at few points, which the others follow."""
+    few = problem.states.played
+    change = np.zeros((len(few.index), 3, len(fit.z)), dtype=np.float32)
+    here = fit.material[few.index]
+    for number in np.flatnonzero(fit.drawn.smooth):
         step = DIFFERENCE * (-1.0 if fit.z[number] > 0 else 1.0)
         z = fit.z.copy()
         z[number] += step
-        moved = drawn.deformations(problem.scene, z)
+        moved = fit.drawn.deformations(problem.scene, z)
         if moved is not None:
-            change[order, :, number] = (anchors_moved(model, moved) - fit.material[order]) / step
-    spread: np.ndarray = problem.spread @ change.reshape(len(change), -1)
-    return spread.reshape(change.shape)
+            change[:, :, number] = (few.moved(moved) - here) / step
+    spread: np.ndarray = few.spread @ change.reshape(len(change), -1)
+    return spread.reshape(-1, *change.shape[1:])
