@@ -68,7 +68,10 @@ class DrawsConfig:
     Attributes:
         starts: random states that are tried, half of them like the fit of the modes, half like the network's answer.
         kept: how many of them are followed to the end.
-        approaches: linearizations towards the fit of the modes, first of all.
+        sieve: sets of differences spent, and on how many of the best starts, one after the other, towards the shape of
+            the fit of the modes.
+        shape_std: standard deviation of that shape, as a share of half the rest box's longest side.
+        shape_worth: how many independent points it is worth.
         first_rounds, last_rounds: linearizations of all and of those that are kept.
         steps: of the linear fit in each.
         jumps: how often one draw may jump to one of ``places`` places.
@@ -78,9 +81,11 @@ class DrawsConfig:
         start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
     """
 
-    starts: int = 6
+    starts: int = 40
     kept: int = 2
-    approaches: int = 3
+    sieve: tuple[tuple[int, int], ...] = ((1, 16), (2, 4))
+    shape_std: float = 0.02
+    shape_worth: float = 500.0
     first_rounds: int = 2
     last_rounds: int = 5
     steps: int = 4
@@ -92,5 +97,5 @@ class DrawsConfig:
     start_sigma: float = 0.03
 
 
-MANY_DRAWS = DrawsConfig(starts=2, kept=1, approaches=2, first_rounds=1, last_rounds=4, jumps=0)
+MANY_DRAWS = DrawsConfig(starts=16, kept=1, sieve=((1, 3), (2, 1)), first_rounds=1, last_rounds=4, jumps=0)
 """Constants for scenes with many draws."""

@@ -4,25 +4,21 @@ Around a state the scene is linear in its draws (``draws_problem``); it is playe
 and so on, from several starts.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.special import ndtri
 
-from mereo.deformation.moving_least_squares import PointWeights
-from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, between, draws_prior, jacobian, linear_step, played
+from mereo.deformation.moving_least_squares import spread
+from mereo.fitting.draws_approach import Near, Shape, approach, near
+from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, between, linear_step, played
 from mereo.fitting.gauss_newton import Posed
-from mereo.fitting.hypotheses import ALIKE, robust_poses
-from mereo.fitting.modes_fit import fit_network
-from mereo.fitting.playback import Drawn, material_moved
-from mereo.fitting.residuals import NetworkTerm, robust_square
-from mereo.geometry.transforms import fit_rigid
+from mereo.fitting.hypotheses import robust_poses
+from mereo.fitting.playback import Drawn
 
 MOST_DRAWS = 120
 """Scenes with more free numbers are left to the modes."""
 
-TOWARDS_MIDDLE = (1.0, 0.8, 0.6, 0.4)
-"""Shares of guessed draws that are tried, until the scene takes them."""
+RANKED_BY = 150
+"""Points by which random states are compared with a shape."""
 
 SHARES = (1.0, 0.5, 0.2)
 """Shares of a step that are tried until the scene takes one."""
@@ -33,56 +29,43 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     config = problem.config
     if problem.states.z.shape[1] > MOST_DRAWS:
         return None
-    starts = [fit for fit in (started(problem, *start) for start in choose_starts(problem, modes)) if fit is not None]
-    guess = guessed(problem, modes)
-    starts = [approach(problem, fit, modes) for fit in [*starts, *([] if guess is None else [guess])]]
-    for rounds, keep in ((config.first_rounds, config.starts), (config.last_rounds, config.kept)):
-        starts = sorted(starts, key=lambda fit: wide_misfit(problem, fit))[:keep]
-        starts = [descend(problem, fit, rounds) for fit in starts]
+    starts = [played(problem, here.drawn, here.z, posed_on(modes, here)) for here in approached(problem, modes)]
+    starts = sorted((fit for fit in starts if fit is not None), key=lambda fit: fit.misfit)[: config.kept]
+    starts = [descend(problem, fit, config.last_rounds) for fit in starts]
     best = min(starts, key=lambda fit: fit.misfit, default=None)
     return None if best is None else jump(problem, best)
 
 
-def guessed(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
-    """The state whose draws the fit of the modes suggests, or one towards the middle where the scene refuses it."""
-    model, drawn = problem.model, problem.states.guess(modes.z, problem.model.motion, problem.config.near)
-    for share in TOWARDS_MIDDLE:
-        z = np.where(drawn.smooth, share * drawn.z, drawn.z)
-        deformations = drawn.deformations(problem.scene, z)
-        if deformations is not None:
-            T = fit_rigid(material_moved(problem.scene, model, deformations), modes.place(model.material(modes.z)))
-            return played(problem, drawn, z, Posed(T[:3, :3], T[:3, 3], np.empty(0)))
-    return None
+def approached(problem: DrawsProblem, modes: Posed) -> list[Near]:
+    """States shaped like the fit of the modes, the most alike first."""
+    config, states, scene = problem.config, problem.states, problem.scene
+    few, model = states.played, problem.model
+    std = config.shape_std * model.half
+    shape = Shape(model.material(modes.z)[few.index], np.full(len(few.index), std), config.shape_worth)
+    drawn = [Drawn.of(scene, seed) for seed in alike(problem, shape)]
+    drawn.append(states.guess(modes.z, model.motion, config.near))
+    found = [near(scene, few, shape, one, one.z) for one in drawn]
+    here = [one for one in found if one is not None]
+    for fresh, keep in config.sieve:
+        here = sorted(here, key=lambda one: one.misfit)[:keep]
+        here = [approach(scene, few, shape, one, fresh) for one in here]
+    return sorted(here, key=lambda one: one.misfit)
 
 
-def wide_misfit(problem: DrawsProblem, fit: DrawsFit) -> float:
-    """Misfit by the cloud's first sigma."""
-    seen = played(problem, fit.drawn, fit.z, fit.posed, wide=True)
-    return np.inf if seen is None else seen.misfit
+def alike(problem: DrawsProblem, shape: Shape) -> list[int]:
+    """Seeds of the random states most like a shape."""
+    states = problem.states
+    some = spread(shape.points, RANKED_BY)
+    library, goal = states.material[:, states.played.index[some]], shape.points[some].astype(np.float32)
+    sigma = problem.base.network_sigma
+    cost = robust_poses(library, goal, np.ones(len(some), dtype=np.float32), sigma)[0]
+    return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
 
 
-def approach(problem: DrawsProblem, fit: DrawsFit, modes: Posed) -> DrawsFit:
-    """Towards the fit of the modes, which is dense and smooth where the frame is neither."""
-    model, config = problem.model, problem.config
-    target = modes.place(model.material(modes.z))[model.sparse]
-    sigma, best, least = problem.base.network_sigma, fit, np.inf
-    for number in range(config.approaches + 1):
-        apart = robust_square(np.linalg.norm(fit.placed()[model.sparse] - target, axis=1), sigma).mean()
-        if apart >= least:
-            break
-        best, least = fit, apart
-        if number == config.approaches:
-            break
-        motion = jacobian(problem, fit)
-        network = NetworkTerm(target, fit.material[model.sparse], motion[model.sparse], np.ones(len(target)))
-        linear = replace(problem.around(fit.material, motion), network=network)
-        start = replace(fit.posed, z=np.zeros(len(fit.z)))
-        found = fit_network(linear, start, draws_prior(fit, motion, config.trust))
-        tried = (
-            played(problem, fit.drawn, fit.z + share * found.z, between(fit.posed, found, share)) for share in SHARES
-        )
-        fit = next((nearer for nearer in tried if nearer is not None), fit)
-    return best
+def posed_on(modes: Posed, here: Near) -> Posed:
+    """Pose in the camera frame of a state that lies on the fit of the modes."""
+    rotation = modes.rotation @ here.rotation
+    return Posed(rotation, modes.place(here.translation[None])[0], np.empty(0), modes.log_scale)
 
 
 def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
@@ -107,33 +90,6 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
             break
         fit = descend(problem, best, config.first_rounds)
     return fit
-
-
-def choose_starts(problem: DrawsProblem, modes: Posed) -> list[tuple[int, Posed]]:
-    """Seeds and poses: states like the fit of the modes, and states like the network's answer."""
-    model, library = problem.model, problem.states.material
-    each = problem.config.starts // 2
-    sigma = ALIKE * model.half
-    goal = modes.place(model.material(modes.z))[model.sparse].astype(np.float32)
-    like_modes = robust_poses(library[:, model.sparse], goal, np.ones(len(goal), dtype=np.float32), sigma)
-    few = slice(0, None, max(1, len(problem.found.labels) // 64))
-    weights = PointWeights(problem.weights.index[few], problem.weights.weight[few])
-    states = np.stack([weights(material) for material in library]).astype(np.float32)
-    target, weight = problem.found.points[few], problem.found.confidence[few]
-    like_network = robust_poses(
-        states, target.astype(np.float32), weight.astype(np.float32), problem.base.network_sigma
-    )
-    result = []
-    for cost, rotation, translation in (like_modes, like_network):
-        best = np.argsort(cost)[:each]
-        result += [(problem.states.seeds[i], Posed(rotation[i], translation[i], np.empty(0))) for i in best]
-    return list({seed: (seed, pose) for seed, pose in result}.values())
-
-
-def started(problem: DrawsProblem, seed: int, posed: Posed) -> DrawsFit | None:
-    """A random state in its pose; None where it cannot be played back."""
-    drawn = Drawn.of(problem.scene, seed)
-    return played(problem, drawn, drawn.z, posed)
 
 
 def descend(problem: DrawsProblem, fit: DrawsFit, rounds: int) -> DrawsFit:
