@@ -80,6 +80,14 @@ def derivatives(scene: Scene, few: Played, here: Near, difference: float) -> Flo
     return change
 
 
+def secant(
+    motion: Float32[np.ndarray, "a 3 d"], step: Float[np.ndarray, " d"], moved: Float[np.ndarray, "a 3"]
+) -> Float32[np.ndarray, "a 3 d"]:
+    """Derivatives that agree with what a step has really moved, otherwise changed least (Broyden's rule)."""
+    missed = (moved - motion @ step.astype(np.float32)).astype(np.float32)
+    return motion + missed[..., None] * (step / max(float(step @ step), 1e-12)).astype(np.float32)
+
+
 def approach(scene, few, shape, here, fresh=2, steps=6, difference=0.02, log=None):
     """The state near the shape."""
     damping = 0.1
@@ -92,7 +100,7 @@ def approach(scene, few, shape, here, fresh=2, steps=6, difference=0.02, log=Non
                 tried = near(scene, few, shape, here.drawn, here.z + step)
                 if log is not None: log.append((tried is None, tried is not None and tried.misfit<here.misfit))
                 if tried is not None:
-                    motion = motion + ((tried.points - here.points - motion @ step.astype(np.float32))[..., None] * (step / max(float(step @ step), 1e-12))).astype(np.float32)
+                    motion = secant(motion, step, tried.points - here.points)
                 if tried is not None and tried.misfit < here.misfit:
                     found = tried
                     break

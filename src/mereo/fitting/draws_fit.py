@@ -8,9 +8,9 @@ import numpy as np
 from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.fitting.draws_approach import Near, Shape, approach, near
-from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, between, linear_step, played
-from mereo.fitting.gauss_newton import Posed
+from mereo.fitting.draws_approach import Near, Shape, approach, derivatives, near, secant
+from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, misfit, normal_equations, played
+from mereo.fitting.gauss_newton import POSE, Posed
 from mereo.fitting.hypotheses import robust_poses
 from mereo.fitting.playback import Drawn
 
@@ -82,7 +82,7 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
             for value in ndtri((np.arange(config.places) + 0.5) / config.places):
                 z = fit.z.copy()
                 z[number] = value
-                others.append(played(problem, fit.drawn, z, fit.posed, wide=True))
+                others.append(played(problem, fit.drawn, z, fit.posed))
         likely = sorted((other for other in others if other is not None), key=lambda other: other.misfit)
         found = [descend(problem, other, config.first_rounds) for other in likely[: config.kept + 1]]
         best = min(found, key=lambda other: other.misfit, default=fit)
@@ -92,24 +92,42 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     return fit
 
 
-def descend(problem: DrawsProblem, fit: DrawsFit, rounds: int) -> DrawsFit:
-    """Linearize, fit, play; a step that does not lower the misfit is halved, then given up.
-
-    Half of the rounds judge by the wide misfit: far from the answer the narrow one is flat.
-    """
-    trust, sigma = problem.config.trust, problem.config.start_sigma
-    for number in range(rounds):
-        wide = 2 * number < rounds
-        before = played(problem, fit.drawn, fit.z, fit.posed, wide)
-        assert before is not None
-        fit = before
-        step, posed = linear_step(problem, fit, trust, sigma)
-        for share in SHARES:
-            tried = played(problem, fit.drawn, fit.z + share * step, between(fit.posed, posed, share), wide)
-            if tried is not None and tried.misfit < fit.misfit:
-                fit = tried
+def descend(problem: DrawsProblem, fit: DrawsFit, fresh: int) -> DrawsFit:
+    """Levenberg and Marquardt's method on played states; ``fresh`` sets of differences, each for some steps."""
+    config, least = problem.config, problem.base.config.cloud_sigma
+    few, sigma, damping = problem.states.played, max(config.start_sigma * problem.model.half, least), config.damping
+    for number in range(fresh):
+        here = Near(fit.drawn, fit.z, fit.material[few.index], np.eye(3), np.zeros(3), 0.0, 0.0)
+        motion = derivatives(problem.scene, few, here, 0.02)
+        for _ in range(config.steps):
+            before = misfit(problem, fit, sigma)
+            better = None
+            for _ in range(config.tries):
+                step = normal_equations(problem, fit, motion, sigma).step(damping)
+                tried = played(problem, fit.drawn, fit.z + step[POSE:], moved(fit.posed, step))
+                if tried is not None:
+                    motion = secant(motion, step[POSE:], (tried.material - fit.material)[few.index])
+                if TRACE: STAT.append((damping, tried is None, tried is not None and misfit(problem, tried, sigma) < before))
+                if tried is not None and misfit(problem, tried, sigma) < before:
+                    better = tried
+                    break
+                damping *= 6.0
+            if better is None:
                 break
-        else:
-            trust *= 0.3
-        sigma *= 0.6
-    return played(problem, fit.drawn, fit.z, fit.posed) or fit
+            gain = before - misfit(problem, better, sigma)
+            fit, damping = better, max(damping / 6.0, 1e-3)
+            if gain < config.gain * before and sigma <= least:
+                break
+            sigma = max(sigma * config.cooling, least)
+        if TRACE: LOG.append((number, time.process_time(), fit.misfit))
+        damping = min(damping, 1.0)
+    return fit
+
+
+import time
+TRACE, LOG, STAT = 0, [], []
+
+
+def moved(posed, step):
+    """Pose after a step."""
+    return posed.moved(step[:POSE])

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
-from mereo.deformation.moving_least_squares import Anchors, spread
+from mereo.deformation.moving_least_squares import Anchors, PointWeights, spread
 from mereo.geometry.procrustes import best_rotations
 from mereo.scenes.draw_recorder import OutOfDraws, Recorder, Shares
 from mereo.scenes.parameters import random_state
@@ -94,6 +94,13 @@ class Drawn:
             return None
 
 
+def as_sparse(weights: PointWeights, count: int) -> csr_array:
+    """Weights of ``count`` points as a matrix."""
+    rows = np.repeat(np.arange(len(weights.index)), weights.index.shape[1])
+    entries = (weights.weight.ravel().astype(np.float32), (rows, weights.index.ravel()))
+    return csr_array(entries, shape=(len(weights.index), count))
+
+
 @dataclass(frozen=True, eq=False)
 class Played:
     """Few material points of each segment, and how all others follow them.
@@ -118,10 +125,7 @@ class Played:
         counts = tuple(len(part) for part in chosen)
         places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
         few = tuple(Anchors(at, model.rest_points[part]) for at, part in zip(places, chosen, strict=True))
-        all_ = following(few, model.rest_points, model.labels)
-        rows = np.repeat(np.arange(len(all_.index)), all_.index.shape[1])
-        entries = (all_.weight.ravel().astype(np.float32), (rows, all_.index.ravel()))
-        follow = csr_array(entries, shape=(len(model.rest_points), sum(counts)))
+        follow = as_sparse(following(few, model.rest_points, model.labels), sum(counts))
         index = np.concatenate(chosen)
         return cls(model.rest_points[index], index, counts, follow)
 
