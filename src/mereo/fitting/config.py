@@ -84,15 +84,16 @@ class DrawsConfig:
     starts: int = 40
     kept: int = 2
     sieve: tuple[tuple[int, int], ...] = ((1, 16), (2, 4))
-    shape_std: float = 0.02
+    shape_std: float = 0.04
     shape_worth: float = 500.0
     first_rounds: int = 1
-    last_rounds: int = 3
+    last_rounds: int = 2
     steps: int = 6
     tries: int = 3
     damping: float = 0.03
     cooling: float = 0.6
     gain: float = 0.003
+    explained: float = 0.125
     jumps: int = 2
     places: int = 6
     few: int = 30
@@ -101,5 +102,5 @@ class DrawsConfig:
     start_sigma: float = 0.03
 
 
-MANY_DRAWS = DrawsConfig(starts=16, kept=1, sieve=((1, 3), (2, 1)), first_rounds=1, last_rounds=3, jumps=0)
+MANY_DRAWS = DrawsConfig(starts=16, kept=1, sieve=((1, 3), (2, 1)), first_rounds=1, last_rounds=2, jumps=0)
 """Constants for scenes with many draws."""

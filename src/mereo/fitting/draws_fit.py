@@ -5,7 +5,8 @@ and so on, from several starts.
 """
 
 import numpy as np
-from scipy.special import ndtri
+from jaxtyping import Float32
+from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import spread
 from mereo.fitting.draws_approach import Near, Shape, approach, derivatives, near, secant
@@ -13,6 +14,7 @@ from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, misfit, normal_e
 from mereo.fitting.gauss_newton import POSE, Posed
 from mereo.fitting.hypotheses import robust_poses
 from mereo.fitting.playback import Drawn
+from mereo.fitting.residuals import robust_square
 
 MOST_DRAWS = 120
 """Scenes with more free numbers are left to the modes."""
@@ -20,52 +22,74 @@ MOST_DRAWS = 120
 RANKED_BY = 150
 """Points by which random states are compared with a shape."""
 
-SHARES = (1.0, 0.5, 0.2)
-"""Shares of a step that are tried until the scene takes one."""
+SMALLEST = 1e-4
+"""Least share of a draw that jumps."""
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """The best of several starts; None where the scene has too many draws or plays none of them back."""
-    config = problem.config
     if problem.states.z.shape[1] > MOST_DRAWS:
         return None
-    starts = [played(problem, here.drawn, here.z, posed_on(modes, here)) for here in approached(problem, modes)]
-    starts = sorted((fit for fit in starts if fit is not None), key=lambda fit: fit.misfit)[: config.kept]
-    starts = [descend(problem, fit, config.last_rounds) for fit in starts]
-    best = min(starts, key=lambda fit: fit.misfit, default=None)
+    guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
+    found = fitted(problem, modes, shape_of_modes(problem, modes), [guess])
+    if problem.config.jumps and not explained(problem, found):
+        camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
+        found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
+    best = min(found, key=lambda fit: fit.misfit, default=None)
     return None if best is None else jump(problem, best)
 
 
-def approached(problem: DrawsProblem, modes: Posed) -> list[Near]:
-    """States shaped like the fit of the modes, the most alike first."""
-    config, states, scene = problem.config, problem.states, problem.scene
-    few, model = states.played, problem.model
-    std = config.shape_std * model.half
-    shape = Shape(model.material(modes.z)[few.index], np.full(len(few.index), std), config.shape_worth)
-    drawn = [Drawn.of(scene, seed) for seed in alike(problem, shape)]
-    drawn.append(states.guess(modes.z, model.motion, config.near))
-    found = [near(scene, few, shape, one, one.z) for one in drawn]
+def explained(problem: DrawsProblem, found: list[DrawsFit]) -> bool:
+    """Whether one of the states explains the cloud."""
+    sigma = problem.base.config.cloud_sigma
+    least = min((float(robust_square(fit.distance, sigma).mean()) for fit in found), default=np.inf)
+    return least < problem.config.explained
+
+
+def shape_of_modes(problem: DrawsProblem, modes: Posed) -> Shape:
+    """Shape that the fit of the modes has found, unposed: dense and smooth."""
+    config, few = problem.config, problem.states.played.index
+    points = problem.model.material(modes.z)[few]
+    return Shape.of(points, config.shape_std * problem.model.half, config.shape_worth, np.ones(len(few)))
+
+
+def shape_of_network(problem: DrawsProblem, log_scale: float) -> Shape:
+    """Shape that the correspondences have, in the camera frame."""
+    found, sigma = problem.found, problem.base.network_sigma
+    points = found.points * np.exp(-log_scale)
+    return Shape.of(points, sigma, problem.config.shape_worth, found.confidence, problem.followed)
+
+
+def fitted(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
+    """States that explain the frame, from starts like a shape; ``frame`` poses the shape in the camera frame."""
+    config, states = problem.config, problem.states
+    drawn = [Drawn.of(states.scene, seed) for seed in alike(problem, shape)] + guesses
+    found = [near(states, shape, one, one.z) for one in drawn]
     here = [one for one in found if one is not None]
     for fresh, keep in config.sieve:
-        here = sorted(here, key=lambda one: one.misfit)[:keep]
-        here = [approach(scene, few, shape, one, fresh) for one in here]
-    return sorted(here, key=lambda one: one.misfit)
+        here = [approach(states, shape, one, fresh) for one in sorted(here, key=lambda one: one.misfit)[:keep]]
+    starts = [(played(problem, one.drawn, one.z, posed_on(frame, one)), one.motion) for one in here]
+    likely = sorted(((fit, motion) for fit, motion in starts if fit is not None), key=lambda start: start[0].misfit)
+    return [descend(problem, fit, config.last_rounds, motion) for fit, motion in likely[: config.kept]]
 
 
 def alike(problem: DrawsProblem, shape: Shape) -> list[int]:
     """Seeds of the random states most like a shape."""
     states = problem.states
     some = spread(shape.points, RANKED_BY)
-    library, goal = states.material[:, states.played.index[some]], shape.points[some].astype(np.float32)
-    sigma = problem.base.network_sigma
-    cost = robust_poses(library, goal, np.ones(len(some), dtype=np.float32), sigma)[0]
+    library, goal = states.material[:, states.played.index], shape.points[some].astype(np.float32)
+    if shape.follow is None:
+        compared = library[:, some]
+    else:
+        compared = np.stack([shape.follow[some] @ one for one in library])
+    cost = robust_poses(compared, goal, shape.weight[some].astype(np.float32), problem.base.network_sigma)[0]
     return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
 
 
-def posed_on(modes: Posed, here: Near) -> Posed:
-    """Pose in the camera frame of a state that lies on the fit of the modes."""
-    rotation = modes.rotation @ here.rotation
-    return Posed(rotation, modes.place(here.translation[None])[0], np.empty(0), modes.log_scale)
+def posed_on(frame: Posed, here: Near) -> Posed:
+    """Pose in the camera frame of a state that lies on a shape whose own pose there is ``frame``."""
+    translation = frame.place(here.translation[None])[0]
+    return Posed(frame.rotation @ here.rotation, translation, np.empty(0), frame.log_scale)
 
 
 def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
@@ -73,17 +97,19 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
 
     Only while the cloud is not explained.
     """
-    config, base = problem.config, problem.base
+    config = problem.config
+    sigma = first_sigma(problem)
     for _ in range(config.jumps):
-        if problem.rigid(fit.material).misfit(fit.posed).cloud < base.config.explained:
+        if explained(problem, [fit]):
             break
         others = []
         for number in np.flatnonzero(fit.drawn.smooth):
-            for value in ndtri((np.arange(config.places) + 0.5) / config.places):
+            for turn in range(1, config.places):
                 z = fit.z.copy()
-                z[number] = value
+                z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.places) % 1.0, SMALLEST, 1 - SMALLEST))
                 others.append(played(problem, fit.drawn, z, fit.posed))
-        likely = sorted((other for other in others if other is not None), key=lambda other: other.misfit)
+        likely = [other for other in others if other is not None]
+        likely.sort(key=lambda other: misfit(problem, other, sigma))
         found = [descend(problem, other, config.first_rounds) for other in likely[: config.kept + 1]]
         best = min(found, key=lambda other: other.misfit, default=fit)
         if best.misfit >= fit.misfit:
@@ -92,42 +118,45 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     return fit
 
 
-def descend(problem: DrawsProblem, fit: DrawsFit, fresh: int) -> DrawsFit:
-    """Levenberg and Marquardt's method on played states; ``fresh`` sets of differences, each for some steps."""
+def first_sigma(problem: DrawsProblem) -> float:
+    """The cloud's first standard deviation, scene units."""
+    return max(problem.config.start_sigma * problem.model.half, problem.base.config.cloud_sigma)
+
+
+def descend(
+    problem: DrawsProblem, fit: DrawsFit, fresh: int, motion: Float32[np.ndarray, "a 3 d"] | None = None
+) -> DrawsFit:
+    """Levenberg and Marquardt's method on played states, by ``fresh`` sets of differences after the given one."""
     config, least = problem.config, problem.base.config.cloud_sigma
-    few, sigma, damping = problem.states.played, max(config.start_sigma * problem.model.half, least), config.damping
-    for number in range(fresh):
-        here = Near(fit.drawn, fit.z, fit.material[few.index], np.eye(3), np.zeros(3), 0.0, 0.0)
-        motion = derivatives(problem.scene, few, here, 0.02)
+    index, sigma, damping = problem.states.played.index, first_sigma(problem), config.damping
+    for number in range(fresh + (motion is not None)):
+        if number or motion is None:
+            motion = derivatives(problem.states, fit.drawn, fit.z, fit.material[index])
+        start = fit.misfit
         for _ in range(config.steps):
             before = misfit(problem, fit, sigma)
-            better = None
-            for _ in range(config.tries):
-                step = normal_equations(problem, fit, motion, sigma).step(damping)
-                tried = played(problem, fit.drawn, fit.z + step[POSE:], moved(fit.posed, step))
-                if tried is not None:
-                    motion = secant(motion, step[POSE:], (tried.material - fit.material)[few.index])
-                if TRACE: STAT.append((damping, tried is None, tried is not None and misfit(problem, tried, sigma) < before))
-                if tried is not None and misfit(problem, tried, sigma) < before:
-                    better = tried
-                    break
-                damping *= 6.0
-            if better is None:
-                break
-            gain = before - misfit(problem, better, sigma)
-            fit, damping = better, max(damping / 6.0, 1e-3)
-            if gain < config.gain * before and sigma <= least:
+            fit, motion, damping = lower(problem, fit, motion, sigma, damping)
+            gain = before - misfit(problem, fit, sigma)
+            if gain == 0 or (gain < config.gain * before and sigma <= least):
                 break
             sigma = max(sigma * config.cooling, least)
-        if TRACE: LOG.append((number, time.process_time(), fit.misfit))
+        if sigma <= least and start - fit.misfit < config.gain * start:
+            break
         damping = min(damping, 1.0)
     return fit
 
 
-import time
-TRACE, LOG, STAT = 0, [], []
-
-
-def moved(posed, step):
-    """Pose after a step."""
-    return posed.moved(step[:POSE])
+def lower(
+    problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float, damping: float
+) -> tuple[DrawsFit, Float32[np.ndarray, "a 3 d"], float]:
+    """A state of lower misfit, or the same; what was learnt of the motion; the next damping."""
+    index, least = problem.states.played.index, misfit(problem, fit, sigma)
+    for _ in range(problem.config.tries):
+        step = normal_equations(problem, fit, motion, sigma).step(damping)
+        tried = played(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))
+        if tried is not None:
+            motion = secant(motion, step[POSE:], (tried.material - fit.material)[index])
+            if misfit(problem, tried, sigma) < least:
+                return tried, motion, max(damping / 6.0, 1e-3)
+        damping *= 6.0
+    return fit, motion, damping

@@ -146,7 +146,9 @@ def normal_equations(
     spread = problem.states.played.spread
     still = np.abs(motion).max(axis=(0, 1)) < 1e-9
     precision = np.diag(np.where(still, HELD, 1.0))
-    normal = NormalEquations.prior(np.where(still, 0.0, fit.z), np.zeros(count), precision, posed.log_scale, base.scale_std)
+    normal = NormalEquations.prior(
+        np.where(still, 0.0, fit.z), np.zeros(count), precision, posed.log_scale, base.scale_std
+    )
     network = problem.network(fit, (problem.followed @ flat).reshape(-1, 3, count))
     state = replace(posed, z=np.zeros(count))
     normal = network.add_to(normal, state, base.network_sigma, config.network_worth[1], robust=True)
