@@ -32,18 +32,18 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
         return None
     guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
     found = fitted(problem, modes, shape_of_modes(problem, modes), [guess])
-    if problem.config.jumps and not explained(problem, found):
+    if problem.config.jumps and not explained(problem, found, problem.config.explained):
         camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
         found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
     best = min(found, key=lambda fit: fit.misfit, default=None)
     return None if best is None else jump(problem, best)
 
 
-def explained(problem: DrawsProblem, found: list[DrawsFit]) -> bool:
-    """Whether one of the states explains the cloud."""
+def explained(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool:
+    """Whether the cloud's misfit under one of the states is below ``most``."""
     sigma = problem.base.config.cloud_sigma
     least = min((float(robust_square(fit.distance, sigma).mean()) for fit in found), default=np.inf)
-    return least < problem.config.explained
+    return least < most
 
 
 def shape_of_modes(problem: DrawsProblem, modes: Posed) -> Shape:
@@ -61,11 +61,25 @@ def shape_of_network(problem: DrawsProblem, log_scale: float) -> Shape:
 
 
 def fitted(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
-    """States that explain the frame, from starts like a shape; ``frame`` poses the shape in the camera frame."""
+    """States that explain the frame, from starts like a shape; ``frame`` poses the shape in the camera frame.
+
+    While what is found is far from explaining the cloud, the next starts are tried.
+    """
     config, states = problem.config, problem.states
     drawn = [Drawn.of(states.scene, seed) for seed in alike(problem, shape)] + guesses
     found = [near(states, shape, one, one.z) for one in drawn]
-    here = [one for one in found if one is not None]
+    here = sorted((one for one in found if one is not None), key=lambda one: one.misfit)
+    batch, fits = config.sieve[0][1], list[DrawsFit]()
+    for number in range(config.batches):
+        fits += followed(problem, frame, shape, here[number * batch : (number + 1) * batch])
+        if explained(problem, fits, config.hopeless):
+            break
+    return fits
+
+
+def followed(problem: DrawsProblem, frame: Posed, shape: Shape, here: list[Near]) -> list[DrawsFit]:
+    """The best of some starts, followed to the end."""
+    config, states = problem.config, problem.states
     for fresh, keep in config.sieve:
         here = [approach(states, shape, one, fresh) for one in sorted(here, key=lambda one: one.misfit)[:keep]]
     starts = [(played(problem, one.drawn, one.z, posed_on(frame, one)), one.motion) for one in here]
@@ -100,7 +114,7 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     config = problem.config
     sigma = first_sigma(problem)
     for _ in range(config.jumps):
-        if explained(problem, [fit]):
+        if explained(problem, [fit], config.explained):
             break
         others = []
         for number in np.flatnonzero(fit.drawn.smooth):

@@ -153,9 +153,9 @@ def normal_equations(
     state = replace(posed, z=np.zeros(count))
     normal = network.add_to(normal, state, base.network_sigma, config.network_worth[1], robust=True)
     corners = problem.model.faces[fit.surface.facing[fit.face]]
-    weight = barycentric(fit.surface.material[corners], fit.place).astype(np.float32)
+    within = barycentric(fit.surface.material[corners], fit.place).astype(np.float32)
     rows = np.repeat(np.arange(len(corners)), 3)
-    at_places = csr_array((weight.ravel(), (rows, corners.ravel())), shape=(len(corners), spread.shape[0])) @ spread
+    at_places = csr_array((within.ravel(), (rows, corners.ravel())), shape=(len(corners), spread.shape[0])) @ spread
     modes = (at_places @ flat).reshape(-1, 3, count)
     direction = fit.surface.normals[fit.face]
     residual = np.einsum("pi,pi->p", direction, fit.place - base.evidence.partners)
