@@ -1,6 +1,5 @@
 """Theorems on the fit of the modes: what it must find, and what it must say, of frames whose truth is known."""
 
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

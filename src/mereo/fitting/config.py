@@ -81,31 +81,46 @@ class DrawsConfig:
     """Constants of the fit of draws.
 
     Attributes:
-        starts: random states that are tried, half of them like the fit of the modes, half like the network's answer.
-        kept: how many of them are followed to the end.
-        approaches: linearizations towards the fit of the modes, first of all.
-        first_rounds, last_rounds: linearizations of all and of those that are kept.
-        steps: of the linear fit in each.
-        jumps: how often one draw may jump to one of ``places`` places.
-        few: scenes with more draws than this get ``MANY_DRAWS`` instead: every linearization plays each draw once.
+        starts: random states that are compared with a shape, the most like it.
+        sieve: sets of differences spent on each start, and on how many of the best, one stage after the other.
+        kept: how many of them are then fitted to the frame.
+        shape_std: standard deviation of the shape that the modes found, as a share of half the rest box's longest side.
+        shape_worth: how many independent points a shape is worth.
+        first_rounds, last_rounds: sets of differences in the fit to the frame, after a jump and else.
+        steps: at most with one set of differences.
+        tries: dampings at most in one step.
+        damping: the first one, relative to the diagonal.
+        cooling: of the cloud's sigma in each step.
+        gain: relative gain of a step below which nothing more is tried.
+        explained: the cloud's misfit above which the network's answer is a start too, and draws may jump.
+        hopeless: the same, above which the next starts are tried, in at most ``batches`` of them.
+        jumps: how often one draw may jump to one of ``places`` places; 0 also leaves out the network's answer.
+        few: scenes with more draws than this get ``MANY_DRAWS`` instead: every set of differences plays each draw once.
         near: how many states count as near where draws are guessed from the modes.
-        trust: standard deviation of a draw's change in one linearization.
         start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
     """
 
-    starts: int = 6
+    starts: int = 40
     kept: int = 2
-    approaches: int = 3
-    first_rounds: int = 2
-    last_rounds: int = 5
-    steps: int = 4
+    sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
+    shape_std: float = 0.04
+    shape_worth: float = 500.0
+    first_rounds: int = 1
+    last_rounds: int = 2
+    steps: int = 6
+    tries: int = 3
+    damping: float = 0.03
+    cooling: float = 0.6
+    gain: float = 0.003
+    explained: float = 0.125
+    hopeless: float = 0.25
+    batches: int = 1
     jumps: int = 2
     places: int = 6
     few: int = 30
     near: int = 100
-    trust: float = 0.7
     start_sigma: float = 0.03
 
 
-MANY_DRAWS = DrawsConfig(starts=2, kept=1, approaches=2, first_rounds=1, last_rounds=4, jumps=0)
+MANY_DRAWS = DrawsConfig(batches=3, starts=16, kept=1, sieve=((1, 3), (1, 1)), first_rounds=1, last_rounds=2, jumps=0)
 """Constants for scenes with many draws."""

@@ -4,85 +4,106 @@ Around a state the scene is linear in its draws (``draws_problem``); it is playe
 and so on, from several starts.
 """
 
-from dataclasses import replace
-
 import numpy as np
-from scipy.special import ndtri
+from jaxtyping import Float32
+from scipy.special import ndtr, ndtri
 
-from mereo.deformation.moving_least_squares import PointWeights
-from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, between, draws_prior, jacobian, linear_step, played
-from mereo.fitting.gauss_newton import Posed
-from mereo.fitting.hypotheses import ALIKE, robust_poses
-from mereo.fitting.modes_fit import fit_network
-from mereo.fitting.playback import Drawn, material_moved
-from mereo.fitting.residuals import NetworkTerm, robust_square
-from mereo.geometry.transforms import fit_rigid
+from mereo.deformation.moving_least_squares import spread
+from mereo.fitting.draws_approach import Near, Shape, approach, derivatives, near, secant
+from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, misfit, normal_equations, played
+from mereo.fitting.gauss_newton import POSE, Posed
+from mereo.fitting.hypotheses import robust_poses
+from mereo.fitting.playback import Drawn
+from mereo.fitting.residuals import robust_square
 
 MOST_DRAWS = 120
 """Scenes with more free numbers are left to the modes."""
 
-TOWARDS_MIDDLE = (1.0, 0.8, 0.6, 0.4)
-"""Shares of guessed draws that are tried, until the scene takes them."""
+RANKED_BY = 150
+"""Points by which random states are compared with a shape."""
 
-SHARES = (1.0, 0.5, 0.2)
-"""Shares of a step that are tried until the scene takes one."""
+SMALLEST = 1e-4
+"""Least share of a draw that jumps."""
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """The best of several starts; None where the scene has too many draws or plays none of them back."""
-    config = problem.config
     if problem.states.z.shape[1] > MOST_DRAWS:
         return None
-    starts = [fit for fit in (started(problem, *start) for start in choose_starts(problem, modes)) if fit is not None]
-    guess = guessed(problem, modes)
-    starts = [approach(problem, fit, modes) for fit in [*starts, *([] if guess is None else [guess])]]
-    for rounds, keep in ((config.first_rounds, config.starts), (config.last_rounds, config.kept)):
-        starts = sorted(starts, key=lambda fit: wide_misfit(problem, fit))[:keep]
-        starts = [descend(problem, fit, rounds) for fit in starts]
-    best = min(starts, key=lambda fit: fit.misfit, default=None)
+    guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
+    found = fitted(problem, modes, shape_of_modes(problem, modes), [guess])
+    if problem.config.jumps and not explained(problem, found, problem.config.explained):
+        camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
+        found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
+    best = min(found, key=lambda fit: fit.misfit, default=None)
     return None if best is None else jump(problem, best)
 
 
-def guessed(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
-    """The state whose draws the fit of the modes suggests, or one towards the middle where the scene refuses it."""
-    model, drawn = problem.model, problem.states.guess(modes.z, problem.model.motion, problem.config.near)
-    for share in TOWARDS_MIDDLE:
-        z = np.where(drawn.smooth, share * drawn.z, drawn.z)
-        deformations = drawn.deformations(problem.scene, z)
-        if deformations is not None:
-            T = fit_rigid(material_moved(problem.scene, model, deformations), modes.place(model.material(modes.z)))
-            return played(problem, drawn, z, Posed(T[:3, :3], T[:3, 3], np.empty(0)))
-    return None
+def explained(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool:
+    """Whether the cloud's misfit under one of the states is below ``most``."""
+    sigma = problem.base.config.cloud_sigma
+    least = min((float(robust_square(fit.distance, sigma).mean()) for fit in found), default=np.inf)
+    return least < most
 
 
-def wide_misfit(problem: DrawsProblem, fit: DrawsFit) -> float:
-    """Misfit by the cloud's first sigma."""
-    seen = played(problem, fit.drawn, fit.z, fit.posed, wide=True)
-    return np.inf if seen is None else seen.misfit
+def shape_of_modes(problem: DrawsProblem, modes: Posed) -> Shape:
+    """Shape that the fit of the modes has found, unposed: dense and smooth."""
+    config, few = problem.config, problem.states.played.index
+    points = problem.model.material(modes.z)[few]
+    return Shape.of(points, config.shape_std * problem.model.half, config.shape_worth, np.ones(len(few)))
 
 
-def approach(problem: DrawsProblem, fit: DrawsFit, modes: Posed) -> DrawsFit:
-    """Towards the fit of the modes, which is dense and smooth where the frame is neither."""
-    model, config = problem.model, problem.config
-    target = modes.place(model.material(modes.z))[model.sparse]
-    sigma, best, least = problem.base.network_sigma, fit, np.inf
-    for number in range(config.approaches + 1):
-        apart = robust_square(np.linalg.norm(fit.placed()[model.sparse] - target, axis=1), sigma).mean()
-        if apart >= least:
+def shape_of_network(problem: DrawsProblem, log_scale: float) -> Shape:
+    """Shape that the correspondences have, in the camera frame."""
+    found, sigma = problem.found, problem.base.network_sigma
+    points = found.points * np.exp(-log_scale)
+    return Shape.of(points, sigma, problem.config.shape_worth, found.confidence, problem.followed)
+
+
+def fitted(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
+    """States that explain the frame, from starts like a shape; ``frame`` poses the shape in the camera frame.
+
+    While what is found is far from explaining the cloud, the next starts are tried.
+    """
+    config, states = problem.config, problem.states
+    drawn = [Drawn.of(states.scene, seed) for seed in alike(problem, shape)] + guesses
+    found = [near(states, shape, one, one.z) for one in drawn]
+    here = sorted((one for one in found if one is not None), key=lambda one: one.misfit)
+    batch, fits = config.sieve[0][1], list[DrawsFit]()
+    for number in range(config.batches):
+        fits += followed(problem, frame, shape, here[number * batch : (number + 1) * batch])
+        if explained(problem, fits, config.hopeless):
             break
-        best, least = fit, apart
-        if number == config.approaches:
-            break
-        motion = jacobian(problem, fit)
-        network = NetworkTerm(target, fit.material[model.sparse], motion[model.sparse], np.ones(len(target)))
-        linear = replace(problem.around(fit.material, motion), network=network)
-        start = replace(fit.posed, z=np.zeros(len(fit.z)))
-        found = fit_network(linear, start, draws_prior(fit, motion, config.trust))
-        tried = (
-            played(problem, fit.drawn, fit.z + share * found.z, between(fit.posed, found, share)) for share in SHARES
-        )
-        fit = next((nearer for nearer in tried if nearer is not None), fit)
-    return best
+    return fits
+
+
+def followed(problem: DrawsProblem, frame: Posed, shape: Shape, here: list[Near]) -> list[DrawsFit]:
+    """The best of some starts, followed to the end."""
+    config, states = problem.config, problem.states
+    for fresh, keep in config.sieve:
+        here = [approach(states, shape, one, fresh) for one in sorted(here, key=lambda one: one.misfit)[:keep]]
+    starts = [(played(problem, one.drawn, one.z, posed_on(frame, one)), one.motion) for one in here]
+    likely = sorted(((fit, motion) for fit, motion in starts if fit is not None), key=lambda start: start[0].misfit)
+    return [descend(problem, fit, config.last_rounds, motion) for fit, motion in likely[: config.kept]]
+
+
+def alike(problem: DrawsProblem, shape: Shape) -> list[int]:
+    """Seeds of the random states most like a shape."""
+    states = problem.states
+    some = spread(shape.points, RANKED_BY)
+    library, goal = states.material[:, states.played.index], shape.points[some].astype(np.float32)
+    if shape.follow is None:
+        compared = library[:, some]
+    else:
+        compared = np.stack([shape.follow[some] @ one for one in library])
+    cost = robust_poses(compared, goal, shape.weight[some].astype(np.float32), problem.base.network_sigma)[0]
+    return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
+
+
+def posed_on(frame: Posed, here: Near) -> Posed:
+    """Pose in the camera frame of a state that lies on a shape whose own pose there is ``frame``."""
+    translation = frame.place(here.translation[None])[0]
+    return Posed(frame.rotation @ here.rotation, translation, np.empty(0), frame.log_scale)
 
 
 def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
@@ -90,17 +111,19 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
 
     Only while the cloud is not explained.
     """
-    config, base = problem.config, problem.base
+    config = problem.config
+    sigma = first_sigma(problem)
     for _ in range(config.jumps):
-        if problem.rigid(fit.material).misfit(fit.posed).cloud < base.config.explained:
+        if explained(problem, [fit], config.explained):
             break
         others = []
         for number in np.flatnonzero(fit.drawn.smooth):
-            for value in ndtri((np.arange(config.places) + 0.5) / config.places):
+            for turn in range(1, config.places):
                 z = fit.z.copy()
-                z[number] = value
-                others.append(played(problem, fit.drawn, z, fit.posed, wide=True))
-        likely = sorted((other for other in others if other is not None), key=lambda other: other.misfit)
+                z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.places) % 1.0, SMALLEST, 1 - SMALLEST))
+                others.append(played(problem, fit.drawn, z, fit.posed))
+        likely = [other for other in others if other is not None]
+        likely.sort(key=lambda other: misfit(problem, other, sigma))
         found = [descend(problem, other, config.first_rounds) for other in likely[: config.kept + 1]]
         best = min(found, key=lambda other: other.misfit, default=fit)
         if best.misfit >= fit.misfit:
@@ -109,51 +132,45 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     return fit
 
 
-def choose_starts(problem: DrawsProblem, modes: Posed) -> list[tuple[int, Posed]]:
-    """Seeds and poses: states like the fit of the modes, and states like the network's answer."""
-    model, library = problem.model, problem.states.material
-    each = problem.config.starts // 2
-    sigma = ALIKE * model.half
-    goal = modes.place(model.material(modes.z))[model.sparse].astype(np.float32)
-    like_modes = robust_poses(library[:, model.sparse], goal, np.ones(len(goal), dtype=np.float32), sigma)
-    few = slice(0, None, max(1, len(problem.found.labels) // 64))
-    weights = PointWeights(problem.weights.index[few], problem.weights.weight[few])
-    states = np.stack([weights(material) for material in library]).astype(np.float32)
-    target, weight = problem.found.points[few], problem.found.confidence[few]
-    like_network = robust_poses(
-        states, target.astype(np.float32), weight.astype(np.float32), problem.base.network_sigma
-    )
-    result = []
-    for cost, rotation, translation in (like_modes, like_network):
-        best = np.argsort(cost)[:each]
-        result += [(problem.states.seeds[i], Posed(rotation[i], translation[i], np.empty(0))) for i in best]
-    return list({seed: (seed, pose) for seed, pose in result}.values())
+def first_sigma(problem: DrawsProblem) -> float:
+    """The cloud's first standard deviation, scene units."""
+    return max(problem.config.start_sigma * problem.model.half, problem.base.config.cloud_sigma)
 
 
-def started(problem: DrawsProblem, seed: int, posed: Posed) -> DrawsFit | None:
-    """A random state in its pose; None where it cannot be played back."""
-    drawn = Drawn.of(problem.scene, seed)
-    return played(problem, drawn, drawn.z, posed)
-
-
-def descend(problem: DrawsProblem, fit: DrawsFit, rounds: int) -> DrawsFit:
-    """Linearize, fit, play; a step that does not lower the misfit is halved, then given up.
-
-    Half of the rounds judge by the wide misfit: far from the answer the narrow one is flat.
-    """
-    trust, sigma = problem.config.trust, problem.config.start_sigma
-    for number in range(rounds):
-        wide = 2 * number < rounds
-        before = played(problem, fit.drawn, fit.z, fit.posed, wide)
-        assert before is not None
-        fit = before
-        step, posed = linear_step(problem, fit, trust, sigma)
-        for share in SHARES:
-            tried = played(problem, fit.drawn, fit.z + share * step, between(fit.posed, posed, share), wide)
-            if tried is not None and tried.misfit < fit.misfit:
-                fit = tried
+def descend(
+    problem: DrawsProblem, fit: DrawsFit, fresh: int, motion: Float32[np.ndarray, "a 3 d"] | None = None
+) -> DrawsFit:
+    """Levenberg and Marquardt's method on played states, by ``fresh`` sets of differences after the given one."""
+    config, least = problem.config, problem.base.config.cloud_sigma
+    index, sigma, damping = problem.states.played.index, first_sigma(problem), config.damping
+    for number in range(fresh + (motion is not None)):
+        if number or motion is None:
+            motion = derivatives(problem.states, fit.drawn, fit.z, fit.material[index])
+        start = fit.misfit
+        for _ in range(config.steps):
+            before = misfit(problem, fit, sigma)
+            fit, motion, damping = lower(problem, fit, motion, sigma, damping)
+            gain = before - misfit(problem, fit, sigma)
+            if gain == 0 or (gain < config.gain * before and sigma <= least):
                 break
-        else:
-            trust *= 0.3
-        sigma *= 0.6
-    return played(problem, fit.drawn, fit.z, fit.posed) or fit
+            sigma = max(sigma * config.cooling, least)
+        if sigma <= least and start - fit.misfit < config.gain * start:
+            break
+        damping = min(damping, 1.0)
+    return fit
+
+
+def lower(
+    problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float, damping: float
+) -> tuple[DrawsFit, Float32[np.ndarray, "a 3 d"], float]:
+    """A state of lower misfit, or the same; what was learnt of the motion; the next damping."""
+    index, least = problem.states.played.index, misfit(problem, fit, sigma)
+    for _ in range(problem.config.tries):
+        step = normal_equations(problem, fit, motion, sigma).step(damping)
+        tried = played(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))
+        if tried is not None:
+            motion = secant(motion, step[POSE:], (tried.material - fit.material)[index])
+            if misfit(problem, tried, sigma) < least:
+                return tried, motion, max(damping / 6.0, 1e-3)
+        damping *= 6.0
+    return fit, motion, damping

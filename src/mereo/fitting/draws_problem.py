@@ -5,26 +5,22 @@ modes, fitted by the same code.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 from scipy.sparse import csr_array
-from scipy.spatial.transform import Rotation
 
 from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.config import MANY_DRAWS, DrawsConfig
 from mereo.fitting.correspondences import Correspondences
-from mereo.fitting.gauss_newton import Posed
-from mereo.fitting.modes_fit import fit_cloud
-from mereo.fitting.playback import Drawn, DrawnStates, anchors_moved, material_moved
-from mereo.fitting.priors import Prior
+from mereo.fitting.gauss_newton import NormalEquations, Posed, along, geman_mcclure
+from mereo.fitting.playback import Drawn, DrawnStates, as_sparse, material_moved
 from mereo.fitting.problem import Problem
-from mereo.fitting.residuals import NetworkTerm
+from mereo.fitting.residuals import MOST_VIOLATIONS, ROBUST, WITNESS_WEIGHT, NetworkTerm, Surface, robust_square
+from mereo.geometry.mesh import barycentric
 from mereo.scenes.scene import Scene
-from mereo.scenes.statistical_model import StatisticalModel, following
-
-DIFFERENCE = 0.02
-"""Step of finite differences, in standard deviations of a draw."""
+from mereo.scenes.statistical_model import StatisticalModel
 
 HELD = 1e6
 """Precision of draws that move nothing here: they stay."""
@@ -39,14 +35,12 @@ class DrawsProblem:
         states: random states of the scene.
         found: correspondences, scene units.
         weights: how their rest positions follow the material points.
-        spread: how all material points follow the anchors, as a sparse matrix.
     """
 
     base: Problem
     states: DrawnStates
     found: Correspondences
     weights: PointWeights
-    spread: csr_array
     config: DrawsConfig
 
     @property
@@ -67,17 +61,23 @@ class DrawsProblem:
         model = base.model
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= DrawsConfig().few else MANY_DRAWS
-        every = following(model.rest_anchors, model.rest_points, model.labels)
-        rows = np.repeat(np.arange(len(every.index)), every.index.shape[1])
-        entries = (every.weight.ravel().astype(np.float32), (rows, every.index.ravel()))
-        spread = csr_array(entries, shape=(len(model.rest_points),) * 2)
-        return cls(base, states, found, model.weights(found.rest, found.labels), spread, config)
+        return cls(base, states, found, model.weights(found.rest, found.labels), config)
 
     def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> Problem:
         """The problem in the linear neighbourhood of a state."""
         model = self.model.around(mean, modes)
         network = NetworkTerm(self.found.points, self.weights(mean), self.weights(modes), self.found.confidence)
         return Problem(model, network, self.base.evidence, self.base.scale_std, self.base.config)
+
+    def network(self, fit: "DrawsFit", modes: Float32[np.ndarray, "n 3 d"] | None = None) -> NetworkTerm:
+        """Correspondences in the neighbourhood of a state."""
+        modes = np.zeros((len(self.found.labels), 3, 0), dtype=np.float32) if modes is None else modes
+        return NetworkTerm(self.found.points, self.weights(fit.material), modes, self.found.confidence)
+
+    @cached_property
+    def followed(self) -> csr_array:
+        """How the rest positions of the correspondences follow the played points."""
+        return as_sparse(self.weights, len(self.model.rest_points)) @ self.states.played.spread
 
     def rigid(self, material: Float[np.ndarray, "m 3"]) -> Problem:
         """Problem of one state's pose alone."""
@@ -86,77 +86,88 @@ class DrawsProblem:
 
 @dataclass(frozen=True, eq=False)
 class DrawsFit:
-    """A played state, posed: draws, rigid pose (its ``z`` is empty), material points unposed, misfit with its prior."""
+    """A played state beside the frame.
+
+    Attributes:
+        drawn, z: the state by its draws.
+        posed: rigid pose; its ``z`` is empty.
+        material: material points, unposed.
+        surface: the posed surface.
+        distance, face, place: of the nearest point of the facing surface to each observed partner.
+        misfit: with the prior of the draws, the cloud by its last sigma.
+    """
 
     drawn: Drawn
     z: Float[np.ndarray, " d"]
     posed: Posed
     material: Float[np.ndarray, "m 3"]
+    surface: Surface
+    distance: Float[np.ndarray, " p"]
+    face: Int[np.ndarray, " p"]
+    place: Float[np.ndarray, "p 3"]
     misfit: float
 
     def placed(self) -> Float[np.ndarray, "m 3"]:
         """Material points in the camera frame."""
-        return self.posed.place(self.material)
+        return self.surface.material
 
 
-def played(
-    problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed, wide: bool = False
-) -> DrawsFit | None:
-    """The state of these draws and how badly it explains the frame; None where the scene refuses it.
-
-    ``wide`` takes the cloud's first sigma, which tells how far off a state is that is not yet right.
-    """
+def played(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed) -> DrawsFit | None:
+    """The state of these draws and how badly it explains the frame; None where the scene refuses it."""
     deformations = drawn.deformations(problem.scene, z)
     if deformations is None:
         return None
     material = material_moved(problem.scene, problem.model, deformations)
     rigid = replace(posed, z=np.empty(0))
-    sigma = problem.config.start_sigma * problem.model.half if wide else None
-    misfit = problem.rigid(material).misfit(rigid, sigma).total + float(z @ z)
-    return DrawsFit(drawn, z, rigid, material, misfit)
+    surface = Surface.through(problem.model, rigid.place(material))
+    if len(surface.facing) == 0:
+        return None
+    nearest = surface.nearest(problem.base.evidence.partners)
+    fit = DrawsFit(drawn, z, rigid, material, surface, *nearest, np.inf)
+    return replace(fit, misfit=misfit(problem, fit, problem.base.config.cloud_sigma))
 
 
-def draws_prior(fit: DrawsFit, motion: Float32[np.ndarray, "m 3 d"], trust: float) -> Prior:
-    """Prior of a change of the draws: N(0, 1) of the draws themselves; those that move nothing stay."""
-    moving = np.abs(motion).max(axis=(0, 1)) > 1e-9
-    precision = 1.0 + 1.0 / trust**2
-    return Prior(np.where(moving, -fit.z / precision, 0.0), np.diag(np.where(moving, precision, HELD)))
+def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
+    """Misfit as ``Problem.misfit`` counts it, by any sigma of the cloud, without looking for partners again."""
+    base = problem.base
+    cloud = base.config.cloud_worth * float(robust_square(fit.distance, sigma).mean())
+    network = base.config.network_worth[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
+    amount = base.evidence.violations(fit.surface.material[base.witnesses], ROBUST * sigma)[1]
+    witnesses = WITNESS_WEIGHT * float(robust_square(amount, sigma, 4 * ROBUST).sum())
+    return cloud + network + witnesses + float(fit.z @ fit.z)
 
 
-def between(one: Posed, other: Posed, share: float) -> Posed:
-    """A share of the way, for a share of a step."""
-    turn = Rotation.from_matrix(other.rotation @ one.rotation.T).as_rotvec()
-    return Posed(
-        Rotation.from_rotvec(share * turn).as_matrix() @ one.rotation,
-        one.translation + share * (other.translation - one.translation),
-        one.z,
-        one.log_scale + share * (other.log_scale - one.log_scale),
+def normal_equations(
+    problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float
+) -> NormalEquations:
+    """Of everything that the frame shows, for changes of pose and draws, whose motion of the played points is given."""
+    base, posed, config = problem.base, fit.posed, problem.base.config
+    flat, count = motion.reshape(len(motion), -1), len(fit.z)
+    spread = problem.states.played.spread
+    still = np.abs(motion).max(axis=(0, 1)) < 1e-9
+    precision = np.diag(np.where(still, HELD, 1.0))
+    normal = NormalEquations.prior(
+        np.where(still, 0.0, fit.z), np.zeros(count), precision, posed.log_scale, base.scale_std
     )
-
-
-def linear_step(
-    problem: DrawsProblem, fit: DrawsFit, trust: float, sigma: float
-) -> tuple[Float[np.ndarray, " d"], Posed]:
-    """Change of the draws, and the pose, that explain the frame best in the linear neighbourhood."""
-    modes = jacobian(problem, fit)
-    linear = problem.around(fit.material, modes)
-    prior = draws_prior(fit, modes, trust)
-    start = replace(fit.posed, z=np.zeros(len(fit.z)))
-    found = fit_cloud(linear, start, prior, sigma, problem.config.steps, 0.0)
-    return found.z, found
-
-
-def jacobian(problem: DrawsProblem, fit: DrawsFit) -> Float32[np.ndarray, "m 3 d"]:
-    """Motion of all material points for a standard deviation of each draw: at the anchors, which the others follow."""
-    model, drawn = problem.model, fit.drawn
-    order = np.concatenate(model.anchors)
-    change = np.zeros((len(model.rest_points), 3, len(fit.z)), dtype=np.float32)
-    for number in np.flatnonzero(drawn.smooth):
-        step = DIFFERENCE * (-1.0 if fit.z[number] > 0 else 1.0)
-        z = fit.z.copy()
-        z[number] += step
-        moved = drawn.deformations(problem.scene, z)
-        if moved is not None:
-            change[order, :, number] = (anchors_moved(model, moved) - fit.material[order]) / step
-    spread: np.ndarray = problem.spread @ change.reshape(len(change), -1)
-    return spread.reshape(change.shape)
+    network = problem.network(fit, (problem.followed @ flat).reshape(-1, 3, count))
+    state = replace(posed, z=np.zeros(count))
+    normal = network.add_to(normal, state, base.network_sigma, config.network_worth[1], robust=True)
+    corners = problem.model.faces[fit.surface.facing[fit.face]]
+    within = barycentric(fit.surface.material[corners], fit.place).astype(np.float32)
+    rows = np.repeat(np.arange(len(corners)), 3)
+    at_places = csr_array((within.ravel(), (rows, corners.ravel())), shape=(len(corners), spread.shape[0])) @ spread
+    modes = (at_places @ flat).reshape(-1, 3, count)
+    direction = fit.surface.normals[fit.face]
+    residual = np.einsum("pi,pi->p", direction, fit.place - base.evidence.partners)
+    weight = geman_mcclure(residual, ROBUST * sigma) * (config.cloud_worth / len(residual) / sigma**2)
+    normal = normal.add(along(posed, fit.place, modes, direction), residual, weight)
+    chosen = base.witnesses
+    direction, amount = base.evidence.violations(fit.surface.material[chosen], ROBUST * sigma)
+    rows = np.flatnonzero(amount > 0)
+    if len(rows) == 0:
+        return normal
+    rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
+    modes = (spread[chosen[rows]] @ flat).reshape(-1, 3, count)
+    jacobian = along(posed, fit.surface.material[chosen[rows]], modes, direction[rows])
+    weight = WITNESS_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
+    return normal.add(jacobian, -amount[rows], weight)

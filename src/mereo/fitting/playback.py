@@ -9,17 +9,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.sparse import csr_array
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
-from mereo.deformation.moving_least_squares import spread
+from mereo.deformation.moving_least_squares import Anchors, PointWeights, spread
 from mereo.geometry.procrustes import best_rotations
 from mereo.scenes.draw_recorder import OutOfDraws, Recorder, Shares
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import Scene
-from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.statistical_model import StatisticalModel, following
 
 STATES_SEED = 400_000
 """A training seed."""
@@ -35,6 +36,12 @@ RIDGE = 1e-3
 
 PROJECTED = 400
 """Material points by which many states are expressed in modes."""
+
+PLAYED = 400
+"""Material points of all segments together whose motion is played for derivatives; the others follow them."""
+
+LEAST_PLAYED = 24
+"""The same of each segment at least."""
 
 LARGEST = 4.0
 """Standard deviations; farther out a share is 0 or 1."""
@@ -87,6 +94,59 @@ class Drawn:
             return None
 
 
+def as_sparse(weights: PointWeights, count: int) -> csr_array:
+    """Weights of ``count`` points as a matrix."""
+    rows = np.repeat(np.arange(len(weights.index)), weights.index.shape[1])
+    entries = (weights.weight.ravel().astype(np.float32), (rows, weights.index.ravel()))
+    return csr_array(entries, shape=(len(weights.index), count))
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """Few material points of each segment, and how all others follow them.
+
+    Attributes:
+        points: their positions at rest, one segment after the other.
+        index: which material points they are.
+        counts: how many each segment has.
+        spread: weights by which all material points follow them.
+    """
+
+    points: Float[np.ndarray, "a 3"]
+    index: Int[np.ndarray, " a"]
+    counts: tuple[int, ...]
+    spread: csr_array
+
+    @classmethod
+    def of(cls, model: StatisticalModel) -> "Played":
+        """Evenly spread points of a model's anchors."""
+        each = max(LEAST_PLAYED, PLAYED // len(model.anchors))
+        chosen = [anchors[spread(model.rest_points[anchors], each)] for anchors in model.anchors]
+        counts = tuple(len(part) for part in chosen)
+        places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        few = tuple(Anchors(at, model.rest_points[part]) for at, part in zip(places, chosen, strict=True))
+        follow = as_sparse(following(few, model.rest_points, model.labels), sum(counts))
+        index = np.concatenate(chosen)
+        return cls(model.rest_points[index], index, counts, follow)
+
+    def moved(self, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "a 3"]:
+        """Positions to which a state moves the points; a map that several segments share is called once."""
+        return moved_together(deformations, self.points, self.counts)
+
+
+def moved_together(
+    deformations: tuple[Deformation, ...], points: Float[np.ndarray, "n 3"], counts: tuple[int, ...]
+) -> Float[np.ndarray, "n 3"]:
+    """Positions to which points go, ``counts`` of each segment one after the other."""
+    owner = np.repeat([id(deformation) for deformation in deformations], counts)
+    result = np.empty_like(points)
+    for deformation in {id(deformation): deformation for deformation in deformations}.values():
+        rows = np.flatnonzero(owner == id(deformation))
+        if len(rows):
+            result[rows] = deformation(points[rows])
+    return result
+
+
 @dataclass(frozen=True, eq=False)
 class DrawnStates:
     """Random states of a scene by seed: where a fit of draws may start.
@@ -97,6 +157,7 @@ class DrawnStates:
         material: their material points, scene frame.
         z: their draws, standard normal; NaN of states with other calls than the first that was not drawn again.
         modes: their coefficients in the statistical model.
+        played: points whose motion is played for derivatives.
     """
 
     scene: Scene
@@ -104,6 +165,7 @@ class DrawnStates:
     material: Float32[np.ndarray, "n m 3"]
     z: Float[np.ndarray, "n d"]
     modes: Float[np.ndarray, "n k"]
+    played: Played
 
     @classmethod
     def of(
@@ -119,7 +181,7 @@ class DrawnStates:
             draws.append(ndtri(np.concatenate([call.shares for call in recorder.calls])))
         fewest = min(len(z) for z in draws)
         z = np.stack([z if len(z) == fewest else np.full(fewest, np.nan) for z in draws])
-        return cls(scene, seeds, np.stack(material), z, coefficients(model, np.stack(material)))
+        return cls(scene, seeds, np.stack(material), z, coefficients(model, np.stack(material)), Played.of(model))
 
     def guess(self, modes: Float[np.ndarray, " k"], motion: Float[np.ndarray, " k"], count: int) -> Drawn:
         """Draws of a state of these coefficients: ridge regression on states, those near it counting more.
@@ -153,12 +215,6 @@ def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]
         aligned = np.matmul(states, rotation.transpose(0, 2, 1)) + center
         z = np.linalg.solve(normal, flat.T @ (aligned - model.mean[few]).reshape(len(z), -1).T).T
     return z
-
-
-def anchors_moved(model: StatisticalModel, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "a 3"]:
-    """Positions to which the anchors of all segments go, one segment after the other."""
-    pairs = zip(deformations, model.anchors, strict=True)
-    return np.concatenate([deformation(model.rest_points[index]) for deformation, index in pairs])
 
 
 def material_moved(

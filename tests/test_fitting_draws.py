@@ -1,0 +1,74 @@
+"""The fit of a scene's own draws: what is played, its derivatives, and the approach to a shape."""
+
+import numpy as np
+import pytest
+from toy_scene import toy_scene
+
+from mereo.fitting.draws_approach import Shape, approach, derivatives, near, secant
+from mereo.fitting.playback import Drawn, DrawnStates, material_moved
+from mereo.scenes.random_states import scene_model
+from mereo.scenes.statistical_model import StatisticalModel
+
+SCENE = toy_scene()
+
+
+@pytest.fixture(scope="module")
+def model() -> StatisticalModel:
+    return scene_model(SCENE, count=200)
+
+
+@pytest.fixture(scope="module")
+def states(model: StatisticalModel) -> DrawnStates:
+    return DrawnStates.of(SCENE, model, 30, 1000)
+
+
+def test_played_points_are_material_points(model: StatisticalModel, states: DrawnStates) -> None:
+    """They move as all material points do, though maps that segments share are called once."""
+    drawn = Drawn.of(SCENE, 1003)
+    deformations = drawn.deformations(SCENE, drawn.z)
+    assert deformations is not None
+    slow = material_moved(SCENE, model, deformations)
+    np.testing.assert_allclose(states.played.moved(deformations), slow[states.played.index], atol=1e-9)
+
+
+def test_all_points_follow_the_played_ones(model: StatisticalModel, states: DrawnStates) -> None:
+    drawn = Drawn.of(SCENE, 1004)
+    deformations = drawn.deformations(SCENE, drawn.z)
+    assert deformations is not None
+    followed = states.played.spread @ states.played.moved(deformations).astype(np.float32)
+    error = np.linalg.norm(followed - material_moved(SCENE, model, deformations), axis=1)
+    assert np.quantile(error, 0.95) < 0.02 * model.half
+
+
+def test_derivatives_predict_a_small_step(states: DrawnStates) -> None:
+    drawn = Drawn.of(SCENE, 1005)
+    here = drawn.deformations(SCENE, drawn.z)
+    step = np.where(drawn.smooth, 0.02 * np.cos(np.arange(len(drawn.z))), 0.0)
+    there = drawn.deformations(SCENE, drawn.z + step)
+    assert here is not None and there is not None
+    points = states.played.moved(here)
+    moved = states.played.moved(there) - points
+    predicted = derivatives(states, drawn, drawn.z, points) @ step
+    assert np.abs(predicted - moved).max() < 0.1 * np.abs(moved).max()
+
+
+def test_a_secant_agrees_with_the_step_and_only_there() -> None:
+    rng = np.random.default_rng(0)
+    motion, step = rng.normal(size=(5, 3, 4)).astype(np.float32), rng.normal(size=4)
+    moved, across = rng.normal(size=(5, 3)), np.array([step[1], -step[0], 0.0, 0.0])
+    found = secant(motion, step, moved)
+    np.testing.assert_allclose(found @ step, moved, atol=1e-5)
+    np.testing.assert_allclose(found @ across, motion @ across, atol=1e-5)
+
+
+def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, states: DrawnStates) -> None:
+    """From another state, to the shape of one whose draws are known, in any pose."""
+    points = states.material[7][states.played.index].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
+    shape = Shape.of(points, 0.04 * model.half, 500.0, np.ones(len(points)))
+    drawn = Drawn.of(SCENE, states.seeds[3])
+    start = near(states, shape, drawn, drawn.z)
+    assert start is not None
+    found = approach(states, shape, start, 3)
+    apart = [np.linalg.norm(n.points @ n.rotation.T + n.translation - points, axis=1) for n in (start, found)]
+    assert found.misfit < start.misfit
+    assert np.median(apart[1]) < 0.3 * np.median(apart[0])
