@@ -11,8 +11,8 @@ from analytic import untrained
 from mereo import __main__ as command_line
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.evaluation.sample_views import SampleView, load_view
+from mereo.fitting import register
 from mereo.fitting.answer import Answer, answer
-from mereo.fitting.fit import ModesFit
 from mereo.fitting.register import Registrar, registrar_for, statistical_model_of
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
@@ -20,8 +20,10 @@ from mereo.geometry.solids import Solids
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")
@@ -105,17 +107,27 @@ def test_full_needs_a_scene(model: Model) -> None:
         Registrar.of(other, "full", "engine")
 
 
-def test_auto_plays_the_scene_only_where_the_modes_do_not_explain_the_cloud(model: Model, view: SampleView) -> None:
+def test_auto_plays_the_scene_where_it_is_at_hand(model: Model, view: SampleView) -> None:
     registrar = Registrar.of(model)
     fitted = registrar.fit_modes(view.depth.to_points())
-    problem = fitted.problem
+    assert fitted.rest is None
+    modes = replace(registrar, choice="modes")
+    assert modes.finish(fitted).method == "modes" and "states" not in vars(modes)
+    foreign = replace(registrar, network=replace(model, provenance={"scene": "mine"}))
+    assert foreign.finish(fitted).method == "modes" and foreign.at_hand is None
+    assert registrar.finish(fitted).seconds > fitted.seconds and registrar.at_hand is not None
 
-    def judged_by(explained: float) -> ModesFit:
-        return replace(fitted, problem=replace(problem, config=replace(problem.config, explained=explained)))
 
-    assert registrar.finish(judged_by(np.inf)).method == "modes" and "states" not in vars(registrar)
-    registrar.finish(judged_by(0.0))
-    assert vars(registrar)["states"] is not None
+def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(
+    model: Model, view: SampleView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(name: str) -> Scene:
+        raise AssetUnavailable("the mesh is not here")
+
+    monkeypatch.setattr(register, "load_scene", missing)
+    assert Registrar.of(model).at_hand is None
+    with pytest.raises(AssetUnavailable, match="the mesh is not here"):
+        Registrar.of(model, "full")
 
 
 def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> None:

@@ -65,7 +65,7 @@ class Candidates:
 
     @property
     def source(self) -> str:
-        """Where that answer comes from: network, modes or draws."""
+        """Where that answer comes from: network, rest, modes or draws."""
         found = self.answer.registration
         return "network" if found is None else found.method
 
@@ -98,9 +98,9 @@ def find_candidates(
     each["modes"] = _registered(fitted.registration(), grid, encoding)
     default: AnswerName = "modes"
     if "full" in names_for(registrar):
-        assert registrar.states is not None
-        each["full"] = _registered(fitted.with_draws(registrar.states), grid, encoding)
-        default = "modes" if registrar.choice == "auto" and fitted.explains else "full"
+        assert registrar.at_hand is not None
+        each["full"] = _registered(fitted.with_draws(registrar.at_hand), grid, encoding)
+        default = "full"
     found = each[default].registration
     if registrar.choice == "auto" and found is not None and not found.accepted:
         default = "network"
@@ -111,7 +111,7 @@ def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
     """Names of the answers that can be had: the draws only of an object whose scene is at hand."""
     if registrar is None:
         return ("network",)
-    if registrar.choice == "modes" or registrar.states is None:
+    if registrar.choice == "modes" or registrar.at_hand is None:
         return ("network", "modes")
     return ("network", "modes", "full")
 

@@ -37,7 +37,7 @@ def answers(evaluation: Evaluation) -> dict[str, Any]:
     answer would have been better than it by more than ``CLEARLY``. ``registration_error`` is None where none was taken.
     """
     count = max(1, len(evaluation.sources))
-    sources = {name: evaluation.sources.count(name) / count for name in ("network", "modes", "draws")}
+    sources = {name: evaluation.sources.count(name) / count for name in ("network", "rest", "modes", "draws")}
     taken = list(evaluation.examples.values())
     better = {
         name: float(

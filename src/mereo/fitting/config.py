@@ -86,6 +86,8 @@ class DrawsConfig:
         kept: how many of them are then fitted to the frame.
         shape_std: standard deviation of the shape that the modes found, as a share of half the rest box's longest side.
         shape_worth: how many independent points a shape is worth.
+        cloud_worth, network_worth: the same of the cloud and of the correspondences, from beginning to end, also where
+            draws and modes are compared.
         first_rounds, last_rounds: sets of differences in the fit to the frame, after a jump and else.
         steps: at most with one set of differences.
         tries: dampings at most in one step.
@@ -105,8 +107,10 @@ class DrawsConfig:
     sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
     shape_std: float = 0.04
     shape_worth: float = 500.0
+    cloud_worth: float = 1500.0
+    network_worth: float = 30.0
     first_rounds: int = 1
-    last_rounds: int = 2
+    last_rounds: int = 4
     steps: int = 6
     tries: int = 3
     damping: float = 0.03
@@ -122,5 +126,5 @@ class DrawsConfig:
     start_sigma: float = 0.03
 
 
-MANY_DRAWS = DrawsConfig(batches=3, starts=16, kept=1, sieve=((1, 3), (1, 1)), first_rounds=1, last_rounds=2, jumps=0)
+MANY_DRAWS = DrawsConfig(batches=3, starts=16, kept=1, sieve=((1, 3), (1, 1)), first_rounds=1, jumps=0)
 """Constants for scenes with many draws."""

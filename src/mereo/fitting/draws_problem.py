@@ -31,7 +31,7 @@ class DrawsProblem:
     """A frame to be explained by the states of a scene.
 
     Attributes:
-        base: the same frame, explained by modes.
+        base: the same frame, explained by modes, with the worths that the draws are fitted by.
         states: random states of the scene.
         found: correspondences, scene units.
         weights: how their rest positions follow the material points.
@@ -61,6 +61,8 @@ class DrawsProblem:
         model = base.model
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= DrawsConfig().few else MANY_DRAWS
+        worths = replace(base.config, cloud_worth=config.cloud_worth, network_worth=(config.network_worth,) * 2)
+        base = replace(base, config=worths)
         return cls(base, states, found, model.weights(found.rest, found.labels), config)
 
     def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> Problem:

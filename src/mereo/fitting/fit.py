@@ -5,7 +5,6 @@ code -correspondences-> pose and state of the model -deform-> SegmentedMesh, and
 
 import time
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -19,9 +18,10 @@ from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.modes_fit import fit_modes
 from mereo.fitting.playback import DrawnStates
-from mereo.fitting.problem import Misfit, Problem
+from mereo.fitting.problem import Problem
 from mereo.fitting.registration import Method, Registration
 from mereo.fitting.residuals import Surface
+from mereo.fitting.rest_fit import RestFit, fit_rest, is_at_rest
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -46,6 +46,7 @@ class ModesFit:
         unit: length of a scene unit in the cloud's unit, before the fit's own scale.
         posed: coefficients and pose.
         seconds: that it took.
+        rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
     """
 
     problem: Problem
@@ -53,6 +54,7 @@ class ModesFit:
     unit: float
     posed: Posed
     seconds: float
+    rest: RestFit | None = None
 
     @classmethod
     def of(
@@ -71,30 +73,30 @@ class ModesFit:
         with threadpool_limits(1, "blas"):  # products this small are slower on two threads, 20 times on busy cores
             problem = Problem.of(model, found, Evidence.of(points / unit), scale_std, config)
             posed = fit_modes(problem)
-        return cls(problem, found, unit, posed, time.perf_counter() - started)
-
-    @cached_property
-    def misfit(self) -> Misfit:
-        """How badly the modes explain the frame."""
-        return self.problem.misfit(self.posed)
-
-    @property
-    def explains(self) -> bool:
-        """Whether the modes explain the cloud as well as the true state would."""
-        return self.misfit.cloud < self.problem.config.explained
+            rest = fit_rest(problem, found, posed)
+            at_rest = is_at_rest(problem, posed, rest)
+        return cls(problem, found, unit, posed, time.perf_counter() - started, rest if at_rest else None)
 
     def registration(self) -> Registration:
-        """The answer of the modes."""
-        material = self.posed.place(self.problem.model.material(self.posed.z))
+        """The answer of the modes, or the rest model where the frame speaks for that."""
+        model = self.problem.model
+        if self.rest is not None:
+            material = self.rest.posed.place(model.rest_points)
+            return self._registration("rest", model.rest_z, self.rest.posed, material, self.seconds)
+        material = self.posed.place(model.material(self.posed.z))
         return self._registration("modes", self.posed.z, self.posed, material, self.seconds)
 
     def with_draws(self, states: DrawnStates) -> Registration:
-        """The answer of the scene's own draws where their misfit is lower, else that of the modes."""
+        """The answer of the scene's own draws where their misfit is lower, else ``registration``."""
+        if self.rest is not None:
+            return self.registration()
         started = time.perf_counter()
         with threadpool_limits(1, "blas"):
-            drawn = fit_draws(DrawsProblem.of(self.problem, states, self.found), self.posed)
+            problem = DrawsProblem.of(self.problem, states, self.found)
+            drawn = fit_draws(problem, self.posed)
+            taken = drawn is not None and drawn.misfit < problem.base.misfit(self.posed).total
         seconds = self.seconds + time.perf_counter() - started
-        if drawn is None or drawn.misfit >= self.misfit.total:
+        if drawn is None or not taken:
             return replace(self.registration(), seconds=seconds)
         found = self._registration("draws", drawn.z, drawn.posed, drawn.placed(), seconds)
         return replace(found, drawn=replace(drawn.drawn, z=drawn.z))

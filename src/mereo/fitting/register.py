@@ -28,7 +28,7 @@ class Registrar:
         network: the weights, from whose correspondences a fit starts.
         model: statistical model of the same object.
         choice: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
-            misfit; "auto" the draws only where the modes do not explain the cloud and the scene is at hand.
+            misfit; "auto" does the same where the scene is at hand, and else fits the modes.
         given: the object's scene, where it is not the built-in one that the weights were trained on.
     """
 
@@ -117,18 +117,18 @@ class Registrar:
 
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer from a fit of the modes: the draws too where ``choice`` asks for them."""
-        if self.choice == "full":
-            states = self.states
-        else:
-            states = self._at_hand if self.choice == "auto" and not fitted.explains else None
+        states = None if self.choice == "modes" or fitted.rest is not None else self.at_hand
         return fitted.registration() if states is None else fitted.with_draws(states)
 
     @cached_property
-    def _at_hand(self) -> DrawnStates | None:
+    def at_hand(self) -> DrawnStates | None:
+        """``states``, but None where "auto" cannot have the scene's mesh: the weights carry all that the modes need."""
         try:
             return self.states
-        except AssetUnavailable:  # the weights carry all that the modes need; without the scene's mesh they have to do
-            return None
+        except AssetUnavailable:
+            if self.choice == "auto":
+                return None
+            raise
 
 
 def registrar_for(model: Model, choice: FitChoice, scene: Scene | str | None = None) -> Registrar | None:

@@ -14,7 +14,8 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, signed_distance_and_direction
 from mereo.scenes.statistical_model import StatisticalModel, following
 
-Method = Literal["modes", "draws"]
+Method = Literal["rest", "modes", "draws"]
+"""Description of the state that was found: the rest model, unbent; coefficients of the modes; the scene's own draws."""
 
 AT_ONCE = 20_000
 
@@ -56,7 +57,7 @@ class Registration:
         model: the statistical model: rest mesh and material points.
         material: positions of all material points in the camera frame, input unit.
         method: which description of the states it was found in.
-        z: coefficients of the modes, or standard normal draws of the scene.
+        z: coefficients of the modes (at rest those nearest to it), or standard normal draws of the scene.
         scene_unit: length of a scene unit in the input's.
         unit_known: whether that was known beforehand; otherwise it was found together with the pose.
         explained: share of the observed points that lie on the model's facing surface, up to the tolerance.
@@ -82,7 +83,7 @@ class Registration:
     @cached_property
     def beyond_states(self) -> float:
         """How far the state lies outside all that the model has seen (``StatisticalModel.beyond``), scene units."""
-        z = self.z if self.method == "modes" else self.model.project(self.material / self.scene_unit)[1]
+        z = self.z if self.method != "draws" else self.model.project(self.material / self.scene_unit)[1]
         return self.model.beyond(z)
 
     @cached_property

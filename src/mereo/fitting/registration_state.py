@@ -192,7 +192,7 @@ def _unposed(
                 f"the state has {len(z)} coefficients, but the model has {model.count} modes; the file is damaged: "
                 "register the frame again"
             )
-        return model.material(z), None
+        return (model.rest_points if state.method == "rest" else model.material(z)), None
     scene = scene_of(state) if scene is None else scene
     played = played_state(state, scene)
     if not same_topology(scene, model):

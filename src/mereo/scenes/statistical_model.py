@@ -79,6 +79,11 @@ class StatisticalModel:
     pairs: PairDistances
     source_frame: SourceFrame | None = None
 
+    @cached_property
+    def rest_z(self) -> Float[np.ndarray, " k"]:
+        """Coefficients nearest to the rest pose."""
+        return self.project(self.rest_points)[1]
+
     @property
     def count(self) -> int:
         """Number of modes."""

@@ -1,0 +1,53 @@
+"""The object at rest: the hypothesis that nothing is bent, judged against the modes by its evidence.
+
+Modes can imitate noise, so their misfit is always lower; a hypothesis with fewer free numbers is right when the
+difference is smaller than what that freedom buys. By Laplace's approximation (MacKay, Neural Computation 1992) that is
+the logarithm of how much the frame narrows the coefficients, ``log det`` of their posterior precision, as the prior is
+N(0, 1) each.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mereo.fitting.correspondences import Correspondences
+from mereo.fitting.gauss_newton import POSE, Posed
+from mereo.fitting.modes_fit import fit_cloud
+from mereo.fitting.priors import Prior
+from mereo.fitting.problem import Misfit, Problem
+from mereo.fitting.residuals import NetworkTerm
+from mereo.geometry.transforms import fit_rigid
+
+
+@dataclass(frozen=True, eq=False)
+class RestFit:
+    """Rigid pose of the rest model that explains a frame best; its ``posed.z`` is empty."""
+
+    posed: Posed
+    misfit: Misfit
+
+
+def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> RestFit:
+    """Fit of the rest model's pose, from that of the modes."""
+    model, config = problem.model, problem.config
+    rigid = model.around(model.rest_points, np.zeros((len(model.rest_points), 3, 0), dtype=np.float32))
+    rest = replace(problem, model=rigid, network=NetworkTerm.of(rigid, found))
+    T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
+    start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
+    prior = Prior(np.empty(0), np.empty((0, 0)))
+    posed = fit_cloud(rest, start, prior, config.refine_sigma, config.refine_steps, 0.0)
+    return RestFit(posed, rest.misfit(posed))
+
+
+def is_at_rest(problem: Problem, modes: Posed, rest: RestFit) -> bool:
+    """Whether the evidence of the rest model is greater than that of the modes."""
+    return rest.misfit.total - problem.misfit(modes).total < narrowing(problem, modes)
+
+
+def narrowing(problem: Problem, modes: Posed) -> float:
+    """``log det`` of the coefficients' posterior precision, whatever the pose is; 0 where there are none."""
+    config = problem.config
+    known = problem.known(modes, Prior.whole(problem.model), 0.0)
+    matrix = problem.seen(known, modes, config.cloud_sigma, config.network_worth[1], True).matrix
+    pose, cross, z = matrix[:POSE, :POSE], matrix[:POSE, POSE:], matrix[POSE:, POSE:]
+    return float(np.linalg.slogdet(z - cross.T @ np.linalg.solve(pose, cross))[1])
