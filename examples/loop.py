@@ -27,6 +27,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
 from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import reconstruct
+from mereo.scenes.draw_recorder import Recorder
 from mereo.scenes.parameters import Played, play, random_state, turned
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
@@ -95,7 +96,7 @@ def turn_at(time: float) -> float:
 def mesh_at(scene: Scene, played: Played, turn: float) -> SegmentedMesh:
     """The object with all draws of its state moved at once; each stays as likely as it was."""
     shares = {call.key: turned(call.shares, turn, SEED + index) for index, call in enumerate(played.calls)}
-    return scene.deform(play(scene, SEED, shares, None)[1]).mesh
+    return scene.deform(play(scene, Recorder(SEED, shares))).mesh
 
 
 def camera_pose() -> Float[np.ndarray, "4 4"]:

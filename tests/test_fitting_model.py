@@ -8,9 +8,10 @@ from toy_scene import sample_deformations, toy_scene
 from mereo.deformation.moving_least_squares import Anchors
 from mereo.geometry.procrustes import robust_rigid
 from mereo.geometry.transforms import fit_rigid
+from mereo.scenes.principal_components import build_model
 from mereo.scenes.random_states import interior_nodes, sample_states, scene_model, state_points
 from mereo.scenes.seeds import example_rng
-from mereo.scenes.statistical_model import StatisticalModel, build_model
+from mereo.scenes.statistical_model import StatisticalModel
 
 
 @pytest.fixture(scope="module")

@@ -110,7 +110,7 @@ class DrawsConfig:
     cloud_worth: float = 1500.0
     network_worth: float = 30.0
     first_rounds: int = 1
-    last_rounds: int = 4
+    last_rounds: int = 2
     steps: int = 6
     tries: int = 3
     damping: float = 0.03
@@ -126,5 +126,15 @@ class DrawsConfig:
     start_sigma: float = 0.03
 
 
-MANY_DRAWS = DrawsConfig(batches=3, starts=16, kept=1, sieve=((1, 3), (1, 1)), first_rounds=1, jumps=0)
+MANY_DRAWS = DrawsConfig(
+    cloud_worth=3000.0,
+    network_worth=10.0,
+    batches=3,
+    starts=16,
+    kept=1,
+    sieve=((1, 3), (1, 1)),
+    first_rounds=1,
+    last_rounds=4,
+    jumps=0,
+)
 """Constants for scenes with many draws."""

@@ -174,4 +174,4 @@ def _solved(shape: Shape, here: Near, motion: Float32[np.ndarray, "a 3 d"], damp
     offset = points - shape.points
     weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * ROBUST * shape.std)
     jacobian = in_space(posed, points, shape.at(motion))
-    return normal.add(jacobian, offset.T.ravel(), np.tile(weight, 3)).step(damping)[POSE:]
+    return normal.add(jacobian, offset.ravel(), np.repeat(weight, 3)).step(damping)[POSE:]

@@ -10,10 +10,11 @@ from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.scenes.assets import AssetUnavailable
+from mereo.scenes.principal_components import build_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene, State
 from mereo.scenes.seeds import example_rng
-from mereo.scenes.statistical_model import StatisticalModel, build_model, material_points
+from mereo.scenes.statistical_model import StatisticalModel, material_points
 
 STATES = 1500
 STATES_SEED = 500_000
