@@ -150,3 +150,15 @@ def test_where_no_registration_is_found_auto_says_why(model: Model, view: Sample
     assert not found.taken and found.registration is None and "they must be of one object" in str(found.refusal)
     with pytest.raises(ValueError, match="they must be of one object"):
         answer(view.depth.to_points(), other, replace(registrar, choice="modes"), 32)
+
+
+def test_points_may_be_plain_lists(found: Answer) -> None:
+    registration = found.registration
+    assert registration is not None
+    rest = registration.model.rest_points[:3]
+    np.testing.assert_array_equal(registration.to_camera(rest.tolist()), registration.to_camera(rest))
+    there = registration.to_camera(rest)
+    np.testing.assert_array_equal(registration.to_rest(there.tolist()), registration.to_rest(there))
+    assert registration.query([[0, 0, 100]]).label.shape == (1,)
+    with pytest.raises(ValueError, match=r"the points have the shape \(3,\); they must be rows of x, y, z"):
+        registration.to_camera([0.0, 1.0, 2.0])

@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from numpy.typing import ArrayLike
 
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
@@ -101,16 +102,15 @@ class Registration:
         """Segments at rest, to be asked the same."""
         return Solids(self.model.rest)
 
-    def to_camera(
-        self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"] | None = None
-    ) -> Float[np.ndarray, "n 3"]:
+    def to_camera(self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None) -> Float[np.ndarray, "n 3"]:
         """Positions of points of the rest model in the camera frame.
 
         Args:
-            points: rest pose, scene units.
+            points: n x 3, rest pose, scene units.
             labels: of the segments that they move along with, 1 or more; by default those that hold them or come
                 nearest.
         """
+        points = rows_of_three(points)
         labels = nearest_labels(self.rest_solids, points) if labels is None else labels
         result = np.empty_like(points)
         for first in range(0, len(points), AT_ONCE):  # the weights of a large mesh would take gigabytes
@@ -118,10 +118,9 @@ class Registration:
             result[rows] = self.model.weights(points[rows], labels[rows])(self.material)
         return result
 
-    def to_rest(
-        self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"] | None = None
-    ) -> Float[np.ndarray, "n 3"]:
-        """Inverse of ``to_camera``: where points of the camera frame are in the rest model, scene units."""
+    def to_rest(self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None) -> Float[np.ndarray, "n 3"]:
+        """Inverse of ``to_camera``: where n x 3 points of the camera frame are in the rest model, scene units."""
+        points = rows_of_three(points)
         labels = nearest_labels(self.solids, points) if labels is None else labels
         guess = following(self._moved_anchors, points, labels)(self.model.rest_points)
         result = guess.copy()
@@ -132,8 +131,9 @@ class Registration:
             result[rows[converged]] = found[converged]
         return result
 
-    def query(self, points: Float[np.ndarray, "n 3"]) -> Located:
-        """Segment, signed distance, direction and rest position of points of the camera frame."""
+    def query(self, points: ArrayLike) -> Located:
+        """Segment, signed distance, direction and rest position of n x 3 points of the camera frame."""
+        points = rows_of_three(points)
         labels = self.solids.label(points)
         distance, direction = signed_distance_and_direction(self.solids, points, labels)
         nearest = np.where(labels > 0, labels, nearest_labels(self.solids, points)).astype(np.uint8)
@@ -146,6 +146,16 @@ class Registration:
     @cached_property
     def _moved_anchors(self) -> tuple[Anchors, ...]:
         return tuple(Anchors(index, self.material[index]) for index in self.model.anchors)
+
+
+def rows_of_three(points: ArrayLike) -> Float[np.ndarray, "n 3"]:
+    """Points as an array of numbers; raises ``ValueError`` for another shape."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(
+            f"the points have the shape {array.shape}; they must be rows of x, y, z: reshape them to (n, 3)"
+        )
+    return array
 
 
 def nearest_labels(solids: Solids, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
