@@ -87,6 +87,12 @@ def _object(model: Model) -> str:
     sizes = provenance.get("visible_m")
     if isinstance(sizes, list | tuple):
         lines.append(f"- longest side of the visible part in training: {sizes[0]:.3g} to {sizes[1]:.3g} m")
+    states = model.statistical_model
+    if states is not None:
+        lines.append(
+            f"- registration: the mesh at rest and {states.count} modes of deformation, which leave "
+            f"{states.residue:.2g} scene units (root mean square) of an unseen state"
+        )
     taught = model.supervision
     answers = {"labels": taught.labels, "signed distances": taught.distances, "directions": taught.directions}
     known = [answer for answer, is_taught in answers.items() if is_taught]
@@ -132,7 +138,18 @@ def _result(test: dict[str, Any]) -> str:
     names = ["IoU", "mIoU", *segments]
     values = [test["iou"], test["miou"], *segments.values()]
     rows = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}", f"| {' | '.join(format_score(v) for v in values)} |"]
-    return "\n".join([f"{title}:\n", *rows, ""])
+    return "\n".join([f"{title}:\n", *rows, "", *_answers(test)])
+
+
+def _answers(test: dict[str, Any]) -> list[str]:
+    """Scores of all who could have answered, one line; nothing where the network alone could."""
+    titles = {"network": "the network alone", "modes": "registered modes", "full": "with the draws of the scene"}
+    each = []
+    for name, title in titles.items():
+        if name in test:
+            iou, miou = (format_score(test[name][key]) for key in ("iou", "miou"))
+            each.append(f"{title} {iou} / {miou} in {test[name]['seconds']:.2f} s")
+    return [f"By who answers (IoU / mIoU, seconds of a frame): {', '.join(each)}.", ""] if len(each) > 1 else []
 
 
 def _limits(model: Model, tests: Sequence[dict[str, Any]]) -> str:
