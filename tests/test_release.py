@@ -47,7 +47,7 @@ def test_the_file_answers_as_the_weights_and_the_card_knows_it(tmp_path: Path) -
         before = model.network.state_dict()[key]
         assert torch.equal(value, _unpack(_pack(before)) if key == PACKED else before)
     logits, exact = (m.logits(m.encode(points), points) for m in (released, model))
-    assert 0 < np.abs(logits - exact).max() < 0.5 and np.abs(logits - exact).mean() < 0.02
+    assert np.abs(logits - exact).max() < 0.5 and np.abs(logits - exact).mean() < 0.02
     assert (logits.argmax(axis=1) == exact.argmax(axis=1)).mean() > 0.995
     assert released.provenance["recipe"]["init"] == "weights.safetensors"  # type: ignore[index]
     text = (tmp_path / "out/bunny-2.md").read_text()
@@ -102,7 +102,8 @@ def test_shipped_weights_have_a_true_card(name: str) -> None:
     assert states is not None and f"the mesh at rest and {states.count} modes of deformation" in text
     assert states.source_frame is not None
     assert '"/' not in json.dumps(model.provenance), "no folders of the machine that trained"
-    assert {tensor.dtype for tensor in load_file(path).values() if tensor.is_floating_point()} == {torch.float16}
+    network = [tensor for key, tensor in load_file(path).items() if not key.startswith("states.")]
+    assert {tensor.dtype for tensor in network if tensor.is_floating_point()} == {torch.float16}
 
 
 def test_a_shipped_name_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
