@@ -75,7 +75,7 @@ def test_labels_are_those_of_the_segments(network: Reconstruction, found: Answer
 
 def test_a_scanners_frame_gets_its_answer_in_that_frame(model: Model, view: SampleView) -> None:
     points = view.depth.to_points().points @ SCANNER_TO_CAMERA.T
-    result = answer(PointCloud(points), model, Registrar.of(model), 48, "scanner").reconstruction
+    result = answer(PointCloud(points), model, Registrar.of(model, "modes"), 48, "scanner").reconstruction
     assert np.median(Solids(result.surfaces).nearest(points).distance) < 0.02 * np.ptp(points, axis=0).max()
     for one in result.segments:
         inside = result.labels.positions(np.argwhere(result.labels.labels == one.label)).mean(axis=0)
@@ -137,7 +137,8 @@ def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> N
 
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
     stretched = view.depth.to_points().points * np.array([1.0, 1.6, 1.0])
-    found = answer(stretched, model, Registrar.of(model), 32)
+    without_scene = replace(model, provenance={"scene": "mine"})
+    found = answer(stretched, model, Registrar.of(without_scene), 32)
     assert found.registration is not None and not found.registration.accepted and not found.taken
     forced = answer(stretched, model, Registrar.of(model, "modes"), 32)
     assert forced.taken and forced.registration is not None and not forced.registration.accepted
