@@ -77,6 +77,7 @@ def test_a_registration_is_as_far_off_as_its_points_are(model: Model, view: View
     np.testing.assert_allclose(large.hidden, shifted.hidden)
 
 
+@pytest.mark.slow
 def test_an_evaluation_compares_all_who_could_answer(model: Model, tmp_path: Path) -> None:
     found = evaluate(model, "engine", examples=2, seed=SEED, cells=24)
     values = metrics(found, {})

@@ -108,6 +108,7 @@ def test_a_frame_of_nothing_is_refused(folder: Path, capsys: pytest.CaptureFixtu
     assert "--carry-frame is 'scene' and nothing is carried" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_a_registration_nothing_is_written(
     folder: Path, view: SampleView, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,6 +35,7 @@ def encoded(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     return clouds
 
 
+@pytest.mark.slow
 def test_a_trial_of_the_laboratory(encoded: list[np.ndarray]) -> None:
     laboratory = Laboratory(load_scene("rope"), load_model("rope"))
     view = laboratory.look(random_state(laboratory.scene, 3), laboratory.first_place())
@@ -56,6 +57,7 @@ def test_a_page_of_a_frame(encoded: list[np.ndarray]) -> None:
     assert len(encoded) == 1
 
 
+@pytest.mark.slow
 def test_a_case_of_the_demo(
     encoded: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

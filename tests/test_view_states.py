@@ -223,6 +223,7 @@ def test_the_page_of_a_state_shows_its_mesh_and_answers(states: StatisticalModel
 # --- the laboratory ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_laboratory_shows_and_scores_the_default_answer(model: Model) -> None:
     laboratory = Laboratory(load_scene("rope"), model)
     view = laboratory.look(random_state(laboratory.scene, 3), laboratory.first_place())
@@ -261,6 +262,7 @@ def test_sliders_of_modes_move_the_model(states: StatisticalModel) -> None:
     assert np.abs(freedom.random(1)).max() < 5 and (freedom.random(1) != freedom.random(2)).any()
 
 
+@pytest.mark.slow
 def test_a_modes_state_is_seen_and_rebuilt(states: StatisticalModel, model: Model) -> None:
     freedom = ModeShapes(states, states.library[4].astype(np.float64))
     laboratory = Laboratory(load_scene("rope"), model, shapes=freedom)
