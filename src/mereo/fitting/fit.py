@@ -16,12 +16,12 @@ from mereo.fitting.draws_fit import fit_draws
 from mereo.fitting.draws_problem import DrawsProblem
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import Posed
-from mereo.fitting.modes_fit import fit_modes
+from mereo.fitting.modes_fit import Judged, fit_modes
 from mereo.fitting.playback import DrawnStates
 from mereo.fitting.problem import Problem
 from mereo.fitting.registration import Method, Registration
 from mereo.fitting.residuals import Surface
-from mereo.fitting.rest_fit import RestFit, fit_rest, is_at_rest
+from mereo.fitting.rest_fit import fit_rest, is_at_rest
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -54,7 +54,7 @@ class ModesFit:
     unit: float
     posed: Posed
     seconds: float
-    rest: RestFit | None = None
+    rest: Judged | None = None
 
     @classmethod
     def of(
@@ -72,10 +72,10 @@ class ModesFit:
         found = found.scaled(1 / unit)
         with threadpool_limits(1, "blas"):  # products this small are slower on two threads, 20 times on busy cores
             problem = Problem.of(model, found, Evidence.of(points / unit), scale_std, config)
-            posed = fit_modes(problem)
-            rest = fit_rest(problem, found, posed)
-            at_rest = is_at_rest(problem, posed, rest)
-        return cls(problem, found, unit, posed, time.perf_counter() - started, rest if at_rest else None)
+            modes = fit_modes(problem)
+            rest = fit_rest(problem, found, modes.posed)
+            at_rest = is_at_rest(problem, modes, rest)
+        return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
 
     def registration(self) -> Registration:
         """The answer of the modes, or the rest model where the frame speaks for that."""

@@ -19,8 +19,8 @@ from mereo.fitting.problem import Misfit, Problem
 from mereo.geometry.procrustes import robust_rigid
 
 
-def fit_modes(problem: Problem) -> Posed:
-    """The whole fit."""
+def fit_modes(problem: Problem) -> "Judged":
+    """The whole fit, and how well it explains the frame."""
     config = problem.config
     first = fit_whole(problem)
     best = Judged.of(problem, first).better(problem, refine(problem, first))
@@ -32,7 +32,7 @@ def fit_modes(problem: Problem) -> Posed:
             best = best.better(problem, refine(problem, other, config.last_widening, config.last_refine))
         if best is before:
             break
-    return best.posed
+    return best
 
 
 @dataclass(frozen=True, eq=False)

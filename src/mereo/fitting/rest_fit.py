@@ -6,29 +6,21 @@ the logarithm of how much the frame narrows the coefficients, ``log det`` of the
 N(0, 1) each.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.gauss_newton import POSE, Posed
-from mereo.fitting.modes_fit import fit_cloud
+from mereo.fitting.modes_fit import Judged, fit_cloud
 from mereo.fitting.priors import Prior
-from mereo.fitting.problem import Misfit, Problem
+from mereo.fitting.problem import Problem
 from mereo.fitting.residuals import NetworkTerm
 from mereo.geometry.transforms import fit_rigid
 
 
-@dataclass(frozen=True, eq=False)
-class RestFit:
-    """Rigid pose of the rest model that explains a frame best; its ``posed.z`` is empty."""
-
-    posed: Posed
-    misfit: Misfit
-
-
-def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> RestFit:
-    """Fit of the rest model's pose, from that of the modes."""
+def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> Judged:
+    """Fit of the rest model's pose, from that of the modes; its ``posed.z`` is empty."""
     model, config = problem.model, problem.config
     rigid = model.around(model.rest_points, np.zeros((len(model.rest_points), 3, 0), dtype=np.float32))
     rest = replace(problem, model=rigid, network=NetworkTerm.of(rigid, found))
@@ -36,12 +28,12 @@ def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> RestFit:
     start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
     prior = Prior(np.empty(0), np.empty((0, 0)))
     posed = fit_cloud(rest, start, prior, config.refine_sigma, config.refine_steps, 0.0)
-    return RestFit(posed, rest.misfit(posed))
+    return Judged.of(rest, posed)
 
 
-def is_at_rest(problem: Problem, modes: Posed, rest: RestFit) -> bool:
+def is_at_rest(problem: Problem, modes: Judged, rest: Judged) -> bool:
     """Whether the evidence of the rest model is greater than that of the modes."""
-    return rest.misfit.total - problem.misfit(modes).total < narrowing(problem, modes)
+    return rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
 
 
 def narrowing(problem: Problem, modes: Posed) -> float:
