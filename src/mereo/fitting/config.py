@@ -84,6 +84,8 @@ class DrawsConfig:
         starts: random states that are compared with a shape, the most like it.
         sieve: sets of differences spent on each start, and on how many of the best, one stage after the other.
         kept: how many of them are then fitted to the frame.
+        met: misfit up to which a start meets a shape; beyond, ``choices`` states with other discrete draws are tried,
+            and the ``chosen`` most like the shape approach it.
         shape_std: standard deviation of the shape that the modes found, as a share of half the rest box's longest side.
         shape_worth: how many independent points a shape is worth.
         cloud_worth, network_worth: the same of the cloud and of the correspondences, from beginning to end, also where
@@ -104,6 +106,9 @@ class DrawsConfig:
 
     starts: int = 40
     kept: int = 2
+    met: float = 100.0
+    choices: int = 100
+    chosen: int = 4
     sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
     shape_std: float = 0.04
     shape_worth: float = 500.0
@@ -129,7 +134,7 @@ class DrawsConfig:
 MANY_DRAWS = DrawsConfig(
     cloud_worth=3000.0,
     network_worth=10.0,
-    batches=3,
+    batches=2,
     starts=16,
     kept=1,
     sieve=((1, 3), (1, 1)),

@@ -4,11 +4,14 @@ Around a state the scene is linear in its draws (``draws_problem``); it is playe
 and so on, from several starts.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float32
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import spread
+from mereo.fitting.discrete_draws import chosen_otherwise
 from mereo.fitting.draws_approach import Near, Shape, approach, derivatives, near, secant
 from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, misfit, normal_equations, played
 from mereo.fitting.gauss_newton import POSE, Posed
@@ -81,10 +84,32 @@ def followed(problem: DrawsProblem, frame: Posed, shape: Shape, here: list[Near]
     """The best of some starts, followed to the end."""
     config, states = problem.config, problem.states
     for fresh, keep in config.sieve:
-        here = [approach(states, shape, one, fresh) for one in sorted(here, key=lambda one: one.misfit)[:keep]]
+        here = [approach(states, shape, one, fresh) for one in sorted(here, key=by_misfit)[:keep]]
+        here += chosen_better(problem, shape, min(here, key=by_misfit, default=None))
     starts = [(played(problem, one.drawn, one.z, posed_on(frame, one)), one.motion) for one in here]
     likely = sorted(((fit, motion) for fit, motion in starts if fit is not None), key=lambda start: start[0].misfit)
     return [descend(problem, fit, config.last_rounds, motion) for fit, motion in likely[: config.kept]]
+
+
+def chosen_better(problem: DrawsProblem, shape: Shape, best: Near | None) -> list[Near]:
+    """States near a shape that ``best`` does not meet, made from that one by other discrete draws."""
+    config, states = problem.config, problem.states
+    if best is None or best.misfit < config.met:
+        return []
+    others = chosen_otherwise(states.scene, replace(best.drawn, z=best.z), config.choices)
+    here = [near(states, shape, other, other.z) for other in others]
+    likely = sorted((one for one in here if one is not None and differs(one, best, shape.std)), key=by_misfit)
+    return [approach(states, shape, one, 1) for one in likely[: config.chosen]]
+
+
+def differs(one: Near, other: Near, least: float) -> bool:
+    """Whether any played point of two states is farther apart than ``least``; a choice may come out the same again."""
+    return bool(np.abs(one.points - other.points).max() > least)
+
+
+def by_misfit(one: Near | DrawsFit) -> float:
+    """Misfit, as a key to sort by."""
+    return one.misfit
 
 
 def alike(problem: DrawsProblem, shape: Shape) -> list[int]:
@@ -157,7 +182,7 @@ def descend(
         if sigma <= least and start - fit.misfit < config.gain * start:
             break
         damping = min(damping, 1.0)
-    return fit
+    return replace(fit, motion=motion)
 
 
 def lower(

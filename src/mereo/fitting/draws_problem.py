@@ -25,6 +25,9 @@ from mereo.scenes.statistical_model import StatisticalModel
 HELD = 1e6
 """Precision of draws that move nothing here: they stay."""
 
+STILL = 1e-9
+"""Motion, in scene units for a standard deviation, below which a draw moves nothing."""
+
 
 @dataclass(frozen=True, eq=False)
 class DrawsProblem:
@@ -97,6 +100,7 @@ class DrawsFit:
         surface: the posed surface.
         distance, face, place: of the nearest point of the facing surface to each observed partner.
         misfit: with the prior of the draws, the cloud by its last sigma.
+        motion: of the played points for a standard deviation of each draw, where it is known.
     """
 
     drawn: Drawn
@@ -108,6 +112,7 @@ class DrawsFit:
     face: Int[np.ndarray, " p"]
     place: Float[np.ndarray, "p 3"]
     misfit: float
+    motion: Float32[np.ndarray, "a 3 d"] | None = None
 
     def placed(self) -> Float[np.ndarray, "m 3"]:
         """Material points in the camera frame."""
@@ -139,6 +144,14 @@ def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
     return cloud + network + witnesses + float(fit.z @ fit.z)
 
 
+def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:
+    """``NormalEquations.narrowing`` of the draws that move something."""
+    assert fit.motion is not None
+    still = int((np.abs(fit.motion).max(axis=(0, 1)) < STILL).sum())
+    equations = normal_equations(problem, fit, fit.motion, problem.base.config.cloud_sigma)
+    return equations.narrowing() - still * float(np.log(HELD))
+
+
 def normal_equations(
     problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float
 ) -> NormalEquations:
@@ -146,7 +159,7 @@ def normal_equations(
     base, posed, config = problem.base, fit.posed, problem.base.config
     flat, count = motion.reshape(len(motion), -1), len(fit.z)
     spread = problem.states.played.spread
-    still = np.abs(motion).max(axis=(0, 1)) < 1e-9
+    still = np.abs(motion).max(axis=(0, 1)) < STILL
     precision = np.diag(np.where(still, HELD, 1.0))
     normal = NormalEquations.prior(
         np.where(still, 0.0, fit.z), np.zeros(count), precision, posed.log_scale, base.scale_std

@@ -13,7 +13,8 @@ from threadpoolctl import threadpool_limits
 from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences, find_correspondences
 from mereo.fitting.draws_fit import fit_draws
-from mereo.fitting.draws_problem import DrawsProblem
+from mereo.fitting.draws_problem import DrawsFit, DrawsProblem
+from mereo.fitting.draws_problem import narrowing as draws_narrowing
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.modes_fit import Judged, fit_modes
@@ -22,6 +23,7 @@ from mereo.fitting.problem import Problem
 from mereo.fitting.registration import Method, Registration
 from mereo.fitting.residuals import Surface
 from mereo.fitting.rest_fit import fit_rest, is_at_rest
+from mereo.fitting.rest_fit import narrowing as modes_narrowing
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -87,14 +89,18 @@ class ModesFit:
         return self._registration("modes", self.posed.z, self.posed, material, self.seconds)
 
     def with_draws(self, states: DrawnStates) -> Registration:
-        """The answer of the scene's own draws where their misfit is lower, else ``registration``."""
+        """The answer of the scene's own draws where their misfit is lower or their evidence greater, else the modes'.
+
+        Modes can imitate what they do not hold, with more of them than a scene has draws; the evidence counts that.
+        It does not speak against draws, which have the states that there really are.
+        """
         if self.rest is not None:
             return self.registration()
         started = time.perf_counter()
         with threadpool_limits(1, "blas"):
             problem = DrawsProblem.of(self.problem, states, self.found)
             drawn = fit_draws(problem, self.posed)
-            taken = drawn is not None and drawn.misfit < problem.base.misfit(self.posed).total
+            taken = drawn is not None and is_drawn(problem, drawn, self.posed)
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
             return replace(self.registration(), seconds=seconds)
@@ -123,6 +129,12 @@ class ModesFit:
             seconds=seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
         )
+
+
+def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:
+    """Whether a state of the draws is to be preferred to the modes."""
+    gain = drawn.misfit - problem.base.misfit(modes).total
+    return gain < 0 or gain < modes_narrowing(problem.base, modes) - draws_narrowing(problem, drawn)
 
 
 def fit_frame(

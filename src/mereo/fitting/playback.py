@@ -16,7 +16,7 @@ from scipy.special import ndtr, ndtri
 from mereo.deformation.maps import Deformation
 from mereo.deformation.moving_least_squares import Anchors, PointWeights, spread
 from mereo.geometry.procrustes import best_rotations
-from mereo.scenes.draw_recorder import OutOfDraws, Recorder, Shares
+from mereo.scenes.draw_recorder import Call, OutOfDraws, Recorder, Shares
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import Scene
@@ -80,7 +80,11 @@ class Drawn:
     @classmethod
     def of(cls, scene: Scene, seed: int) -> "Drawn":
         """The random state of a seed, without attempts that the scene itself threw away."""
-        calls = random_state(scene, seed).calls
+        return cls.recorded(random_state(scene, seed).calls, seed)
+
+    @classmethod
+    def recorded(cls, calls: Sequence[Call], seed: int) -> "Drawn":
+        """The state of recorded calls; ``seed`` is that of what is not recorded."""
         sizes = tuple(len(call.shares) for call in calls)
         smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in calls])
         return cls(seed, ndtri(np.concatenate([call.shares for call in calls])), sizes, smooth)

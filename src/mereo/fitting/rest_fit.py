@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from mereo.fitting.correspondences import Correspondences
-from mereo.fitting.gauss_newton import POSE, Posed
+from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.modes_fit import Judged, fit_cloud
 from mereo.fitting.priors import Prior
 from mereo.fitting.problem import Problem
@@ -37,9 +37,7 @@ def is_at_rest(problem: Problem, modes: Judged, rest: Judged) -> bool:
 
 
 def narrowing(problem: Problem, modes: Posed) -> float:
-    """``log det`` of the coefficients' posterior precision, whatever the pose is; 0 where there are none."""
+    """``NormalEquations.narrowing`` of the modes at a state."""
     config = problem.config
     known = problem.known(modes, Prior.whole(problem.model), 0.0)
-    matrix = problem.seen(known, modes, config.cloud_sigma, config.network_worth[1], True).matrix
-    pose, cross, z = matrix[:POSE, :POSE], matrix[:POSE, POSE:], matrix[POSE:, POSE:]
-    return float(np.linalg.slogdet(z - cross.T @ np.linalg.solve(pose, cross))[1])
+    return problem.seen(known, modes, config.cloud_sigma, config.network_worth[1], True).narrowing()
