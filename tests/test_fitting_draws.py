@@ -1,11 +1,19 @@
 """The fit of a scene's own draws: what is played, its derivatives, and the approach to a shape."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from test_fitting_theorems import said, shown
 from toy_scene import toy_scene
 
 from mereo.fitting.draws_approach import Shape, approach, derivatives, near, secant
+from mereo.fitting.draws_fit import fit_draws
+from mereo.fitting.draws_problem import DrawsProblem
+from mereo.fitting.draws_problem import narrowing as draws_narrowing
+from mereo.fitting.fit import ModesFit, is_drawn
 from mereo.fitting.playback import Drawn, DrawnStates, material_moved
+from mereo.fitting.rest_fit import narrowing as modes_narrowing
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -72,3 +80,30 @@ def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, stat
     apart = [np.linalg.norm(n.points @ n.rotation.T + n.translation - points, axis=1) for n in (start, found)]
     assert found.misfit < start.misfit
     assert np.median(apart[1]) < 0.3 * np.median(apart[0])
+
+
+def test_the_simpler_description_is_preferred_by_its_evidence(model: StatisticalModel, states: DrawnStates) -> None:
+    """Draws are taken where their misfit is lower, or higher by less than what the modes' more free numbers buy."""
+    points, material = shown(model, 0.5)
+    fitted = ModesFit.of(points, said(model, material), model, 1.0)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.found)
+    drawn = fit_draws(problem, fitted.posed)
+    assert drawn is not None
+    modes = problem.base.misfit(fitted.posed).total
+    bought = modes_narrowing(problem.base, fitted.posed) - draws_narrowing(problem, drawn)
+    assert bought > 1.0
+    for gain, taken in ((-5.0, True), (0.9 * bought, True), (1.1 * bought, False)):
+        assert is_drawn(problem, replace(drawn, misfit=modes + gain), fitted.posed) == taken
+
+
+def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
+    points, material = shown(model, 0.5)
+    fitted = ModesFit.of(points, said(model, material), model, 1.0)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.found)
+    drawn = fit_draws(problem, fitted.posed)
+    assert drawn is not None and drawn.motion is not None
+    one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
+    one_moves[:, :, 1:] = 0.0
+    narrowed = [draws_narrowing(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]
+    assert narrowed[0] > 1.0
+    assert narrowed[1] == pytest.approx(0.0, abs=1e-6)

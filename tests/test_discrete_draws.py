@@ -1,0 +1,109 @@
+"""States that differ in a discrete draw: all that was drawn is kept, and what the choice asks for is drawn anew."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+from test_fitting_theorems import IN_FRONT, said, seen
+from toy_scene import Shear, rest_mesh, toy_scene
+
+from mereo.deformation.draw_names import named, part
+from mereo.deformation.maps import Deformation
+from mereo.fitting.discrete_draws import chosen_otherwise
+from mereo.fitting.fit import ModesFit
+from mereo.fitting.playback import Drawn, DrawnStates
+from mereo.geometry.transforms import transform_points
+from mereo.scenes.parameters import random_state
+from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.statistical_model import StatisticalModel
+
+SIDES = 4
+"""Options of the discrete draw: no side, or one of three boxes is pushed out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pushed:
+    distance: float
+    then: Shear
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        return self.then(points + np.array([0.0, self.distance, 0.0]))
+
+
+def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    shear = Shear(*(named(rng, "shear").uniform(-1, 1, size=3) * [3.0, 0.3, 0.2]))
+    box = int(named(rng, "box").choice(SIDES))
+    maps: list[Deformation] = [shear] * 4
+    if box < 3:
+        with part(rng, f"box {box}"):
+            maps[box] = Pushed(float(named(rng, "distance").uniform(4.0, 6.0)), shear)
+    return tuple(maps)
+
+
+SCENE = Scene("pushed", rest_mesh(), sample_deformations, Workspace())
+
+
+def box_of(drawn: Drawn) -> int:
+    """Option of a state's discrete draw, the fourth number."""
+    return int(ndtr(drawn.z[3]) * SIDES)
+
+
+@pytest.mark.parametrize("seed", [1001, 1002, 1003])
+def test_all_but_the_choice_and_what_it_asks_for_is_kept(seed: int) -> None:
+    drawn = Drawn.of(SCENE, seed)
+    others = chosen_otherwise(SCENE, drawn, 40)
+    assert {box_of(other) for other in others} == set(range(SIDES))
+    for other in others:
+        np.testing.assert_allclose(other.z[:3], drawn.z[:3])
+        assert len(other.z) == (4 if box_of(other) == 3 else 5)
+        assert other.deformations(SCENE, other.z) is not None
+        if box_of(other) == box_of(drawn):
+            np.testing.assert_allclose(other.z[4:], drawn.z[4:])
+
+
+def test_the_same_state_gives_the_same_others() -> None:
+    drawn = Drawn.of(SCENE, 1001)
+    first, second = (np.concatenate([other.z for other in chosen_otherwise(SCENE, drawn, 10)]) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_a_scene_without_discrete_draws_has_no_others() -> None:
+    assert chosen_otherwise(toy_scene(), Drawn.of(toy_scene(), 1001), 10) == []
+
+
+def test_a_scene_that_begins_anew_is_refused() -> None:
+    """Draws of an attempt that was thrown away would count as draws of the state."""
+
+    def again(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        while True:
+            maps = sample_deformations(rng)
+            if len({id(one) for one in maps}) == 1:
+                return maps
+
+    scene = replace(SCENE, sample_deformations=again)
+    drawn = Drawn.of(scene, 1001)
+    assert len(drawn.z) == 4
+    assert all(len(other.z) < 4 + 12 * 5 for other in chosen_otherwise(scene, drawn, 40))
+
+
+def states_with(model: StatisticalModel, box: int, count: int) -> DrawnStates:
+    """States of the first seeds that push this box."""
+    seeds = [seed for seed in range(1000, 1200) if box_of(Drawn.of(SCENE, seed)) == box][:count]
+    each = [DrawnStates.of(SCENE, model, 1, seed) for seed in seeds]
+    columns = {name: np.concatenate([getattr(one, name) for one in each]) for name in ("material", "z", "modes")}
+    return replace(each[0], seeds=tuple(seeds), **columns)
+
+
+def test_a_choice_that_no_start_has_made_is_found() -> None:
+    """All states that a fit may start from push no box; the frame shows one that is pushed."""
+    model = scene_model(SCENE, count=200)
+    pushed = states_with(model, 1, 1).seeds[0]
+    state = SCENE.deform(random_state(SCENE, pushed).deformations)
+    material = transform_points(IN_FRONT, state_points(state, model.nodes, model.node_labels))
+    fitted = ModesFit.of(seen(state.mesh.transformed(IN_FRONT)), said(model, material), model, 1.0)
+    found = fitted.with_draws(states_with(model, 3, 16))
+    assert found.method == "draws" and found.drawn is not None
+    assert box_of(found.drawn) == 1
+    assert np.median(np.linalg.norm(found.material - material, axis=1)) < 0.05
