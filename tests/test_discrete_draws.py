@@ -107,3 +107,12 @@ def test_a_choice_that_no_start_has_made_is_found() -> None:
     assert found.method == "draws" and found.drawn is not None
     assert box_of(found.drawn) == 1
     assert np.median(np.linalg.norm(found.material - material, axis=1)) < 0.05
+
+
+def test_draws_far_beyond_the_bounds_are_kept_as_they_are_played() -> None:
+    """A fit may push a draw farther than its share can say; then the state is played at the bound."""
+    drawn = Drawn.of(SCENE, 1001)
+    far = replace(drawn, z=np.where(np.arange(len(drawn.z)) == 0, 9.0, drawn.z))
+    others = chosen_otherwise(SCENE, far, 10)
+    assert others
+    np.testing.assert_allclose([other.z[0] for other in others], 4.0)

@@ -8,9 +8,8 @@ anew.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import ndtr
 
-from mereo.fitting.playback import SMOOTH, Drawn
+from mereo.fitting.playback import SMOOTH, Drawn, shares_of
 from mereo.scenes.draw_recorder import Call, OutOfDraws, Recorder
 from mereo.scenes.given_draws import played_back
 from mereo.scenes.parameters import play
@@ -25,7 +24,7 @@ def chosen_otherwise(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
 
     Nothing where the scene has no discrete draws. The same state gives the same ones.
     """
-    calls = played_back(scene, drawn.seed, np.split(ndtr(drawn.z), np.cumsum(drawn.sizes)[:-1])).calls
+    calls = played_back(scene, drawn.seed, shares_of(drawn.z, drawn.sizes)).calls
     discrete = [number for number, call in enumerate(calls) if call.kind not in SMOOTH]
     if not discrete:
         return []

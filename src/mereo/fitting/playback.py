@@ -91,11 +91,15 @@ class Drawn:
 
     def deformations(self, scene: Scene, z: Float[np.ndarray, " d"]) -> tuple[Deformation, ...] | None:
         """Deformations of the state with other draws; None where the scene refuses it."""
-        shares = np.split(ndtr(np.clip(z, -LARGEST, LARGEST)), np.cumsum(self.sizes)[:-1])
         try:
-            return scene.sample_deformations(Playback(self.seed, shares))
+            return scene.sample_deformations(Playback(self.seed, shares_of(z, self.sizes)))
         except (OutOfDraws, ValueError):
             return None
+
+
+def shares_of(z: Float[np.ndarray, " d"], sizes: tuple[int, ...]) -> list[Shares]:
+    """Shares of each call, of standard normal draws, as they are played."""
+    return np.split(ndtr(np.clip(z, -LARGEST, LARGEST)), np.cumsum(sizes)[:-1])
 
 
 def as_sparse(weights: PointWeights, count: int) -> csr_array:

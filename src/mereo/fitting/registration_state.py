@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import ndtr
 
 from mereo.fitting.answer import Answer
-from mereo.fitting.playback import LARGEST, SMOOTH, Drawn, material_moved
+from mereo.fitting.playback import SMOOTH, Drawn, material_moved, shares_of
 from mereo.fitting.register import Registrar, same_topology
 from mereo.fitting.registration import Registration
 from mereo.fitting.state_file import FORMAT, STATE, WITNESSES, RegistrationState, StateDraws, read_state, save_state
@@ -202,11 +201,6 @@ def _unposed(
         )
     smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in played.calls])
     return material_moved(scene, model, played.deformations), Drawn(state.draws.seed, z, state.draws.sizes, smooth)
-
-
-def shares_of(z: Float[np.ndarray, " d"], sizes: tuple[int, ...]) -> list[np.ndarray]:
-    """Shares of each call, of standard normal draws, as ``Drawn`` plays them."""
-    return np.split(ndtr(np.clip(z, -LARGEST, LARGEST)), np.cumsum(sizes)[:-1])
 
 
 def witnesses(model: StatisticalModel) -> Int[np.ndarray, " w"]:
