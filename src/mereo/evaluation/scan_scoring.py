@@ -41,8 +41,8 @@ def evaluate_scans(
     """
     if scene is not None and not truths:
         raise ValueError(
-            f"the scene {scene.name!r} is given without truth files; the bunny's own scans have their scene: name truth "
-            "files with --scans, or leave out --scene"
+            f"the scene {scene.name!r} is given without truth files; the bunny's own scans have their scene: name "
+            "truth files with --scans, or leave out --scene"
         )
     scans = [read_truth(path, scene) for path in truths] if truths else [bunny_posed(name) for name in SCANS]
     names = [scan.name for scan in scans]

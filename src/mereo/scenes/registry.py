@@ -18,8 +18,8 @@ def scene_named_in(file: Path, name: str) -> Scene:
     """
     if name not in SCENES and not is_yaml(name):
         raise ValueError(
-            f"{file} names the scene {name!r}, which is neither built in nor a YAML file; data files run no others: read "
-            "the scene, and if you trust it name it yourself with --scene"
+            f"{file} names the scene {name!r}, which is neither built in nor a YAML file; data files run no others: "
+            "read the scene, and if you trust it name it yourself with --scene"
         )
     return load_scene(name if name in SCENES else file.parent / name)
 
