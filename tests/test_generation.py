@@ -112,7 +112,15 @@ def test_two_workers_equal_one(whole: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_leaves_complete_shards_only(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "number, line",
+    [
+        (signal.SIGINT, "mereo: interrupted\n"),
+        (signal.SIGTERM, "mereo: stopped by SIGTERM\n"),
+        (signal.SIGHUP, "mereo: stopped by SIGHUP\n"),
+    ],
+)
+def test_ctrl_c_leaves_complete_shards_only(tmp_path: Path, number: signal.Signals, line: str) -> None:
     """A real interrupt to a real command, as a terminal sends it: to every process of the group."""
     output = tmp_path / "data"
     options = "--examples 20000 --workers 2 --image-size 32 --points 32 --per-segment 4 --output"
@@ -121,9 +129,9 @@ def test_ctrl_c_leaves_complete_shards_only(tmp_path: Path) -> None:
     deadline = time.monotonic() + 300
     while not list(output.glob("shard-*")) and time.monotonic() < deadline:
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, number)
     _, errors = process.communicate(timeout=120)
-    assert (process.returncode, errors) == (130, "mereo: interrupted\n")
+    assert (process.returncode, errors) == (128 + number, line)
     names = {path.name for path in output.iterdir()}
     shards = names - {"manifest.json", "statistical_model.safetensors", "template.safetensors"}
     assert len(names) - len(shards) == 3 and shards, names
