@@ -2,12 +2,16 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from safetensors.numpy import load_file
 
 import mereo.__main__ as command_line
 from mereo.cli.stop_signals import STOPPING, Stopped, stop_signals
@@ -92,3 +96,25 @@ def test_a_closed_terminal_takes_no_words_and_raises_none(monkeypatch: pytest.Mo
 
     monkeypatch.setattr("sys.stderr", SimpleNamespace(write=closed, flush=closed))
     assert run(hang_up, monkeypatch) == 128 + STOPPING[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "number, how", [(signal.SIGINT, "interrupted"), *((each, f"stopped by {each.name}") for each in STOPPING)]
+)
+def test_a_real_signal_leaves_complete_shards_only(tmp_path: Path, number: signal.Signals, how: str) -> None:
+    """A real command, signalled as a terminal does it: to every process of the group."""
+    output = tmp_path / "data"
+    options = "--examples 20000 --workers 2 --image-size 32 --points 32 --per-segment 4 --output"
+    command = [sys.executable, "-m", "mereo", "generate", "rope", *options.split(), str(output)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
+    deadline = time.monotonic() + 300
+    while not list(output.glob("shard-*")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, number)
+    _, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (128 + number, f"mereo: {how}\n")
+    names = {path.name for path in output.iterdir()}
+    shards = names - {"manifest.json", "statistical_model.safetensors", "template.safetensors"}
+    assert len(names) - len(shards) == 3 and shards, names
+    assert all(len(load_file(output / name)["labels"]) == 64 for name in shards)
