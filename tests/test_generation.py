@@ -4,10 +4,6 @@ import errno
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -109,25 +105,6 @@ def test_any_example_can_be_remade_alone(whole: Path) -> None:
 def test_two_workers_equal_one(whole: Path, tmp_path: Path) -> None:
     generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, workers=2)
     assert contents(whole) == contents(tmp_path / "data")
-
-
-@pytest.mark.slow
-def test_ctrl_c_leaves_complete_shards_only(tmp_path: Path) -> None:
-    """A real interrupt to a real command, as a terminal sends it: to every process of the group."""
-    output = tmp_path / "data"
-    options = "--examples 20000 --workers 2 --image-size 32 --points 32 --per-segment 4 --output"
-    command = [sys.executable, "-m", "mereo", "generate", "rope", *options.split(), str(output)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
-    deadline = time.monotonic() + 300
-    while not list(output.glob("shard-*")) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=120)
-    assert (process.returncode, errors) == (130, "mereo: interrupted\n")
-    names = {path.name for path in output.iterdir()}
-    shards = names - {"manifest.json", "statistical_model.safetensors", "template.safetensors"}
-    assert len(names) - len(shards) == 3 and shards, names
-    assert all(len(load_file(output / name)["labels"]) == 64 for name in shards)
 
 
 # --- what is stored ---------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ from camera_files import write_camera
 from PIL import Image
 
 from mereo.cli.stream import stream_reconstructions
-from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.stream import StreamFrame
 from mereo.reconstruction.stream_sources import frames_of
 from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.scenes.registry import load_scene
@@ -99,6 +101,65 @@ def test_names_on_standard_input_are_frames(
     frames = list(frames_of("-", read(folder), IsolationConfig()))
     assert [Path(frame.name).name for frame in frames] == ["000.png", "001.png"]
     assert len(frames[1].load()) > 32
+
+
+def damaged_clouds(folder: Path, cloud: np.ndarray) -> set[str]:
+    """Write files that no reader can make anything of, and clouds that show nothing; returns their names."""
+    np.save(folder / "1 equal.npy", np.ones((500, 3)))
+    np.save(folder / "1 one point.npy", np.ones((1, 3)))
+    np.save(folder / "1 no number.npy", np.full((500, 3), np.nan))
+    whole, archive = (folder / "0.npy").read_bytes(), io.BytesIO()
+    np.savez(archive, points=cloud)
+    shape = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1" + b"0" * 30 + b", 3), }"
+    for name, content in {
+        "empty": b"",
+        "header cut": whole[:40],
+        "data cut": whole[:300],
+        "header of brackets": whole[:30] + b"(" * 30 + whole[60:],
+        "endless": whole[:10] + shape.ljust(118) + whole[128:],
+        "archive cut": archive.getvalue()[:500],
+    }.items():
+        (folder / f"1 {name}.npy").write_bytes(content)
+    return {file.name for file in folder.glob("1 *")}
+
+
+def test_no_damaged_frame_ends_a_stream(
+    sequence: tuple[Path, list[SegmentedMesh]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, truth = sequence
+    cloud = np.concatenate([segment.vertices for segment in truth[0].segments])
+    np.save(tmp_path / "0.npy", cloud)
+    np.save(tmp_path / "2.npy", cloud)
+    bad = damaged_clouds(tmp_path, cloud)
+    summary = stream_reconstructions(str(tmp_path), "rope", resolution=24, every_frame=True)
+    assert (summary.answered, summary.failed) == (2, len(bad))
+    lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
+    assert {one["frame"] for one in lines if "error" in one} == bad
+    assert all("\n" not in one["error"] for one in lines if "error" in one)
+
+
+def test_a_place_that_takes_no_surfaces_is_each_frames_error(
+    sequence: tuple[Path, list[SegmentedMesh]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "0.npy", sequence[1][0].segments[0].vertices)
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="none of the 1 frames could be answered"):
+        stream_reconstructions(str(tmp_path), "rope", resolution=24, surfaces=tmp_path / "file")
+    assert "error" in json.loads(capsys.readouterr().out)
+
+
+def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def frames(*_: object) -> Iterator[StreamFrame]:
+        yield StreamFrame("first", 0.0, lambda: PointCloud(np.ones((40, 3))))
+        raise ValueError("it is cut off")
+
+    monkeypatch.setattr("mereo.cli.stream.frames_of", frames)
+    with pytest.raises(ValueError, match="^it is cut off$"):
+        stream_reconstructions(str(tmp_path), "rope")
+    out, err = capsys.readouterr()
+    assert json.loads(out)["frame"] == "first" and "1 bad" in err
 
 
 def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:

@@ -140,6 +140,20 @@ def test_a_stream_reads_the_same_frames(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.load().points, alone.cloud.points)
 
 
+def test_a_recording_that_is_damaged_anywhere_is_a_sentence_after_its_whole_frames(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", 1, depth_topics)
+    whole, sentences = path.read_bytes(), set()
+    for start in range(4096, len(whole), 131):
+        path.write_bytes(whole[:start] + b"\xff" * 60 + whole[start + 60 :])
+        try:
+            for frame in recorded_frames(path):
+                frame.read()
+        except ValueError as error:
+            sentences.add(str(error))
+    farther = [text for text in sentences if f"{path} cannot be read any farther (" in text]
+    assert farther and all(text.endswith("record or copy it again") for text in farther)
+
+
 def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
     metres = (DEPTH_MM / np.float32(1000)).astype(np.float32)
     metres[DEPTH_MM == 0] = np.nan

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -108,6 +109,37 @@ def test_what_no_longer_belongs_together_is_refused(
         truth.write_text(text.replace('"format": 1', '"format": 2') if fault == "another format" else text[:100])
         with pytest.raises(ValueError, match="cannot be read as a truth file of mereo align"):
             read_truth(truth)
+
+
+def test_a_truth_file_never_runs_a_python_scene_that_the_user_has_not_named(
+    bar: tuple[Path, Scene, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = shutil.copytree(bar[0], tmp_path / "sent")
+    (folder / "evil.py").write_text(
+        "from pathlib import Path\nfrom dataclasses import replace\nfrom mereo.scenes.registry import load_scene\n"
+        "Path(__file__).with_name('was-run').touch()\n"
+        "def scene():\n    return replace(load_scene(Path(__file__).with_name('bar.yaml')), name='trusted')\n"
+    )
+    truth = folder / "truth/truth.json"
+    for name in ("../evil.py", str(folder / "evil.py"), "../evil.PY"):
+        truth.write_text(json.dumps(json.loads(truth.read_text()) | {"scene": name}))
+        with pytest.raises(ValueError, match=f"names the scene '{name}', which is neither built in nor a YAML file"):
+            read_truth(truth)
+        assert not (folder / "was-run").exists()
+    model = AnalyticModel.of(lambda points: points, ("left", "right"))
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.evaluation.scan_scoring.check_names", lambda _, names: named.append(names))
+    monkeypatch.setattr("mereo.evaluation.scan_scoring.registrar_for", lambda *_: sys.exit("read"))
+    named: list[tuple[str, ...]] = []
+    options = ["--scans", str(truth), "--scene", str(folder / "evil.py"), "--output", str(folder / "test")]
+    with pytest.raises(SystemExit, match="read"):
+        main(["evaluate", "known", *options])
+    assert named == [("left", "right")] and (folder / "was-run").exists()
+
+
+def test_a_scene_without_truths_is_refused(bar: tuple[Path, Scene, np.ndarray]) -> None:
+    with pytest.raises(ValueError, match="the scene 'bar' is given without truth files; the bunny's own scans"):
+        evaluate_scans(AnalyticModel.of(lambda points: points, ("left", "right")), scene=bar[1])
 
 
 def test_two_truths_of_one_name(bar: tuple[Path, Scene, np.ndarray]) -> None:

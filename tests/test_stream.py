@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mereo.geometry.camera import PointCloud
-from mereo.reconstruction.stream import Counter, StreamFrame, stream
+from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, stream
 
 
 def frame(number: int, time_s: float = 0.0) -> StreamFrame:
@@ -92,6 +92,34 @@ def test_a_bad_frame_is_reported_and_passed_over() -> None:
     assert "0 frames answered" in str(counter.summary()) and "1 bad" in str(counter.summary())
 
 
+@pytest.mark.parametrize(
+    "problem, sentence",
+    [
+        (ValueError("all points coincide"), "all points coincide"),
+        (OSError(), "OSError"),
+        (IndexError("list index\nout of range"), "bad cannot be answered (IndexError: list index out of range)"),
+        (EOFError(), "bad cannot be answered (EOFError): record or write it again"),
+        (MemoryError("Unable to allocate 8 EiB"), "bad cannot be answered (MemoryError: Unable to allocate 8 EiB)"),
+    ],
+)
+def test_whatever_a_frame_raises_is_its_own_error(problem: Exception, sentence: str) -> None:
+    def load() -> PointCloud:
+        raise problem
+
+    frames = [StreamFrame("bad", 0.0, load), frame(1)]
+    bad, good = stream(frames, number_of, every_frame=True)
+    assert bad.result is None and bad.error.startswith(sentence) and good.result == 1
+
+
+def test_the_memory_of_a_summary_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mereo.reconstruction.stream.RECENT", 3)
+    counter = Counter()
+    for latency_s in (100.0, 1.0, 2.0, 3.0):
+        counter.add(Outcome("", 0.0, 0, "", latency_s, 0.0, 0))
+    assert len(counter.latencies) == 3
+    assert counter.summary().answered == 4 and counter.summary().latency_median_s == 2.0
+
+
 def test_a_broken_sequence_is_raised_after_its_frames() -> None:
     def frames() -> Iterator[StreamFrame]:
         yield frame(0)
@@ -109,6 +137,25 @@ def test_frames_keep_their_recorded_pace() -> None:
     outcomes = list(stream((frame(i, 7.0 + 0.1 * i) for i in range(4)), number_of, recorded_pace=True))
     assert time.perf_counter() - start >= 0.29
     assert outcomes[-1].result == 3
+
+
+def test_leaving_early_ends_a_thread_for_which_nothing_comes() -> None:
+    asked = threading.Semaphore(0)
+
+    def quiet() -> Iterator[StreamFrame | None]:
+        yield frame(0)
+        while True:
+            asked.acquire(timeout=10)
+            yield None
+
+    outcomes = stream(quiet(), number_of)
+    assert next(outcomes).result == 0
+    outcomes.close()  # type: ignore[attr-defined]
+    asked.release(2)
+    for thread in threading.enumerate():
+        if thread.name == "frames":
+            thread.join(5)
+            assert not thread.is_alive()
 
 
 def test_leaving_early_ends_the_reading_thread() -> None:

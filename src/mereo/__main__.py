@@ -5,6 +5,7 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import field, make_dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
@@ -13,6 +14,7 @@ import tyro
 from tyro.conf import subcommand
 
 from mereo.cli import commands, scene_commands, tool_commands
+from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
@@ -41,8 +43,11 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     warnings.formatwarning = _warning_line
     try:
-        parse(arguments).run()
-        sys.stdout.flush()
+        with stop_signals():
+            parse(arguments).run()
+            sys.stdout.flush()
+    except Stopped as stopped:
+        return _stop(f"mereo: stopped by {stopped.signal.name}", 128 + stopped.signal)
     except KeyboardInterrupt:
         return _stop("mereo: interrupted", INTERRUPTED)
     except BrokenPipeError:
@@ -78,8 +83,9 @@ def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:
 
 
 def _stop(message: str, code: int) -> int:
-    sys.stdout.flush()
-    print(message, file=sys.stderr)
+    with suppress(OSError):  # a terminal that was closed (HUP) takes no words
+        sys.stdout.flush()
+        print(message, file=sys.stderr)
     return code
 
 

@@ -18,8 +18,8 @@ from mereo.io.atomic_files import new_directory
 from mereo.io.readers import read_point_cloud
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.weights import load_model
-from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.registry import is_yaml, load_scene
+from mereo.scenes.scene import SCENES, Scene
 from mereo.visualization.contact_sheets import save_png
 from mereo.visualization.scan_overlay import overlay
 
@@ -65,7 +65,9 @@ def align_file(
         write_segments_glb(directory / "segments.glb", placement.mesh, viewer_rotation(scan.frame), UNITS_M[scan.unit])
         save_png(directory / "overlay.png", overlay(placement, cloud, scan))
     print_placement(placement, f"{scan.path.name}, {len(cloud)} points", scan.unit)
-    print(f"wrote {output}; look at {output / 'overlay.png'}, then: mereo evaluate WEIGHTS --scans {output / TRUTH}")
+    trusted = "" if scene in SCENES or is_yaml(scene) else f" --scene {scene}"  # a data file runs no Python scene
+    evaluation = f"mereo evaluate WEIGHTS --scans {output / TRUTH}{trusted}"
+    print(f"wrote {output}; look at {output / 'overlay.png'}, then: {evaluation}")
     return placement
 
 

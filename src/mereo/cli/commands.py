@@ -155,7 +155,8 @@ class Evaluate:
         output: folder to create.
         examples: how many.
         seed: test seeds start at 1,000,000.
-        scene: the scene's name or file, where it is not the built-in one that the weights were trained on.
+        scene: the scene's name or file, where it is not the built-in one that the weights were trained on; for scans,
+            where the truth files name a Python scene, which they cannot have run.
         scans: score real scans instead of rendered views: truth files, or their folders, of `mereo align`; without
             any, the four range scans of the bunny, whose poses are known.
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
@@ -189,7 +190,7 @@ class Evaluate:
             if settings != GenerateConfig():
                 raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
             model = load_for(self.weights, self.inference)
-            evaluate_on_scans(model, self.output, truths=self.scans, choice=self.fit)
+            evaluate_on_scans(model, self.output, truths=self.scans, scene=self.scene, choice=self.fit)
             return
         evaluate_weights(
             self.weights,

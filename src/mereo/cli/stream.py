@@ -3,19 +3,22 @@
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mereo.geometry.conventions import CloudAxes
+from mereo.io.atomic_files import to_json
 from mereo.io.config import InputConfig
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
-from mereo.reconstruction.stream import Counter, Outcome, Summary, stream
-from mereo.reconstruction.stream_sources import STANDARD_INPUT, frames_of
+from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, Summary, sentence, stream
+from mereo.reconstruction.stream_sources import STANDARD_INPUT, frames_of, watched_frames
 
 
 def stream_reconstructions(
@@ -25,6 +28,7 @@ def stream_reconstructions(
     resolution: int = 48,
     rate_hz: float = 30.0,
     every_frame: bool = False,
+    watch: bool = False,
     surfaces: Path | None = None,
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
@@ -32,33 +36,50 @@ def stream_reconstructions(
 ) -> Summary:
     """Print a line of JSON for each answered or bad frame, and the summary at the end or after Ctrl-C.
 
-    Raises ``ValueError`` where not one frame could be answered.
+    Raises ``ValueError`` where not one frame could be answered, and what broke the sequence off, where something did.
     """
     reading, isolation = reading or InputConfig(), isolation or IsolationConfig()
     model = load_for(weights, inference or InferenceConfig())
-    frames = frames_of(source, reading, isolation, rate_hz)
+    frames: Iterable[StreamFrame | None] = (
+        watched_frames(source, reading, isolation) if watch else frames_of(source, reading, isolation, rate_hz)
+    )
     answer = partial(reconstruct, model=model, resolution=resolution, frame=reading.frame)
-    # what is written to standard input arrives when it does
-    pace = not every_frame and source != STANDARD_INPUT
+    # what is written to standard input or into a watched folder arrives when it does
+    pace = not every_frame and not watch and source != STANDARD_INPUT
     outcomes: Iterator[Outcome[Reconstruction]] = stream(frames, answer, recorded_pace=pace, every_frame=every_frame)
     counter, last_error = Counter(), ""
-    to_viewer = viewer_rotation(reading.frame)
+    broken_off: Exception | None = None
     try:
-        for outcome in outcomes:
+        for answered in outcomes:
+            outcome = answered if surfaces is None else written(answered, surfaces, reading.frame)
             counter.add(outcome)
             last_error = outcome.error or last_error
-            print(json.dumps(line(outcome)), flush=True)
-            if surfaces is not None and outcome.result is not None:
-                surfaces.mkdir(parents=True, exist_ok=True)
-                name = re.sub(r"[^\w.-]+", "_", outcome.name)
-                write_segments_glb(surfaces / f"{name}.glb", outcome.result.surfaces, to_viewer)
+            print(json.dumps(to_json(line(outcome))), flush=True)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
+    except BrokenPipeError:  # nobody reads the answers any more
+        raise
+    except (ValueError, OSError) as problem:
+        broken_off = problem
     summary = counter.summary()
     print(summary, file=sys.stderr)
+    if broken_off is not None:
+        raise broken_off
     if not summary.answered and last_error:
         raise ValueError(f"none of the {summary.failed} frames could be answered; the last one: {last_error}")
     return summary
+
+
+def written(outcome: Outcome[Reconstruction], folder: Path, axes: CloudAxes) -> Outcome[Reconstruction]:
+    """Write the surfaces of an answered frame; where that fails, the outcome is a failed one."""
+    if outcome.result is None:
+        return outcome
+    name = re.sub(r"[^\w.-]+", "_", outcome.name)
+    try:
+        write_segments_glb(folder / f"{name}.glb", outcome.result.surfaces, viewer_rotation(axes))
+    except Exception as problem:
+        return replace(outcome, result=None, error=sentence(problem, outcome.name))
+    return outcome
 
 
 def line(outcome: Outcome[Reconstruction]) -> dict[str, Any]:

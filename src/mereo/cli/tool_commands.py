@@ -122,7 +122,7 @@ class StreamCommand:
     """Reconstruct frames as they come: the latest one wins, a bad one is reported and passed over.
 
     Each answer is one line of JSON on standard output, in the input's frame and units; rate and latency come at the
-    end, on standard error.
+    end, on standard error. The exit status is 0 where any frame was answered and the sequence was whole, else 2.
 
     Attributes:
         source: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
@@ -130,6 +130,7 @@ class StreamCommand:
         resolution: grid cells along the longest side: fewer are faster.
         rate: frames per second at which a folder was recorded.
         every_frame: answer all frames, however long it takes, instead of the latest.
+        watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
         surfaces: folder for the surfaces of each answered frame, one GLB file each.
         reading: how a frame is read.
         isolation: what is left out of it.
@@ -141,6 +142,7 @@ class StreamCommand:
     resolution: int = 48
     rate: float = 30.0
     every_frame: bool = False
+    watch: bool = False
     surfaces: Path | None = None
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
@@ -148,6 +150,8 @@ class StreamCommand:
 
     def run(self) -> None:
         """Print a line of JSON for each frame, and the summary at the end."""
+        # read when torch is loaded; clouds of ever other sizes would fill it with products that do not come again
+        os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "4")
         from mereo.cli.stream import stream_reconstructions
 
         stream_reconstructions(
@@ -156,6 +160,7 @@ class StreamCommand:
             resolution=self.resolution,
             rate_hz=self.rate,
             every_frame=self.every_frame,
+            watch=self.watch,
             surfaces=self.surfaces,
             reading=self.reading,
             isolation=self.isolation,

@@ -14,24 +14,37 @@ from mereo.evaluation.scoring import CELLS, TestCase, check_names, score_cases
 from mereo.fitting.config import FitChoice
 from mereo.fitting.register import registrar_for
 from mereo.models.model import Model
+from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 
 def evaluate_scans(
-    model: Model, *, truths: Sequence[str | Path] = (), cells: int = CELLS, choice: FitChoice = "auto"
+    model: Model,
+    *,
+    truths: Sequence[str | Path] = (),
+    scene: Scene | None = None,
+    cells: int = CELLS,
+    choice: FitChoice = "auto",
 ) -> Evaluation:
     """Scores of a model on real scans.
 
     Args:
         model: the trained model.
         truths: truth files, or their folders, of ``mereo align``; none means the four scans of the bunny.
+        scene: the scene that the scans were aligned with; by default each truth file's own, which must be built in or
+            YAML: a data file never has a Python scene run.
         cells: cells of the grid along each axis.
         choice: which answer is scored: by default what a user gets, and beside it all others that can be had.
 
-    Raises ``ValueError`` for another object's model or two scans of one name, ``FileNotFoundError`` for a missing file,
-    and ``AssetUnavailable`` where a scan of the bunny cannot be had.
+    Raises ``ValueError`` for another object's model, two scans of one name and a scene without truths,
+    ``FileNotFoundError`` for a missing file, and ``AssetUnavailable`` where a scan of the bunny cannot be had.
     """
-    scans = [read_truth(path) for path in truths] if truths else [bunny_posed(name) for name in SCANS]
+    if scene is not None and not truths:
+        raise ValueError(
+            f"the scene {scene.name!r} is given without truth files; the bunny's own scans have their scene: name "
+            "truth files with --scans, or leave out --scene"
+        )
+    scans = [read_truth(path, scene) for path in truths] if truths else [bunny_posed(name) for name in SCANS]
     names = [scan.name for scan in scans]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(
@@ -39,7 +52,7 @@ def evaluate_scans(
         )
     for scan in scans:
         check_names(model, scan.truth.names)
-    registrar = registrar_for(model, choice)
+    registrar = registrar_for(model, choice, scene)
     return score_cases(model, lambda index: _case(scans[index], cells), len(scans), False, registrar)
 
 

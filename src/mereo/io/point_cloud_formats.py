@@ -118,10 +118,10 @@ def _is_number(cell: str) -> bool:
 
 
 def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    loaded = np.load(path, allow_pickle=False)
-    if isinstance(loaded, np.ndarray):
-        return _check_array(loaded)
-    with loaded:
+    with path.open("rb") as file:  # by its name, numpy would leave a damaged archive open
+        loaded = np.load(file, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return _check_array(loaded)
         if "points" in loaded:
             return _check_array(loaded["points"])
         arrays = [loaded[key] for key in loaded.files]

@@ -6,7 +6,7 @@ nothing was measured; compressed depth that of ROS's compressed_depth_image_tran
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -95,7 +95,7 @@ def recorded_frames(
         raise FileNotFoundError(f"{path} does not exist; a ROS bag is needed: check the path")
     if find_spec("rosbags") is None:
         raise ImportError(f"{path} needs rosbags, which is not installed: pip install 'mereo[sensors]'")
-    with closing(_open(path)) as reader:
+    with closing(_open(path)) as reader, _undamaged(path):
         topic = topic or _depth_topic(reader, path)
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype in FRAMES]
         if not connections:
@@ -138,9 +138,23 @@ def _open(path: Path) -> Any:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     except Exception as error:  # a damaged bag raises whatever its storage format does
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
-        raise ValueError(f"{path} cannot be read as a ROS bag ({reason}): record or copy it again") from error
+        raise ValueError(f"{path} cannot be read as a ROS bag ({_reason(error)}): record or copy it again") from error
     return reader
+
+
+@contextmanager
+def _undamaged(path: Path) -> Iterator[None]:
+    """One sentence of whatever a bag raises that could be opened but is damaged farther in."""
+    try:
+        yield
+    except (ValueError, ImportError, MemoryError):
+        raise
+    except Exception as error:
+        raise ValueError(f"{path} cannot be read any farther ({_reason(error)}): record or copy it again") from error
+
+
+def _reason(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
 
 
 def _depth_topic(reader: Any, path: Path) -> str:
@@ -198,8 +212,7 @@ def _read(decode: Callable[[Any], Content], message: Callable[[], Any], source: 
     try:
         return decode(message())
     except Exception as error:  # whatever a broken message makes of the parser
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
-        raise ValueError(f"{source} cannot be read ({reason}): take another frame") from error
+        raise ValueError(f"{source} cannot be read ({_reason(error)}): take another frame") from error
 
 
 def _depth_image(message: Any, camera: Camera, depth_scale: float | None) -> DepthImage:

@@ -7,6 +7,7 @@ grows, however slow the machine is.
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -17,6 +18,9 @@ from mereo.geometry.camera import PointCloud
 from mereo.reconstruction.latest_slot import LatestSlot
 
 Result = TypeVar("Result")
+
+RECENT = 10_000
+"""Answers whose latencies a summary is made of: a stream may run for weeks in the same memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +61,7 @@ class Outcome(Generic[Result]):
 
 
 def stream(
-    frames: Iterable[StreamFrame],
+    frames: Iterable[StreamFrame | None],
     answer: Callable[[PointCloud], Result],
     *,
     recorded_pace: bool = False,
@@ -66,13 +70,14 @@ def stream(
     """Answer the latest frame, again and again, until the sequence ends.
 
     Args:
-        frames: the sequence; iterated in a thread of its own, which may wait for the camera.
+        frames: the sequence; iterated in a thread of its own, which may wait for the camera. A None says that nothing
+            new has come, and lets a thread that waits see that the stream has been left.
         answer: from a cloud to whatever is wanted, for example ``lambda cloud: reconstruct(cloud, model, 48)``.
         recorded_pace: frames arrive when their times say, counted from the first; else as fast as they are read.
         every_frame: none is dropped; the sequence waits for the answers.
 
-    Yields one outcome per answered or failed frame. What goes wrong in one frame (``ValueError``, ``OSError``) is its
-    outcome's error; what goes wrong in the sequence itself is raised after the outcomes before it.
+    Yields one outcome per answered or failed frame. Whatever goes wrong in one frame is its outcome's error; what goes
+    wrong in the sequence itself is raised after the outcomes before it.
     """
     reading = _Reading(frames, recorded_pace, every_frame)
     threading.Thread(target=reading.run, daemon=True, name="frames").start()
@@ -82,8 +87,8 @@ def stream(
             start, result, error = time.perf_counter(), None, ""
             try:
                 result = answer(frame.load())
-            except (ValueError, OSError) as problem:
-                error = " ".join(str(problem).split()) or type(problem).__name__
+            except Exception as problem:  # a damaged frame makes the libraries that parse it raise anything
+                error = sentence(problem, frame.name)
             now = time.perf_counter()
             yield Outcome(frame.name, frame.time_s, result, error, now - taken.arrived_s, now - start, taken.replaced)
         if reading.failure is not None:
@@ -92,10 +97,19 @@ def stream(
         reading.slot.stop()
 
 
+def sentence(problem: Exception, name: str) -> str:
+    """Sentence that says what is wrong with a frame; ``name`` is the frame's."""
+    text = " ".join(str(problem).split())
+    if isinstance(problem, ValueError | OSError | ImportError):
+        return text or type(problem).__name__
+    reason = f"{type(problem).__name__}: {text}" if text else type(problem).__name__
+    return f"{name} cannot be answered ({reason}): record or write it again"
+
+
 class _Reading:
     """The reading thread's side of a stream."""
 
-    def __init__(self, frames: Iterable[StreamFrame], recorded_pace: bool, every_frame: bool) -> None:
+    def __init__(self, frames: Iterable[StreamFrame | None], recorded_pace: bool, every_frame: bool) -> None:
         self.frames, self.recorded_pace, self.every_frame = frames, recorded_pace, every_frame
         self.slot = LatestSlot[StreamFrame]()
         self.failure: Exception | None = None
@@ -111,6 +125,10 @@ class _Reading:
     def _bring(self) -> None:
         start, zero = time.perf_counter(), None
         for frame in self.frames:
+            if frame is None:
+                if self.slot.stopped:
+                    break
+                continue
             zero = frame.time_s if zero is None else zero
             if self.recorded_pace:
                 time.sleep(max(0.0, frame.time_s - zero - (time.perf_counter() - start)))
@@ -120,7 +138,7 @@ class _Reading:
 
 @dataclass(frozen=True)
 class Summary:
-    """Numbers of a stream: answers per second, latencies in seconds, and what was not answered."""
+    """Numbers of a stream: answers per second, latencies in seconds (the last ``RECENT``), what was not answered."""
 
     answered: int
     failed: int
@@ -142,8 +160,8 @@ class Counter:
 
     def __init__(self) -> None:
         self.start = time.perf_counter()
-        self.latencies: list[float] = []
-        self.failed = self.dropped = 0
+        self.latencies = deque[float](maxlen=RECENT)
+        self.answered = self.failed = self.dropped = 0
 
     def add(self, outcome: Outcome[Result]) -> None:
         """Count an outcome."""
@@ -151,11 +169,12 @@ class Counter:
         if outcome.error:
             self.failed += 1
         else:
+            self.answered += 1
             self.latencies.append(outcome.latency_s)
 
     def summary(self) -> Summary:
         """Numbers of the stream up to now; latencies are NaN where nothing was answered."""
         seconds = time.perf_counter() - self.start
-        count = len(self.latencies)
-        median, worst = np.quantile(self.latencies, [0.5, 0.99]) if count else (np.nan, np.nan)
-        return Summary(count, self.failed, self.dropped, count / seconds, float(median), float(worst))
+        median, worst = np.quantile(self.latencies, [0.5, 0.99]) if self.latencies else (np.nan, np.nan)
+        rate_hz = self.answered / seconds
+        return Summary(self.answered, self.failed, self.dropped, rate_hz, float(median), float(worst))

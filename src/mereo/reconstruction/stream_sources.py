@@ -1,5 +1,6 @@
-"""Sources of a stream's frames: a folder of files, a ROS recording, or file names on standard input."""
+"""Sources of a stream's frames: a folder, complete or still filled, a ROS recording, file names on standard input."""
 
+import io
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -8,13 +9,14 @@ from pathlib import Path
 
 from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
-from mereo.io.depth_formats import is_depth_image
+from mereo.io.depth_formats import DEPTH_READERS
 from mereo.io.point_cloud_formats import CLOUD_READERS
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.reconstruction.stream import StreamFrame
+from mereo.reconstruction.watched_folder import LOOK_S, WatchedFolder
 
 STANDARD_INPUT = "-"
 """Source that means names of files on standard input."""
@@ -45,7 +47,7 @@ def frames_of(
         return _recorded(path, reading, isolation)
     if not path.is_dir():
         raise ValueError(f"{path} is a single file; for one frame use `mereo reconstruct`, here name its folder")
-    files = sorted(file for file in path.iterdir() if _is_frame(file) and file != reading.mask)
+    files = sorted(file for file in path.iterdir() if _is_frame(file, reading))
     if not files:
         raise ValueError(f"{path} has no depth images or point clouds; a folder of frames is needed: check the path")
     return (
@@ -54,12 +56,43 @@ def frames_of(
     )
 
 
-def _is_frame(file: Path) -> bool:
-    return file.is_file() and (file.suffix.lower() in CLOUD_READERS or is_depth_image(file))
+def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:
+    """Frames of a folder as their files arrive, without end; None where nothing new has come.
+
+    Files that are there already come first. One that is written again is a new frame; see ``watched_folder`` on when a
+    file is complete. Times count from the start.
+
+    Raises ``FileNotFoundError``, or ``ValueError`` for what is no folder; ``OSError`` where it is removed meanwhile.
+    """
+    path = Path(source)
+    if source != STANDARD_INPUT and not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; a folder that can be watched is needed: make it first")
+    if not path.is_dir() or is_recording(path):
+        raise ValueError(f"{source} is no folder of frames; only such a folder can be watched: leave out --watch")
+    return _arriving(WatchedFolder(path, lambda file: _is_frame(file, reading)), reading, isolation)
+
+
+def _arriving(folder: WatchedFolder, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:
+    start = time.perf_counter()
+    while True:
+        begun = time.perf_counter()
+        for file in folder.look(begun):
+            load = _loader(partial(read_frame, file, reading), isolation)
+            yield StreamFrame(file.name, time.perf_counter() - start, load)
+        yield None
+        time.sleep(max(LOOK_S, time.perf_counter() - begun))  # at most half of the time in a folder of many files
+
+
+def _is_frame(file: Path, reading: InputConfig) -> bool:
+    """Whether the name of a file is a frame's; hidden ones are those that a writer renames when they are complete."""
+    known = file.suffix.lower() in CLOUD_READERS or file.suffix.lower() in DEPTH_READERS
+    return known and not file.name.startswith(".") and file != reading.mask and file.is_file()
 
 
 def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame]:
     start = time.perf_counter()
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        sys.stdin.reconfigure(errors="surrogateescape")  # names are bytes: one that is no UTF-8 is still a file's
     for line in sys.stdin:
         if name := line.strip():
             load = _loader(partial(read_frame, name, reading), isolation)

@@ -11,6 +11,19 @@ def is_yaml(scene: "str | Path | Scene") -> bool:
     return isinstance(scene, str | Path) and Path(scene).suffix.lower() in (".yaml", ".yml")
 
 
+def scene_named_in(file: Path, name: str) -> Scene:
+    """Scene that a data file names: a built-in one, or a YAML file where it is seen from the data file's folder.
+
+    Raises ``ValueError`` for Python scenes, which run only where the user names them, and as ``load_scene`` does.
+    """
+    if name not in SCENES and not is_yaml(name):
+        raise ValueError(
+            f"{file} names the scene {name!r}, which is neither built in nor a YAML file; data files run no others: "
+            "read the scene, and if you trust it name it yourself with --scene"
+        )
+    return load_scene(name if name in SCENES else file.parent / name)
+
+
 def load_scene(name: str | Path) -> Scene:
     """Scene by its built-in name, or from a file, YAML or Python.
 

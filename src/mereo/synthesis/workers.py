@@ -13,7 +13,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from itertools import islice
-from multiprocessing import connection
+from multiprocessing import connection, resource_tracker
 from multiprocessing.synchronize import Event
 from typing import Any, TypeVar
 
@@ -49,6 +49,7 @@ def in_processes(
     _check_can_be_sent(function)
     # spawned, not forked: threads of libraries that this process has used do not survive a fork
     context = multiprocessing.get_context("spawn")
+    _start_resource_tracker()
     stop = context.Event()
     waiting, running = iter(items), dict[Future[Result], Item]()
     with (
@@ -73,13 +74,29 @@ def in_processes(
             pool.shutdown(cancel_futures=True)
 
 
+def _start_resource_tracker() -> None:
+    """Start Python's process that frees shared things, which ignores INT and TERM by itself, with HUP blocked too.
+
+    A closed terminal would end it before the others, which then complain that what they free is gone.
+    """
+    if not hasattr(signal, "SIGHUP"):
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])  # what is blocked stays so in a new process
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 _in_worker: tuple[Function[Any, Any], Event] | None = None
 """Set once when a worker starts: an event can only be inherited, and the function need not be sent with every item."""
 
 
 def _start_worker(function: Function[Any, Any], stop: Event) -> None:
     global _in_worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business, which sets `stop`
+    # Ctrl-C and a closed terminal are the parent's business, which sets `stop`; TERM is how the pool ends its processes
+    for number in (signal.SIGINT, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ())):
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     _in_worker = function, stop
 

@@ -28,6 +28,7 @@ from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.pipeline import Reconstruction
+from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
 from mereo.visualization.error_maps import error_picture
@@ -89,12 +90,17 @@ def evaluate_on_scans(
     output: str | Path,
     *,
     truths: Sequence[str | Path] = (),
+    scene: str | None = None,
     cells: int = CELLS,
     choice: FitChoice = "auto",
 ) -> Evaluation:
-    """Score a model on real scans, with the same files as ``evaluate_weights``: ``mereo evaluate --scans``."""
+    """Score a model on real scans, with the same files as ``evaluate_weights``: ``mereo evaluate --scans``.
+
+    Takes the arguments of ``evaluate_scans``; ``scene`` is a name or a file.
+    """
     with new_directory(output) as directory:
-        evaluation = evaluate_scans(model, truths=truths, cells=cells, choice=choice)
+        loaded = None if scene is None else load_scene(scene)
+        evaluation = evaluate_scans(model, truths=truths, scene=loaded, cells=cells, choice=choice)
         facts = {"scans": list(evaluation.examples), "truths": [str(path) for path in truths]}
         write_evaluation(directory, evaluation, {**facts, "trained": model.provenance})
     print(markdown_table(evaluation))

@@ -17,8 +17,8 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import write_json
 from mereo.io.errors import readable
 from mereo.io.readers import read_point_cloud
-from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES
+from mereo.scenes.registry import scene_named_in
+from mereo.scenes.scene import SCENES, Scene
 
 TRUTH = "truth.json"
 """Name of the file."""
@@ -85,11 +85,15 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_truth(path: str | Path) -> PosedScan:
+def read_truth(path: str | Path, scene: Scene | None = None) -> PosedScan:
     """Scan with its placed segments, from truth.json or the folder that holds it.
 
+    Args:
+        path: the file or its folder.
+        scene: the scene that the scan was aligned with, which has to be given where it is a Python file.
+
     Raises ``FileNotFoundError`` where the file, its scan or its scene is missing, and ``ValueError`` where one of them
-    is not what it was.
+    is not what it was, or where the file names a Python scene and ``scene`` is not given.
     """
     path = Path(path)
     path = path / TRUTH if path.is_dir() else path
@@ -100,19 +104,19 @@ def read_truth(path: str | Path) -> PosedScan:
         poses = {name: _array(entry["T_scan_segment"], (4, 4)) for name, entry in facts["segments"].items()}
         boxes = {name: _array(entry["rest_box"], (2, 3)) for name, entry in facts["segments"].items()}
         scan = ScanFile(path.parent / facts["scan"], facts["unit"], facts["frame"], facts["drop_invalid"])
-        scene, scan_sha256 = facts["scene"], facts["scan_sha256"]
-    loaded = load_scene(scene if scene in SCENES else path.parent / scene)
+        name, scan_sha256 = str(facts["scene"]), facts["scan_sha256"]
+    loaded = scene_named_in(path, name) if scene is None else scene
     rest, unit_m = loaded.rest, loaded.unit_m
     if rest.names != tuple(poses) or not _same_place(rest, boxes):
-        raise ValueError(f"the meshes of the scene {scene!r} are not those that {path} was made with: align again")
+        raise ValueError(f"the meshes of the scene {name!r} are not those that {path} was made with: align again")
     if not scan.path.exists():
         raise FileNotFoundError(f"{scan.path}, the scan of {path}, does not exist: put it there, or align again")
     if sha256_of(scan.path) != scan_sha256:
         raise ValueError(f"{scan.path} is not the file that {path} was made from (another SHA-256): align it again")
     cloud = read_point_cloud(scan.path, scan.drop_invalid)
-    name = path.resolve().parent.name if path.name == TRUTH else path.stem
+    title = path.resolve().parent.name if path.name == TRUTH else path.stem
     scene_unit = None if unit_m is None else unit_m / UNITS_M[scan.unit]
-    return PosedScan(name, cloud, moved(rest, np.stack(list(poses.values()))), scan.frame, scene_unit)
+    return PosedScan(title, cloud, moved(rest, np.stack(list(poses.values()))), scan.frame, scene_unit)
 
 
 def _array(value: Any, shape: tuple[int, int]) -> np.ndarray:

@@ -16,6 +16,7 @@ import trimesh
 from jaxtyping import Float, UInt8
 
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
+from mereo.visualization.viewer.guard import guarded_servers
 
 BACKDROP = ((58, 65, 78), (22, 25, 32))
 """Top and bottom of the background, neutral and dark: the palette's yellow is hard to see on white."""
@@ -42,7 +43,10 @@ def import_viser() -> Any:
 
 
 def start_server(port: int, title: str) -> Any:
-    """Server of viser on 127.0.0.1; port 0 means any. Raises ``OSError`` where the port is taken."""
+    """Server of viser on 127.0.0.1 that answers its own page only (``guard``); port 0 means any.
+
+    Raises ``OSError`` where the port is taken, and ``ImportError`` for a viser that the guard does not know.
+    """
     viser = import_viser()
     with socket.socket() as probe:  # viser would silently take another port
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -53,8 +57,14 @@ def start_server(port: int, title: str) -> Any:
         port = probe.getsockname()[1]
     # browsers open connections ahead and drop them, which websockets reports with a traceback each
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
-    with contextlib.redirect_stdout(io.StringIO()):  # its own banner
+    with contextlib.redirect_stdout(io.StringIO()), guarded_servers() as guards:  # without its own banner
         server = viser.ViserServer(host="127.0.0.1", port=port, label=title, verbose=False)
+    if not guards:
+        stop_server(server)
+        raise ImportError(
+            f"viser {viser.__version__} starts its server in a way that mereo cannot guard against other pages: run "
+            "pip install 'viser==1.1.1'"
+        )
     server.gui.configure_theme(
         dark_mode=True, show_logo=False, show_share_button=False, control_width="medium", brand_color=(86, 180, 233)
     )

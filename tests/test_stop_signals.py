@@ -1,0 +1,120 @@
+"""TERM and HUP end a command as Ctrl-C does: by an exception in the main thread, which leaves nothing half-written."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from safetensors.numpy import load_file
+
+import mereo.__main__ as command_line
+from mereo.cli.stop_signals import STOPPING, Stopped, stop_signals
+from mereo.cli.stream import stream_reconstructions
+from mereo.io.atomic_files import atomic_file
+
+
+def run(work: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> int:
+    """Exit code of the command line when a command does this work."""
+    monkeypatch.setattr(command_line, "parse", lambda _: SimpleNamespace(run=work))
+    return command_line.main([])
+
+
+@pytest.mark.parametrize("number", STOPPING)
+def test_a_signal_leaves_nothing_half_written(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def write() -> None:
+        with atomic_file(tmp_path / "results" / "table.md") as partial:
+            partial.write_text("half of it")
+            os.kill(os.getpid(), number)
+            threading.Event().wait(20)
+
+    assert run(write, monkeypatch) == 128 + number
+    assert capsys.readouterr().err == f"mereo: stopped by {number.name}\n"
+    assert not list(tmp_path.iterdir())
+    assert signal.getsignal(number) == signal.SIG_DFL
+
+
+@pytest.mark.parametrize("number", STOPPING)
+def test_a_second_signal_cuts_no_cleaning_short(number: signal.Signals) -> None:
+    cleaned = []
+    with pytest.raises(Stopped), stop_signals():
+        try:
+            os.kill(os.getpid(), number)
+            threading.Event().wait(20)
+        finally:
+            for each in STOPPING:
+                os.kill(os.getpid(), each)
+            cleaned.append(number)
+    assert cleaned == [number]
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    """As ``nohup`` asks for."""
+    number = STOPPING[-1]
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        with stop_signals():
+            os.kill(os.getpid(), number)
+            assert signal.getsignal(number) == signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
+
+
+def test_a_command_runs_outside_the_main_thread_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    codes: list[int] = []
+    thread = threading.Thread(target=lambda: codes.append(run(lambda: None, monkeypatch)))
+    thread.start()
+    thread.join(20)
+    assert codes == [0]
+
+
+def test_a_stream_ends_with_its_summary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.npy").touch()
+    with monkeypatch.context() as patched:
+        patched.setattr("mereo.cli.stream.load_for", lambda *_: None)
+        patched.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(lambda: os.kill(os.getpid(), STOPPING[0]), 1))
+        assert run(lambda: stream_reconstructions(str(tmp_path), "rope") and None, patched) == 0
+    assert capsys.readouterr().err.startswith("stopped\n0 frames answered")
+
+
+def test_a_closed_terminal_takes_no_words_and_raises_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    def closed(*_: object, **__: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    def hang_up() -> None:
+        os.kill(os.getpid(), STOPPING[-1])
+        threading.Event().wait(20)
+
+    monkeypatch.setattr("sys.stderr", SimpleNamespace(write=closed, flush=closed))
+    assert run(hang_up, monkeypatch) == 128 + STOPPING[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "number, how", [(signal.SIGINT, "interrupted"), *((each, f"stopped by {each.name}") for each in STOPPING)]
+)
+def test_a_real_signal_leaves_complete_shards_only(tmp_path: Path, number: signal.Signals, how: str) -> None:
+    """A real command, signalled as a terminal does it: to every process of the group."""
+    output = tmp_path / "data"
+    options = "--examples 20000 --workers 2 --image-size 32 --points 32 --per-segment 4 --output"
+    command = [sys.executable, "-m", "mereo", "generate", "rope", *options.split(), str(output)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
+    deadline = time.monotonic() + 300
+    while not list(output.glob("shard-*")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, number)
+    _, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (128 + number, f"mereo: {how}\n")
+    names = {path.name for path in output.iterdir()}
+    shards = names - {"manifest.json", "statistical_model.safetensors", "template.safetensors"}
+    assert len(names) - len(shards) == 3 and shards, names
+    assert all(len(load_file(output / name)["labels"]) == 64 for name in shards)
