@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mereo.io.config import InputConfig
+from mereo.io.scratch_folders import check_place
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
@@ -34,6 +35,8 @@ def stream_reconstructions(
 
     Raises ``ValueError`` where not one frame could be answered.
     """
+    if surfaces is not None:
+        check_place(surfaces, may_be_link=True)
     reading, isolation = reading or InputConfig(), isolation or IsolationConfig()
     model = load_for(weights, inference or InferenceConfig())
     frames = frames_of(source, reading, isolation, rate_hz)

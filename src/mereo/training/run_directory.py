@@ -12,7 +12,7 @@ import torch.distributed as dist
 from jaxtyping import Float
 from torch import Tensor
 
-from mereo.io.atomic_files import claim_directory
+from mereo.io.output_folders import claim_directory
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.model import Model

@@ -17,6 +17,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from mereo.io.scratch_folders import check_place
 from mereo.models.device import compiling_pays, keep_freed_memory, pick_device, pick_precision
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
@@ -41,6 +42,7 @@ def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_e
     written. Raises ``ValueError`` for other settings, and at the first step whose loss or gradient is not finite: what
     was saved before stays.
     """
+    check_place(run_dir, may_be_link=True)
     process = join_processes()
     device = pick_device(process.rank)
     data = Dataset.load(dataset_dir, device)
