@@ -23,6 +23,7 @@ NO_PLACES = {
     "a\0b": r"the output 'a\\x00b' has a zero byte",
     "link": "link is a link, which would be lost; an output is written in its own place: name that",
     "dangling": "is a link",
+    "pipe/deep/out": "pipe is no folder, so out cannot be made in it: choose another --output",
     "pipe": "is a device or pipe; an output is a file or folder: choose another --output",
 }
 

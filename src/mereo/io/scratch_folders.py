@@ -52,6 +52,9 @@ def check_place(path: Path, may_be_link: bool = False) -> None:
         raise ValueError(f"{path} is a link, which would be lost; an output is written in its own place: name that")
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ValueError(f"{path} is a device or pipe; an output is a file or folder: choose another --output")
+    above = next((place for place in path.parents if place.exists()), path.parent)
+    if above.exists() and not above.is_dir():
+        raise ValueError(f"{above} is no folder, so {path.name} cannot be made in it: choose another --output")
 
 
 @contextmanager
