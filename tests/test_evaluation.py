@@ -213,7 +213,7 @@ def test_weights_of_another_object() -> None:
 def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_model(untrained(load_scene("rope").rest.names), tmp_path / "w.safetensors")
     result = evaluate_weights(tmp_path / "w.safetensors", tmp_path / "out", examples=2, cells=12)
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+    assert sorted(p.name for p in (tmp_path / "out").glob("[!.]*")) == [
         "errors.png",
         "metrics.json",
         "report.html",

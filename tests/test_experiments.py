@@ -63,7 +63,7 @@ def test_results_are_three_files(tmp_path: Path) -> None:
     result = Result("noise", "Noise", "cpu", (Row("rope", "x", score(0.5, NAN)),), (Claim("c", {"rope": True}),))
     write_result(result, tmp_path / "noise")
     write_result(result, tmp_path / "noise")  # again, over the old ones
-    assert {path.name for path in (tmp_path / "noise").iterdir()} == {"table.md", "results.json", "figure.png"}
+    assert {path.name for path in (tmp_path / "noise").glob("[!.]*")} == {"table.md", "results.json", "figure.png"}
     found = json.loads((tmp_path / "noise" / "results.json").read_text())
     assert found["rows"][0]["score"]["miou"] is None
     assert found["claims"][0]["verdict"] == "We agree (rope)."

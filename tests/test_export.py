@@ -2,6 +2,7 @@
 
 import ast
 import json
+import os
 import re
 import subprocess
 import sys
@@ -71,7 +72,7 @@ def export(case: str, place: Path, kind: str) -> tuple[Model, Path]:
 @pytest.mark.parametrize("case", ["plain", pytest.param("everything", marks=pytest.mark.slow)])
 def test_a_reloaded_torch_program_answers_as_the_network(tmp_path: Path, case: str) -> None:
     model, folder = export(case, tmp_path, "torch")
-    assert sorted(path.name for path in folder.iterdir()) == ["encoder.pt2", "model.json", "query.pt2"]
+    assert sorted(path.name for path in folder.glob("[!.]*")) == ["encoder.pt2", "model.json", "query.pt2"]
     encoder, query = (torch.export.load(folder / f"{name}.pt2").module() for name in ("encoder", "query"))
     wanted = json.loads((folder / "model.json").read_text())["query_inputs"]
     for points, queries in ((model.network.config.points, 1), (model.network.config.points + 31, 50)):
@@ -149,6 +150,10 @@ def test_the_runner_says_in_one_line_what_is_wrong(
     assert main() == 2
     assert re.fullmatch(r"mereo_onnx: error: .+\n", capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
+    os.mkfifo(tmp_path / "out.npz")
+    assert main() == 2
+    assert "out.npz is no ordinary file, and would be replaced; choose another" in capsys.readouterr().err
+    assert (tmp_path / "out.npz").is_fifo()
 
 
 def test_the_runner_is_short_and_needs_numpy_and_onnxruntime_only() -> None:

@@ -4,12 +4,14 @@ import errno
 import json
 import os
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mereo.io.atomic_files import atomic_file, claim_directory, new_directory, write_json
+from mereo.io.atomic_files import atomic_file, write_json
+from mereo.io.output_folders import claim_directory, new_directory
 
 INTERRUPTIONS = [ValueError("no"), KeyboardInterrupt(), SystemExit(1)]
 
@@ -21,8 +23,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_file_appears_at_the_end_with_ordinary_permissions(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "er" / "a.txt"
     with atomic_file(path) as partial:
-        assert partial.suffix == ".txt"
-        assert partial.parent == path.parent
+        assert partial.name == "a.txt"
+        assert partial.parent.parent == path.parent, "so that a rename will do"
         partial.write_text("whole")
         assert not path.exists()
     assert contents(tmp_path / "deep" / "er") == {"a.txt": b"whole"}
@@ -34,8 +36,8 @@ def test_a_file_appears_at_the_end_with_ordinary_permissions(tmp_path: Path) -> 
 @pytest.mark.parametrize("interruption", INTERRUPTIONS, ids=lambda e: type(e).__name__)
 def test_an_interruption_leaves_everything_as_it_was(tmp_path: Path, interruption: BaseException) -> None:
     (tmp_path / "old.txt").write_text("old")
-    (tmp_path / "old").mkdir()
-    (tmp_path / "old" / "x").write_text("old")
+    with new_directory(tmp_path / "old") as first:
+        (first / "x").write_text("old")
     before = contents(tmp_path)
     for path in (tmp_path / "old.txt", tmp_path / "new" / "deep" / "a.txt"):
         with pytest.raises(type(interruption)), atomic_file(path) as partial:
@@ -87,10 +89,21 @@ def test_existing_outputs_are_kept_unless_forced(tmp_path: Path) -> None:
         pass
     with pytest.raises(FileExistsError, match="is a directory; a file"), atomic_file(tmp_path / "d"):
         pass
-    for name in ("d", "empty"):
-        with new_directory(tmp_path / name, force=name == "d") as partial:
-            (partial / "y").write_text("new")
-    assert contents(tmp_path) == {"a": b"old", "d": b"", "d/y": b"new", "empty": b"", "empty/y": b"new"}
+    with new_directory(tmp_path / "empty") as partial:
+        (partial / "y").write_text("new")
+    after = contents(tmp_path)
+    assert json.loads(after.pop("empty/.mereo.json"))["files"].keys() == {"y"}
+    assert after == {"a": b"old", "d": b"", "d/x": b"old", "empty": b"", "empty/y": b"new"}
+
+
+def test_a_file_that_came_meanwhile_is_kept_unless_forced(tmp_path: Path) -> None:
+    for force, kept in ((False, "theirs"), (True, "ours")):
+        path = tmp_path / f"{force}.txt"
+        with suppress(FileExistsError), atomic_file(path, force=force) as partial:
+            partial.write_text("ours")
+            path.write_text("theirs")
+        assert path.read_text() == kept
+    assert len(contents(tmp_path)) == 2
 
 
 def test_json_knows_arrays_and_has_no_nan(tmp_path: Path) -> None:
@@ -110,7 +123,7 @@ def test_a_directory_is_claimed_once(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_process_left_is_in_nobodys_way(tmp_path: Path) -> None:
-    (tmp_path / ".settings.1a2b.partial.json").write_text("{")
+    (tmp_path / ".settings.json.1a2b3c4d.partial").mkdir()
     assert claim_directory(tmp_path, "settings.json", {"a": 1}, "a run") is None
     assert json.loads((tmp_path / "settings.json").read_text()) == {"a": 1}
 

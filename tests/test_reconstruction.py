@@ -118,7 +118,7 @@ def test_the_unit_of_the_cloud_does_not_matter() -> None:
 def test_files(found: tuple[CloudAxes, np.ndarray, Reconstruction], tmp_path: Path) -> None:
     frame, cloud, result = found
     write_reconstruction(result, PointCloud(cloud), tmp_path / "out", frame=frame, title="two balls")
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+    assert sorted(p.name for p in (tmp_path / "out").glob("[!.]*")) == [
         "labels.npz",
         "preview.png",
         "report.html",

@@ -50,10 +50,10 @@ def results(found: Reconstruction, files: FilesConfig, unit_m: float = 1.0) -> R
 def test_every_format_is_written_where_the_table_says(found: Reconstruction, tmp_path: Path) -> None:
     pytest.importorskip("nibabel", reason="nibabel is not installed: pip install 'mereo[medical]'")
     write_reconstruction(found, PointCloud(view()), tmp_path / "all", files=FilesConfig(("all",)), unit_m=0.01)
-    names = {path.name for path in (tmp_path / "all").iterdir()}
+    names = {path.name for path in (tmp_path / "all").glob("[!.]*")}
     second = {"segments.mtl", "points.npz"}
     assert names == {writer.file for writer in WRITERS.values()} | second | {"preview.png", "report.html"}
-    assert sorted(path.name for path in (tmp_path / "all/stl").iterdir()) == ["1-big.stl", "2-small.stl"]
+    assert sorted(path.name for path in (tmp_path / "all/stl").glob("[!.]*")) == ["1-big.stl", "2-small.stl"]
     assert json.loads((tmp_path / "all/summary.json").read_text())["unit_m"] == 0.01
 
 

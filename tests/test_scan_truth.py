@@ -53,7 +53,7 @@ def test_the_command_places_the_segments(bar: tuple[Path, Scene, np.ndarray]) ->
         shift_mm, turn_deg = pose_error(np.array(entry["T_scan_segment"]), pose, middle)
         assert shift_mm < 0.05 and turn_deg < 0.15
         assert entry["placed_by"] == "scan" and entry["residual"]["median"] < 0.04
-    assert {path.name for path in (folder / "truth").iterdir()} == {"truth.json", "overlay.png", "segments.glb"}
+    assert {path.name for path in (folder / "truth").glob("[!.]*")} == {"truth.json", "overlay.png", "segments.glb"}
 
 
 def test_the_truth_is_scan_and_segments_in_one_frame(bar: tuple[Path, Scene, np.ndarray]) -> None:

@@ -145,7 +145,7 @@ def test_half_an_obj_never_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_stl_files_are_closed_solids_at_their_place(tmp_path: Path) -> None:
     write_segments_stl(tmp_path / "stl", segments())
-    assert sorted(path.name for path in (tmp_path / "stl").iterdir()) == ["1-zebra-head.stl", "3-Öhrchen.stl"]
+    assert sorted(path.name for path in (tmp_path / "stl").glob("[!.]*")) == ["1-zebra-head.stl", "3-Öhrchen.stl"]
     box = trimesh.load_mesh(tmp_path / "stl/3-Öhrchen.stl")
     assert box.is_watertight and box.volume == pytest.approx(SIDES.prod(), rel=1e-5)
     np.testing.assert_allclose(box.bounds, BOX, atol=1e-7)

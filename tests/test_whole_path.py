@@ -36,7 +36,7 @@ def test_a_tiny_network_finds_the_rope(tmp_path: Path) -> None:
     view = sample_view(load_scene("rope"), GenerateConfig(), example_rng(TEST_SEED_START, 0))
     np.save(tmp_path / "cloud.npy", view.depth.to_points().points)
     mereo("reconstruct", tmp_path / "cloud.npy", "--weights", weights, "--resolution", 64, "--output", result)
-    assert {path.name for path in result.iterdir()} == {
+    assert {path.name for path in result.glob("[!.]*")} == {
         "segments.glb", "labels.npz", "summary.json", "state.json", "preview.png", "report.html"
     }  # fmt: skip
     nodes = trimesh.load(result / "segments.glb").graph.nodes_geometry

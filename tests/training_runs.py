@@ -13,16 +13,13 @@ from mereo.training import trainer
 from mereo.training.config import TrainConfig
 
 
-class _Killed(Exception):
-    pass
-
-
-def _kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    """Let training be interrupted after ``steps`` steps."""
     original = trainer.Trainer.train_step
 
     def step(self: trainer.Trainer, batch: object) -> None:
         if self.step == steps:
-            raise _Killed
+            raise KeyboardInterrupt
         original(self, batch)  # type: ignore[arg-type]
 
     monkeypatch.setattr(trainer.Trainer, "train_step", step)
@@ -31,8 +28,8 @@ def _kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
 def assert_resumes_exactly(dataset: Path, folder: Path, config: TrainConfig, steps: int) -> None:
     """A run that is killed after ``steps`` and started again ends with the same bits as an uninterrupted one."""
     trainer.train(dataset, folder / "whole", config, checkpoint_every_s=0.0)
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(_Killed):
-        _kill_after(patch, steps)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        kill_after(patch, steps)
         trainer.train(dataset, folder / "parts", config, checkpoint_every_s=0.0)
     assert not list((folder / "parts").glob(".*"))  # a file being written has a hidden name
     trainer.train(dataset, folder / "parts", config, checkpoint_every_s=0.0)

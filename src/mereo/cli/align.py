@@ -14,7 +14,7 @@ from mereo.evaluation.registration.truth_file import TRUTH, ScanFile, write_trut
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.io.atomic_files import new_directory
+from mereo.io.output_folders import new_directory
 from mereo.io.readers import read_point_cloud
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.weights import load_model
@@ -47,7 +47,7 @@ def align_file(
         scene_unit_mm: millimetres per scene unit, where the scene does not say.
         as_one: the object is rigid, see ``placement.place``.
         hold: names of segments that stay, see ``placement.place``.
-        force: replace an existing folder.
+        force: replace an existing folder that mereo wrote.
     """
     if (start is None) == (weights is None):
         raise ValueError(
@@ -55,7 +55,8 @@ def align_file(
             "NAME (docs/own-object.md says how to make a start file)"
         )
     load_icp()  # its absence is better said before the work
-    with new_directory(output, force) as directory:
+    read = [path for path in (scan.path, scene, start, weights) if path is not None]
+    with new_directory(output, force, read) as directory:
         loaded = load_scene(scene)
         cloud = read_point_cloud(scan.path, scan.drop_invalid)
         scale = known_scale(loaded, scan.unit, scene_unit_mm)

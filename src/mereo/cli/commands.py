@@ -225,7 +225,7 @@ class Reconstruct:
         carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
             glTF), points (PLY, PCD, XYZ, NPY) or CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses).
         carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
-        force: replace an existing output folder.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
     input: Positional[Path]
@@ -271,7 +271,7 @@ class Export:
         weights: a shipped name or a file.
         output: folder to create; for ONNX with mereo_onnx.py, which runs the graphs with numpy and onnxruntime alone.
         format: onnx, or torch for .pt2 files.
-        force: replace an existing output folder.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
     weights: Positional[str]

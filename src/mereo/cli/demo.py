@@ -27,8 +27,9 @@ from mereo.fitting.registration_state import write_state
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.solids import label_grid
-from mereo.io.atomic_files import new_directory
 from mereo.io.config import DEFAULT_FILES
+from mereo.io.output_folders import check_new_directory, new_directory
+from mereo.io.scratch_folders import check_place
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import Reconstruction, encode_frame, extract, segment_names
@@ -85,6 +86,7 @@ class Column:
 
 def main(output: str | Path = Path("out/demo")) -> None:
     """Reconstruct every input that can be had, print tables, and write a folder each below ``output``."""
+    check_place(Path(output), may_be_link=True)
     console, started = Console(), time.perf_counter()
     for make in _inputs():
         try:
@@ -92,6 +94,7 @@ def main(output: str | Path = Path("out/demo")) -> None:
         except AssetUnavailable as error:
             console.print(f"The real scan {REAL_SCAN} is left out: {error}\n", highlight=False, soft_wrap=True)
             continue
+        check_new_directory(Path(output) / case.name, force=True)
         _show(case, load_model(case.weights), Path(output) / case.name, console)
     console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
     console.print(OWN_OBJECT, highlight=False, soft_wrap=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from mereo.io.atomic_files import check_file_place
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import LEAST_STATES, scene_model
 from mereo.scenes.registry import load_scene
@@ -28,6 +29,7 @@ def show_modes(scene: str, output: Path | None, states: int) -> None:
 
     Raises ``ValueError`` for too few states, for weights without a model and for another suffix than .png.
     """
+    check_file_place(output)
     if output is not None and output.suffix.lower() != ".png":
         raise ValueError(f"{output} has the suffix {output.suffix!r}; the picture is a PNG file: rename it")
     name, model = _model_of(scene, states)

@@ -14,9 +14,9 @@ from mereo.fitting.config import FitChoice
 from mereo.fitting.register import Registrar, describe, registrar_for
 from mereo.fitting.registration_state import write_state
 from mereo.geometry.transforms import inverse_rigid
-from mereo.io.atomic_files import new_directory
 from mereo.io.attachments import read_attachments
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
+from mereo.io.output_folders import new_directory
 from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
@@ -59,7 +59,7 @@ def reconstruct_file(
         scene: whose draws are fitted, where it is not the built-in one that the weights were trained on.
         carry: files of what is defined in the rest model, to be brought to where the object is.
         carry_frame: their frame and unit: of the object's own files, or of its scene.
-        force: replace an existing folder.
+        force: replace an existing folder that mereo wrote.
 
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``read_frame``, ``find_object`` and
     ``reconstruct`` do, and ``ValueError`` for ``carry`` without a registration.
@@ -70,7 +70,8 @@ def reconstruct_file(
         raise ValueError(f"--carry-frame is {carry_frame!r} and nothing is carried: name a file with --carry")
     if attachments and choice == "off":
         raise ValueError("--fit is off, but --carry needs a registration, along which things move: use --fit auto")
-    with new_directory(output, force) as directory:
+    read = [path for path in (input, weights, scene, reading.intrinsics, reading.mask, *carry) if path is not None]
+    with new_directory(output, force, read) as directory:
         frame = read_frame(input, reading)
         seen = find_object(frame, isolation)
         print(seen)

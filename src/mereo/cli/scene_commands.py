@@ -84,9 +84,11 @@ class ScenePreview:
 
     def run(self) -> None:
         """Write the picture of random states."""
+        from mereo.io.atomic_files import check_file_place
         from mereo.scenes.registry import load_scene
         from mereo.visualization.previews import preview_all, preview_scene
 
+        check_file_place(self.output)
         if self.all == bool(self.scene):
             given = f"both {self.scene!r} and --all are" if self.all else "neither a scene nor --all is"
             raise ValueError(f"{given} given; one of them is needed: name a scene, or give --all")
@@ -135,10 +137,12 @@ class SceneExport:
         """Write the mesh file of the segments at rest."""
         import numpy as np
 
+        from mereo.io.atomic_files import check_file_place
         from mereo.io.writers.glb import write_segments_glb
         from mereo.io.writers.ply import write_segments_ply
         from mereo.scenes.registry import load_scene
 
+        check_file_place(self.output)
         suffix = self.output.suffix.lower()
         if suffix not in (".ply", ".glb"):
             raise ValueError(f"{self.output} has the suffix {suffix!r}; it must be .ply or .glb: rename it")

@@ -12,6 +12,7 @@ from typing import Any
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.atomic_files import to_json
 from mereo.io.config import InputConfig
+from mereo.io.scratch_folders import check_place
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
@@ -38,6 +39,8 @@ def stream_reconstructions(
 
     Raises ``ValueError`` where not one frame could be answered, and what broke the sequence off, where something did.
     """
+    if surfaces is not None:
+        check_place(surfaces, may_be_link=True)
     reading, isolation = reading or InputConfig(), isolation or IsolationConfig()
     model = load_for(weights, inference or InferenceConfig())
     frames: Iterable[StreamFrame | None] = (

@@ -34,7 +34,7 @@ class Align:
         as_one: the object is rigid: place it as a whole.
         hold: segments to leave at their start or at their neighbour, whatever the scan shows.
         drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
-        force: replace an existing output folder.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
     scan: Positional[Path]
@@ -236,7 +236,7 @@ class Release:
         name: of the files: lower case letters, digits, - and _.
         output: folder to create.
         tests: folders that `mereo evaluate` has written for these weights; their scores go into the card.
-        force: replace an existing output folder.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
     weights: Positional[str]

@@ -112,6 +112,16 @@ def find_weights(name: str | Path) -> Path:
     return path
 
 
+def trained_steps(path: Path) -> int | None:
+    """Steps of training that a file of weights says it has had, from its header alone; None where it is none."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            steps = json.loads((file.metadata() or {})["mereo"])["provenance"]["steps"]
+    except (SafetensorError, OSError, KeyError, ValueError):
+        return None
+    return steps if isinstance(steps, int) else None
+
+
 def load_for(name: str | Path, inference: InferenceConfig) -> Model:
     """Trained model (``load_model``) on the device and in the precision that are asked for."""
     return replace(load_model(name, find_device(inference.device)), precision=inference.precision)

@@ -28,7 +28,9 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from mereo.io.atomic_files import atomic_file, claim_directory
+from mereo.io.atomic_files import atomic_file
+from mereo.io.output_folders import claim_directory
+from mereo.io.scratch_folders import check_place
 from mereo.scenes.random_states import scene_model, states_for
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.rest_pose import rest_distances
@@ -114,6 +116,7 @@ def generate(
         FileExistsError: ``output`` holds something and ``resume`` is not set.
         OSError: the disk is full; complete shards are kept. ``ChildProcessError`` where a worker was killed.
     """
+    check_place(output, may_be_link=True)
     _check_request(examples, seed, workers, shard, test)
     check_settings(settings.sampling)
     check_sensor(settings.sensor)
@@ -200,18 +203,12 @@ def example_bytes(settings: GenerateConfig, segments: int) -> int:
 
 
 def _claim(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> None:
-    """Create the directory with its manifest, or check that it is this very dataset; other machines' shards may come.
-
-    What a killed run was writing is removed, of this part's shards only.
-    """
+    """Create the directory with its manifest, or check that it is this very dataset; others may write shards there."""
     before = claim_directory(output, MANIFEST, manifest, "a dataset")
     if before is not None:
         if not resume and (alone or any(item.path.exists() for item in shards)):
             raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
         _check_same(output, before, manifest)
-    for item in shards:
-        for leftover in output.glob(f".{item.path.stem}.*.partial*"):
-            leftover.unlink(missing_ok=True)
 
 
 def _check_same(output: Path, before: dict[str, Any], manifest: dict[str, Any]) -> None:

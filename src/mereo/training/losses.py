@@ -7,6 +7,8 @@ from torch import Tensor
 
 from mereo.models.config import Supervision
 from mereo.models.decoder import Prediction
+from mereo.training.config import TrainConfig
+from mereo.training.dataset import Batch
 
 
 def occupancy_loss(
@@ -46,3 +48,22 @@ def rest_loss(predicted: Float[Tensor, "b q 3"], rest: Float[Tensor, "b q 3"]) -
     offset = torch.where(known[..., None], predicted - rest, torch.zeros_like(rest))
     distance = (offset.square().sum(dim=-1) + 1e-8).sqrt()
     return (distance * known).sum() / known.sum().clamp(min=1)
+
+
+def supervised_loss(
+    prediction: Prediction, coarse: Float[Tensor, "b p 3"] | None, batch: Batch, config: TrainConfig
+) -> tuple[Float[Tensor, ""], dict[str, Float[Tensor, ""]]]:
+    """Loss of a batch: the paper's, that of rest coordinates and that of the alignment; also each term by name.
+
+    ``coarse`` are the rest coordinates by which a network aligns its first points, None for one that does not.
+    """
+    loss, terms = occupancy_loss(
+        prediction, batch.labels, batch.distances, batch.directions, config.supervision, config.l1_weight
+    )
+    if coarse is not None:
+        terms["align"] = rest_loss(coarse, batch.rest[:, : coarse.shape[1]])
+        loss = loss + terms["align"]
+    if prediction.rest is not None:
+        terms["rest"] = rest_loss(prediction.rest, batch.rest)
+        loss = loss + REST_WEIGHT * terms["rest"]
+    return loss, terms

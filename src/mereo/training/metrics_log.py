@@ -9,6 +9,7 @@ from typing import Any
 from mereo.io.atomic_files import atomic_file
 
 FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "code", "val_iou", "val_miou")
+TABLE, CURVES = "metrics.csv", "curves.png"
 Row = dict[str, float]
 
 
@@ -30,6 +31,8 @@ class MetricsLog:
     def add_validation(self, step: int, iou: float, miou: float) -> None:
         """Add scores of the state after ``step`` to the row of that step; an undefined mIoU (NaN) is left out."""
         scores = {name: value for name, value in (("val_iou", iou), ("val_miou", miou)) if not math.isnan(value)}
+        if not self.rows or self.rows[-1]["step"] != step:  # the file with the row of that step was lost
+            self.rows.append({"step": step})
         self.rows[-1] |= scores
         self._to_board({"step": step, **scores})
 
@@ -44,7 +47,8 @@ class MetricsLog:
 
     def summary(self) -> str:
         """Latest numbers in one line."""
-        shown = {k: v for k, v in self.rows[-1].items() if k not in ("step", "rate")}
+        latest = self.rows[-1] if self.rows else {}
+        shown = {k: v for k, v in latest.items() if k not in ("step", "rate")}
         return "  ".join(f"{name} {value:.4f}" for name, value in shown.items())
 
     def write(self) -> None:
@@ -53,19 +57,26 @@ class MetricsLog:
         writer = csv.DictWriter(text, FIELDS, restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows({k: _exact(k, v) for k, v in row.items()} for row in self.rows)
-        with atomic_file(self.run_dir / "metrics.csv") as temporary:
+        with atomic_file(self.run_dir / TABLE) as temporary:
             temporary.write_text(text.getvalue())
-        with atomic_file(self.run_dir / "curves.png") as temporary:
+        with atomic_file(self.run_dir / CURVES) as temporary:
             draw_curves(self.rows, temporary)
 
+    def is_written(self, step: int) -> bool:
+        """Whether the rows that were read back end with ``step``, and their curves are there."""
+        return bool(self.rows) and self.rows[-1]["step"] == step and (self.run_dir / CURVES).is_file()
+
     def read_until(self, step: int) -> None:
-        """Take up the rows of the steps that the checkpoint includes."""
-        path = self.run_dir / "metrics.csv"
+        """Take up the rows of the steps that the checkpoint includes; ``ValueError`` where they cannot be read."""
+        path = self.run_dir / TABLE
         if not path.is_file():
             return
-        with path.open(newline="") as file:
-            rows = [{k: float(v) for k, v in row.items() if v != ""} for row in csv.DictReader(file)]
-        self.rows = [row for row in rows if row["step"] <= step]
+        try:
+            with path.open(newline="") as file:
+                rows = [{k: float(v) for k, v in row.items() if v != ""} for row in csv.DictReader(file)]
+            self.rows = [row for row in rows if row["step"] <= step]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is not the table of a run ({error}); delete it to go on without it") from None
 
 
 def _exact(name: str, value: float) -> str:
@@ -97,7 +108,8 @@ def draw_curves(rows: list[Row], path: Path) -> None:
             smooth = [sorted(values[i : i + window])[window // 2] for i in range(len(values) - window + 1)]
             left.plot(steps[window - 1 :], smooth, label=name)
     left.set(yscale="log", xlabel="step", title="training loss (running median)")
-    left.legend()
+    if left.lines:
+        left.legend()
     for name, label in (("val_iou", "IoU"), ("val_miou", "mIoU")):
         points = [(row["step"], row[name]) for row in rows if name in row]
         if points:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from mereo.evaluation.metrics import format_score
-from mereo.io.atomic_files import new_directory
+from mereo.io.output_folders import new_directory
 from mereo.models.config import NetworkConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model, weights_bytes
@@ -41,7 +41,7 @@ def release(
         name: lower case letters, digits, - and _.
         output: folder to create.
         tests: folders that `mereo evaluate` has written, of these weights.
-        force: replace an existing folder.
+        force: replace an existing folder that mereo wrote.
 
     Raises ``ValueError`` for odd names, and for tests of other segments; ``FileNotFoundError`` for folders without
     metrics.json.
@@ -50,9 +50,9 @@ def release(
         raise ValueError(
             f"the name is {name!r}; weights are named by lower case letters, digits, - and _: choose others"
         )
-    model = _with_statistical_model(_without_places(load_model(weights)))
-    found = [_metrics(folder, model) for folder in tests]
-    with new_directory(output, force) as directory:
+    with new_directory(output, force, [weights, *tests]) as directory:
+        model = _with_statistical_model(_without_places(load_model(weights)))
+        found = [_metrics(folder, model) for folder in tests]
         path = directory / f"{name}.safetensors"
         save_model(model, path, torch.float16)
         (directory / f"{name}.md").write_text(card(name, model, found, path.read_bytes()), encoding="utf-8")

@@ -1,5 +1,6 @@
-"""Processes, settings and directory of a training run."""
+"""Processes, settings and directory of a training run, the network it starts from and the model it ends with."""
 
+import copy
 import json
 import os
 from dataclasses import dataclass, replace
@@ -8,11 +9,13 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+from jaxtyping import Float
 from torch import Tensor
 
-from mereo.io.atomic_files import claim_directory
+from mereo.io.output_folders import claim_directory
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders.autodecoder import Autodecoder
+from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model
 from mereo.synthesis.config import TEMPLATE
@@ -86,6 +89,40 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
             )
         lookup.distance.copy_(data.template)
     return network
+
+
+def trained_model(
+    average: Network, data: Dataset, config: TrainConfig, step: int, offsets: Float[Tensor, " c"] | None
+) -> Model:
+    """Model of the averaged network after ``step`` steps, class offsets in its last bias, with its weights' header."""
+    network = average
+    if offsets is not None:
+        network = copy.deepcopy(average)  # the running average must stay what it is
+        with torch.no_grad():
+            network.decoder.head.bias[: len(offsets)] += offsets.to(network.decoder.head.bias.device)
+    manifest = data.manifest
+    provenance: dict[str, object] = {
+        "scene": manifest["scene"],
+        "source": manifest.get("source"),
+        "data": manifest["settings"],
+        "training_seed": manifest["seed"],
+        "training_examples": manifest["examples"],
+        "steps": step,
+        "mereo": manifest["version"],
+        "visible_m": data.visible_m,
+        "class_offsets": None if offsets is None else offsets.tolist(),
+        "recipe": config.to_dict(),
+    }
+    return Model(
+        network=network,
+        names=tuple(s["name"] for s in manifest["segments"]),
+        colors=tuple(tuple(s["color"]) for s in manifest["segments"]),
+        loss=config.loss,
+        provenance=provenance,
+        domain=data.domain(),
+        nested=tuple((inner, outer) for inner, outer in manifest.get("nested", ())),
+        statistical_model=data.statistical_model,
+    )
 
 
 COUNTS = ("points", "neighbors", "ratio1", "ratio2", "local_neighbors", "sight_neighbors", "align_points")

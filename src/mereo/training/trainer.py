@@ -1,7 +1,8 @@
 """Loop of training, plain over batches; running the same command again continues where it stopped.
 
-Everything random in step t is drawn from (seed, t), so a resumed run repeats an uninterrupted one exactly. Under
-``torchrun`` each process takes its share of every batch; process 0 writes.
+Everything random in step t is drawn from (seed, t), and which steps are validated depends on their number alone, so a
+resumed run repeats an uninterrupted one exactly. Under ``torchrun`` each process takes its share of every batch;
+process 0 writes.
 """
 
 import copy
@@ -16,26 +17,32 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from mereo.io.scratch_folders import check_place
 from mereo.models.device import compiling_pays, keep_freed_memory, pick_device, pick_precision
-from mereo.models.encoders.autodecoder import CODES, Autodecoder
-from mereo.models.model import Model
+from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
-from mereo.models.weights import save_model
+from mereo.models.weights import save_model, trained_steps
 from mereo.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mereo.training.config import TrainConfig
 from mereo.training.dataset import Batch, Dataset
-from mereo.training.losses import REST_WEIGHT, occupancy_loss, rest_loss
+from mereo.training.losses import supervised_loss
 from mereo.training.metrics_log import MetricsLog
-from mereo.training.run_directory import Process, claim_run, fit_config, join_processes, start_network
+from mereo.training.optimization import clip_gradients, parameter_groups, rate_share, update_average
+from mereo.training.run_directory import Process, claim_run, fit_config, join_processes, start_network, trained_model
 from mereo.training.validation import choose_offsets, held_out, validate
+
+WEIGHTS = "weights.safetensors"
 
 
 def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_every_s: float = 120.0) -> Path:
     """Train on a generated dataset; returns the path of the weights (``run_dir/weights.safetensors``).
 
     ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors. If it
-    holds a checkpoint of the same settings, training continues from it; other settings raise ``ValueError``.
+    holds a checkpoint of the same settings, training continues from it, and what is missing of a finished run is
+    written. Raises ``ValueError`` for other settings, and at the first step whose loss or gradient is not finite: what
+    was saved before stays.
     """
+    check_place(run_dir, may_be_link=True)
     process = join_processes()
     device = pick_device(process.rank)
     data = Dataset.load(dataset_dir, device)
@@ -52,17 +59,21 @@ def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_e
     last_save = time.monotonic()
     for batch in trainer.batches():
         trainer.train_step(batch)
-        finished = trainer.step == trainer.total
-        if finished or trainer.agree(time.monotonic() - last_save > checkpoint_every_s):
-            trainer.validate_and_save(finished)
+        trainer.validate()
+        if trainer.step < trainer.total and trainer.agree(time.monotonic() - last_save > checkpoint_every_s):
+            trainer.save()
             last_save = time.monotonic()
+    trainer.finish()
     if process.world > 1:
         dist.destroy_process_group()
-    return run_dir / "weights.safetensors"
+    return run_dir / WEIGHTS
 
 
 REPORT_EVERY = 20
 """Steps between two lines of progress."""
+
+VALIDATIONS = 20
+"""Held-out scores of a run, evenly over its steps: by the clock, a resumed run would have others."""
 
 
 class Trainer:
@@ -80,11 +91,11 @@ class Trainer:
         self.config, self.data, self.run_dir, self.process, self.device = config, data, run_dir, process, device
         self.network = network.to(device)
         self.average = copy.deepcopy(self.network)
-        self.optimizer = torch.optim.AdamW(_parameter_groups(self.network, config), lr=config.learning_rate, fused=True)
+        self.optimizer = torch.optim.AdamW(parameter_groups(self.network, config), lr=config.learning_rate, fused=True)
         self.examples = len(data) - config.holdout
         self.orders: dict[int, Tensor] = {}
         self.total = max(1, math.ceil(config.epochs * self.examples / config.batch))
-        self.step = 0
+        self.step = self.saved_step = 0
         self.log = MetricsLog(run_dir) if process.is_main else None
         self.unread: list[tuple[int, float, dict[str, Tensor]]] = []
         self.autocast = pick_precision(config.precision, device)
@@ -133,20 +144,22 @@ class Trainer:
     def train_step(self, batch: Batch) -> None:
         """Take one optimizer step."""
         self.network.train()
-        part = self._schedule()
+        part = rate_share(self.config, self.step, self.total)
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * part
         torch.manual_seed(_seed(self.config.seed, self.step, self.process.rank))  # for dropout
         loss, terms = self._loss(batch)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if self.config.clip_norm:
-            nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip_norm)
+        norm = clip_gradients(self.network, self.config.clip_norm)
         self.optimizer.step()
         self.step += 1
-        self._update_average()
+        update_average(self.average, self.network, self.step, self.config.ema_decay)
         if self.log is not None:
-            self.unread.append((self.step, self.config.learning_rate * part, {"loss": loss.detach(), **terms}))
+            values = {"norm": norm, "loss": loss.detach(), **terms}
+            self.unread.append((self.step, self.config.learning_rate * part, values))
+            if self.device.type == "cpu":  # where reading waits for nothing
+                self._read_losses()
             if self.step % REPORT_EVERY == 0 or self.step == self.total:
                 self._report_progress()
 
@@ -154,53 +167,42 @@ class Trainer:
         """Loss of a batch, and its terms by name for the record."""
         with torch.autocast(self.device.type, self.autocast) if self.autocast else nullcontext():
             prediction, coarse = self.module(batch.cloud, batch.viewpoint, batch.positions, batch.index)
-        loss, terms = occupancy_loss(
-            prediction,
-            batch.labels,
-            batch.distances,
-            batch.directions,
-            self.config.supervision,
-            self.config.l1_weight,
-        )
-        if coarse is not None:
-            terms["align"] = rest_loss(coarse, batch.rest[:, : coarse.shape[1]])
-            loss = loss + terms["align"]
-        if prediction.rest is not None:
-            terms["rest"] = rest_loss(prediction.rest, batch.rest)
-            loss = loss + REST_WEIGHT * terms["rest"]
+        loss, terms = supervised_loss(prediction, coarse, batch, self.config)
         if isinstance(self.network.encoder, Autodecoder):
             terms["code"] = self.network.encoder.length_penalty(self.network.encoder.code(batch.index)).mean()
             loss = loss + self.config.l1_weight * terms["code"]
         return loss, {name: value.detach() for name, value in terms.items()}
 
-    def _schedule(self) -> float:
-        """The share of its peak that each learning rate has in this step."""
-        config = self.config
-        progress = self.step / self.total
-        if progress < config.warmup:
-            return (self.step + 1) / math.ceil(config.warmup * self.total)
-        if config.schedule == "constant":
-            return 1.0
-        return 0.5 * (1 + math.cos(math.pi * (progress - config.warmup) / (1 - config.warmup)))
-
-    @torch.no_grad()
-    def _update_average(self) -> None:
-        # a young average follows closely, so that the random initialization is forgotten
-        decay = min(self.config.ema_decay, (1 + self.step) / (10 + self.step)) if self.config.ema_decay else 0.0
-        for mean, value in zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True):
-            if mean.is_floating_point():
-                mean.lerp_(value, 1 - decay)
-            else:
-                mean.copy_(value)
-
     def _read_losses(self) -> None:
-        """Log the steps since the last call, all with one copy from the device, which would wait at every step."""
+        """Log the steps since the last call, all with one copy from the device, which would wait at every step.
+
+        Whoever saves calls it first, so nothing is saved of a step whose loss or gradient is not finite, or after it.
+        """
         if self.log is None or not self.unread:
             return
         values = torch.stack([torch.stack(list(terms.values())) for _, _, terms in self.unread]).tolist()
         for (step, rate, terms), row in zip(self.unread, values, strict=True):
-            self.log.add_step(step, rate, dict(zip(terms, row, strict=True)))
+            losses = dict(zip(terms, row, strict=True))
+            norm = losses.pop("norm")
+            if not (math.isfinite(norm) and math.isfinite(losses["loss"])):
+                raise ValueError(self._divergence(step, losses["loss"], norm))
+            self.log.add_step(step, rate, losses)
         self.unread.clear()
+
+    def _divergence(self, step: int, loss: float, norm: float) -> str:
+        """Sentence about a step that is not finite: where it is, what is left, and what may help."""
+        what = f"the gradient's norm is {norm}" if math.isfinite(loss) else f"the loss is {loss}"
+        batch = self._batch_index(step - 1).tolist()
+        examples = ", ".join(map(str, batch[:8])) + (", ..." if len(batch) > 8 else "")
+        kept = (
+            f"the checkpoint and weights of step {self.saved_step} are kept" if self.saved_step else "nothing is saved"
+        )
+        exact = " or --precision float32" if self.autocast else ""
+        return (
+            f"{what} in step {step} of {self.total}, on the examples {examples} of the data; training has diverged and "
+            f"stops, {kept}: choose another --output and a --learning-rate below {self.config.learning_rate:g}{exact}, "
+            "or check these examples"
+        )
 
     def _report_progress(self) -> None:
         self._read_losses()
@@ -213,79 +215,67 @@ class Trainer:
             f"{left_s / 60:.1f} min left"
         )
 
-    def validate_and_save(self, finished: bool) -> None:
-        """Write metrics, curves, the checkpoint and the weights; every file atomically."""
+    def validate(self) -> None:
+        """Score the averaged network on held-out examples, in the steps that have such scores."""
+        due = self.step % math.ceil(self.total / VALIDATIONS) == 0 or self.step == self.total
+        if not (due and self.config.holdout):
+            return
         if self.log is not None:
             self._read_losses()
-            if isinstance(self.average.encoder, Autodecoder):
-                self.average.encoder.update_mean()
-            if self.config.holdout:
-                scores = validate(self.average, self.data, self.config)
-                self.log.add_validation(self.step, scores.iou, scores.miou)
+            self._update_codes()
+            scores = validate(self.average, self.data, self.config)
+            self.log.add_validation(self.step, scores.iou, scores.miou)
+            self.say(f"held-out examples at step {self.step}: {self.log.summary()}")
+        self._wait()
+
+    def save(self, finished: bool = False) -> None:
+        """Write metrics, curves, the weights and the checkpoint; every file atomically.
+
+        The checkpoint is the last, so whatever stops this leaves one from which the others are written again.
+        """
+        if self.log is not None:
+            self._read_losses()
+            self._update_codes()
             self.log.write()
-            save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
             offsets = choose_offsets(self.average, self.data, self.config) if finished else None
-            save_model(self.model(offsets), self.run_dir / "weights.safetensors")
+            save_model(trained_model(self.average, self.data, self.config, self.step, offsets), self.run_dir / WEIGHTS)
+            save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
             self.say(f"saved at step {self.step}: {self.log.summary()}")
+        self.saved_step = self.step
+        self._wait()
+
+    def finish(self) -> None:
+        """Write all that a run leaves at its end, unless an earlier process has, which may have been killed before."""
+        there = self.log is not None and self.log.is_written(self.step)
+        there = there and self.saved_step == self.step == trained_steps(self.run_dir / WEIGHTS)
+        if not self.agree(there):
+            if self.first_step == self.total:  # no step was taken in this process, so none was validated
+                self.validate()
+            self.save(finished=True)
+
+    def _update_codes(self) -> None:
+        if isinstance(self.average.encoder, Autodecoder):
+            self.average.encoder.update_mean()
+
+    def _wait(self) -> None:
+        """Let the processes meet: the first one alone validates and writes."""
         if self.process.world > 1:
             dist.barrier()
-
-    def model(self, offsets: Tensor | None = None) -> Model:
-        """Model of the averaged network, class offsets in its last bias, with the header of its weights."""
-        manifest = self.data.manifest
-        network = self.average
-        if offsets is not None:
-            network = copy.deepcopy(network)  # the running average must stay what it is
-            with torch.no_grad():
-                network.decoder.head.bias[: len(offsets)] += offsets.to(self.device)
-        provenance: dict[str, object] = {
-            "scene": manifest["scene"],
-            "source": manifest.get("source"),
-            "data": manifest["settings"],
-            "training_seed": manifest["seed"],
-            "training_examples": manifest["examples"],
-            "steps": self.step,
-            "mereo": manifest["version"],
-            "visible_m": self.data.visible_m,
-            "class_offsets": None if offsets is None else offsets.tolist(),
-            "recipe": self.config.to_dict(),
-        }
-        return Model(
-            network=network,
-            names=tuple(s["name"] for s in manifest["segments"]),
-            colors=tuple(tuple(s["color"]) for s in manifest["segments"]),
-            loss=self.config.loss,
-            provenance=provenance,
-            domain=self.data.domain(),
-            nested=tuple((inner, outer) for inner, outer in manifest.get("nested", ())),
-            statistical_model=self.data.statistical_model,
-        )
 
     def resume(self) -> bool:
         """Load the checkpoint when there is one; returns whether there was."""
         step = load_checkpoint(self.run_dir, Checkpoint(0, self.network, self.average, self.optimizer))
         if step is None:
             return False
-        self.step = self.first_step = step
+        if not all(value.isfinite().all() for value in self.network.parameters()):
+            raise ValueError(
+                f"the checkpoint of step {step} in {self.run_dir} holds numbers that are not finite, because that run "
+                "diverged; it cannot be continued: choose another --output with a lower --learning-rate"
+            )
+        self.step = self.first_step = self.saved_step = step
         if self.log is not None:
             self.log.read_until(step)
         return True
-
-
-def _parameter_groups(network: nn.Module, config: TrainConfig) -> list[dict[str, object]]:
-    """Weight decay acts on matrices only: it would only slow biases and norms. Codes have a rate of their own."""
-    named = dict(network.named_parameters())
-    codes = [named.pop(CODES)] if CODES in named else []
-    matrices = [p for p in named.values() if p.ndim >= 2]
-    others = [p for p in named.values() if p.ndim < 2]
-    peak = config.learning_rate
-    groups: list[dict[str, object]] = [
-        {"params": matrices, "weight_decay": config.weight_decay, "peak": peak},
-        {"params": others, "weight_decay": 0.0, "peak": peak},
-    ]
-    if codes:
-        groups.append({"params": codes, "weight_decay": 0.0, "peak": config.code_rate})
-    return groups
 
 
 def _seed(*numbers: int) -> int:

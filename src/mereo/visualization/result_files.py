@@ -19,9 +19,10 @@ from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.transforms import transform_points
-from mereo.io.atomic_files import new_directory, write_json
+from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
+from mereo.io.output_folders import new_directory
 from mereo.io.writers.formats import Results, chosen_formats, write_formats
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import EXACT, InferenceConfig

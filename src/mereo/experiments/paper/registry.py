@@ -9,6 +9,7 @@ from typing import get_args
 from mereo.experiments.paper.result import Result, write_result
 from mereo.experiments.paper.scales import SCALES, ExperimentName, ExperimentScale
 from mereo.experiments.paper.store import Store
+from mereo.io.output_folders import check_new_directory
 
 EXPERIMENTS = get_args(ExperimentName)
 
@@ -19,18 +20,19 @@ def run_experiment(name: str, scale: str, root: Path, workers: int = 1) -> Path:
     Datasets, runs and scores are kept in ``root`` and shared between experiments: the same command again continues
     where it stopped, and when all is there it only writes the results again.
 
-    Raises ``ValueError`` for an unknown name or scale.
+    Raises ``ValueError`` for an unknown name or scale, ``FileExistsError`` where that folder holds other things.
     """
     if name not in EXPERIMENTS:
         raise ValueError(f"experiment {name!r} is unknown; it must be one of {', '.join(EXPERIMENTS)}: correct it")
     if scale not in SCALES:
         raise ValueError(f"scale {scale!r} is unknown; it must be one of {', '.join(SCALES)}: correct it")
+    directory = root / "results" / f"{name}-{scale}"
+    check_new_directory(directory, force=True)  # before hours of work
     module = import_module(f"mereo.experiments.paper.{name.replace('-', '_')}")
     run: Callable[[Store, ExperimentScale], Result] = module.run
     result = run(Store(root, workers), SCALES[scale])
     if not SCALES[scale].decides:
         untried = tuple(replace(claim, holds={}) for claim in result.claims)
         result = replace(result, claims=untried, notes=(*result.notes, "It only shows that the experiment runs."))
-    directory = root / "results" / f"{name}-{scale}"
     write_result(result, directory)
     return directory

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from mereo.evaluation.metrics import format_score
 from mereo.evaluation.results import EvaluatedView
 from mereo.experiments.paper.store import Score
-from mereo.io.atomic_files import atomic_file, new_directory, write_json
+from mereo.io.atomic_files import atomic_file, write_json
+from mereo.io.output_folders import new_directory
 from mereo.visualization.error_maps import error_picture
 
 Figures = dict[str, float]

@@ -13,7 +13,7 @@ from mereo.evaluation.sample_views import SampleView, load_view, shipped_views
 from mereo.experiments.speed.fitted_model import fitted_model
 from mereo.experiments.speed.roofline import Machine, measure_machine
 from mereo.experiments.speed.stages import Bench, Stage, random_points
-from mereo.io.atomic_files import write_json
+from mereo.io.atomic_files import check_file_place, write_json
 from mereo.models.config import Precision
 from mereo.models.device import cpu_features
 from mereo.models.model import Model
@@ -55,6 +55,7 @@ def benchmark(
 
     Raises ``ValueError`` for weights of an object without a shipped view.
     """
+    check_file_place(output)
     model, view = _subject(weights, preset)
     model.network.to(device)
     fast = replace(model, precision=precision)

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.io.atomic_files import atomic_file, new_directory
+from mereo.io.atomic_files import atomic_file
+from mereo.io.output_folders import new_directory
 from mereo.io.writers.segment_table import with_faces
 
 RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -114,14 +114,17 @@ def main() -> int:
         "--model", default=str(Path(__file__).parent), help="folder of the graphs; default: of this file"
     )
     options = parser.parse_args()
-    partial = Path(options.output + ".partial.npz")
+    output = Path(options.output)
+    partial = Path(f"{options.output}.{os.getpid()}.partial.npz")
     try:
+        if output.is_symlink() or (output.exists() and not output.is_file()):
+            raise ValueError(f"{output} is no ordinary file, and would be replaced; choose another --output")
         runner = Runner(options.model)
         answers = dict(
             zip(("labels", "distances", "directions"), runner(*map(np.load, (options.cloud, options.points))))
         )
         np.savez_compressed(partial, names=np.array(runner.names), **answers)
-        os.replace(partial, options.output)
+        os.replace(partial, output)
     except (ValueError, OSError, ImportError) as error:
         print(f"mereo_onnx: error: {error}", file=sys.stderr)
         return 2

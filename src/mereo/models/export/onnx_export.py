@@ -26,7 +26,8 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from mereo.geometry.conventions import MIN_POINTS
-from mereo.io.atomic_files import new_directory, write_json
+from mereo.io.atomic_files import write_json
+from mereo.io.output_folders import new_directory
 from mereo.models.decoder import Code
 from mereo.models.encoders.encoding import Level
 from mereo.models.model import DENSE_FACTOR, Model
@@ -225,8 +226,8 @@ def export_weights(
     """
     if format == "onnx":
         _require_onnx()
-    model = load_model(weights)
-    with new_directory(output, force) as directory:
+    with new_directory(output, force, [weights]) as directory:
+        model = load_model(weights)
         graphs = export_graphs(model)
         (write_onnx if format == "onnx" else write_torch)(graphs, directory)
         write_json(directory / "model.json", describe(model, graphs))

@@ -13,7 +13,7 @@ from mereo.deformation.samplers import default_cells
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.mesh_check import likely_unit
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.label_volumes import is_volume, read_label_volume, segment_surfaces
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.scene import SCENES
@@ -66,6 +66,7 @@ def write_scene_file(files: Sequence[Path], output: Path | None = None, units: s
     path = output or Path(f"{name}.yaml")
     if path.suffix not in (".yaml", ".yml"):
         raise ValueError(f"{path} has the suffix {path.suffix!r}; a scene file is .yaml: rename it")
+    check_file_place(path)
     if path.exists():
         raise FileExistsError(f"{path} exists; it is not overwritten: choose another --output")
     source = _source(list(files), path.parent)

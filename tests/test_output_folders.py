@@ -1,0 +1,233 @@
+"""Folders of results replace what mereo wrote and nothing else, whoever comes between or dies half-way."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_output import contents
+
+from mereo import __main__ as command_line
+from mereo.io import scratch_folders
+from mereo.io.atomic_files import atomic_file
+from mereo.io.output_folders import MARKER, new_directory
+from mereo.io.scratch_folders import ASIDE, LOCK
+
+
+def write(path: Path, text: str, force: bool = False) -> None:
+    with new_directory(path, force) as folder:
+        (folder / "deep").mkdir()
+        (folder / "deep" / "a.txt").write_text(text)
+
+
+def read(path: Path) -> str:
+    return (path / "deep" / "a.txt").read_text()
+
+
+def test_what_mereo_wrote_is_replaced_when_forced(tmp_path: Path) -> None:
+    write(tmp_path / "out", "first")
+    write(tmp_path / "out", "second", force=True)
+    assert read(tmp_path / "out") == "second" and os.listdir(tmp_path) == ["out"]
+    shutil.move(tmp_path / "out", tmp_path / "elsewhere")
+    (tmp_path / "elsewhere/deep/a.txt").unlink()
+    write(tmp_path / "elsewhere", "third", force=True)
+    assert read(tmp_path / "elsewhere") == "third"
+
+
+def add(folder: Path) -> None:
+    (folder / "deep" / "mine.txt").write_text("precious")
+
+
+def edit(folder: Path) -> None:
+    (folder / "deep" / "a.txt").write_text("corrected by hand")
+
+
+def add_link(folder: Path) -> None:
+    (folder / "deep" / "link").symlink_to(folder)
+
+
+def add_folder(folder: Path) -> None:
+    (folder / "mine").mkdir()
+
+
+def forget(folder: Path) -> None:
+    (folder / MARKER).unlink()
+
+
+def spoil(folder: Path) -> None:
+    (folder / MARKER).write_text('{"files": 3}')
+
+
+CHANGES = {
+    add: r"holds deep/mine\.txt, not written by mereo or changed since; .*: move that away, or choose another --output",
+    edit: r"holds deep/a\.txt, not written by mereo or changed since",
+    add_link: r"holds deep/link, not written",
+    add_folder: r"holds mine, not written",
+    forget: r"has no \.mereo\.json, .* an earlier version's; .*: choose another --output, or delete it yourself",
+    spoil: r"holds deep and 1 more, not written",
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_folder_with_anything_else_in_it_is_refused_before_the_work(
+    change: Callable[[Path], None], tmp_path: Path
+) -> None:
+    write(tmp_path / "out", "first")
+    change(tmp_path / "out")
+    before = contents(tmp_path)
+    with pytest.raises(FileExistsError, match=CHANGES[change]), new_directory(tmp_path / "out", force=True):
+        pytest.fail("the work was begun")
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_comes_into_a_folder_during_the_work_is_kept(change: Callable[[Path], None], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, "first")
+    before: dict[str, bytes] = {}
+    with pytest.raises(FileExistsError, match="out (holds|was written)"), new_directory(out, force=True) as folder:
+        (folder / "b.txt").write_text("second")
+        change(out)
+        before = contents(out)
+    assert contents(out) == before and os.listdir(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize("existing", ["absent", "empty"])
+def test_an_output_that_is_filled_during_the_work_is_kept(existing: str, tmp_path: Path) -> None:
+    """By a person, and by another run: the first one to end has its result there, the second one says so."""
+    if existing == "empty":
+        (tmp_path / "out").mkdir()
+    message = "was written by another while this ran; it is kept and this result is dropped: run again with another"
+    with pytest.raises(FileExistsError, match=message), new_directory(tmp_path / "out") as folder:
+        (folder / "b.txt").write_text("ours")
+        (tmp_path / "out").mkdir(exist_ok=True)
+        (tmp_path / "out/a.txt").write_text("theirs")
+    assert contents(tmp_path) == {"out": b"", "out/a.txt": b"theirs"}
+
+
+def test_of_two_forced_runs_the_second_one_does_not_replace_what_it_has_not_seen(tmp_path: Path) -> None:
+    write(tmp_path / "out", "first")
+    write(tmp_path / "later", "second")
+    with pytest.raises(FileExistsError, match="written by another"), new_directory(tmp_path / "out", force=True):
+        shutil.rmtree(tmp_path / "out")
+        (tmp_path / "later").rename(tmp_path / "out")
+    assert read(tmp_path / "out") == "second"
+
+
+def test_two_runs_at_once_into_one_folder_are_refused_at_once(tmp_path: Path) -> None:
+    with (
+        new_directory(tmp_path / "out"),
+        pytest.raises(FileExistsError, match="is being written by another process: wait for it, or choose another"),
+        new_directory(tmp_path / "out"),
+    ):
+        pass
+
+
+def test_a_list_that_names_places_elsewhere_removes_nothing_there(tmp_path: Path) -> None:
+    (tmp_path / "precious.txt").write_text("precious")
+    write(tmp_path / "out", "first")
+    listed = json.loads((tmp_path / "out" / MARKER).read_text())
+    listed["files"] |= {"../precious.txt": "", str(tmp_path / "precious.txt"): ""}
+    (tmp_path / "out" / MARKER).write_text(json.dumps(listed))
+    write(tmp_path / "out", "second", force=True)
+    assert read(tmp_path / "out") == "second" and (tmp_path / "precious.txt").read_text() == "precious"
+
+
+def test_the_input_is_never_replaced(tmp_path: Path) -> None:
+    """Not even where mereo wrote it."""
+    write(tmp_path / "out", "first")
+    inputs = [tmp_path / "missing", tmp_path / "out/deep/a.txt"]
+    with (
+        pytest.raises(FileExistsError, match=r"out holds .*a\.txt, which is read; it is not replaced: choose another"),
+        new_directory(tmp_path / "out", True, inputs),
+    ):
+        pytest.fail("the work was begun")
+
+
+def test_reconstruct_does_not_delete_the_folder_of_its_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "cloud.npy", np.ones((100, 3)))
+    (tmp_path / "thesis.tex").write_text("precious")
+    before = contents(tmp_path)
+    command = ["reconstruct", tmp_path / "cloud.npy", "--weights", "rope", "--output", tmp_path, "--force"]
+    assert command_line.main([str(part) for part in command]) == 2
+    assert "which is read; it is not replaced" in capsys.readouterr().err
+    assert contents(tmp_path) == before
+
+
+# --- killed processes -------------------------------------------------------------------------------------------------
+
+DIES = """
+import os, signal, sys
+from pathlib import Path
+from mereo.io import atomic_files, output_folders
+def die(*_): os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def killed(code: str) -> None:
+    """Run Python that must end by a SIGKILL."""
+    done = subprocess.run([sys.executable, "-c", DIES + code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+    killed(
+        f"with output_folders.new_directory({str(tmp_path / 'out')!r}) as folder:\n"
+        f" with atomic_files.atomic_file({str(tmp_path / 'a.txt')!r}) as file:\n"
+        "  (folder / 'half').touch(); file.touch(); die()"
+    )
+    assert len(os.listdir(tmp_path)) == 2
+    own = tmp_path / ".out.mine.partial"  # looks alike
+    lockless = tmp_path / ".out.00000000.partial"
+    for folder in (own, lockless):
+        folder.mkdir()
+        (folder / "mine.txt").write_text("precious")
+    (tmp_path / ".other.00000000.partial").mkdir()
+    (tmp_path / ".other.00000000.partial" / LOCK).touch()
+    write(tmp_path / "out", "whole")
+    with atomic_file(tmp_path / "a.txt") as file:
+        file.write_text("whole")
+    expected = {"out", "a.txt", own.name, lockless.name, ".other.00000000.partial"}
+    assert set(os.listdir(tmp_path)) == expected and (own / "mine.txt").exists() and (lockless / "mine.txt").exists()
+
+
+@pytest.mark.parametrize("moment", ["_place", "_remove_written"])
+def test_a_process_killed_while_it_replaces_loses_neither_result(moment: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, "first")
+    killed(
+        f"output_folders.{moment} = die\n"
+        f"with output_folders.new_directory({str(out)!r}, force=True) as folder:\n (folder / 'b.txt').touch()"
+    )
+    assert any((tmp_path / name / ASIDE).is_dir() for name in os.listdir(tmp_path))
+    with pytest.raises(FileExistsError, match="not overwritten"):  # after it was put back
+        write(out, "second")
+    assert (out / "deep/a.txt").exists() == (moment == "_place") and (out / MARKER).exists()
+    write(out, "second", force=True)
+    assert read(out) == "second" and os.listdir(tmp_path) == ["out"]
+
+
+def test_without_locks_leftovers_stay_and_are_in_nobodys_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    killed(f"with output_folders.new_directory({str(tmp_path / 'out')!r}): die()")
+    monkeypatch.setattr(scratch_folders, "LOCKS", False)
+    write(tmp_path / "out", "whole")
+    write(tmp_path / "out", "again", force=True)
+    assert read(tmp_path / "out") == "again" and len(os.listdir(tmp_path)) == 2
+
+
+def test_a_living_process_keeps_what_it_is_writing(tmp_path: Path) -> None:
+    """Another one that writes the same file at the same time removes none of it."""
+    with atomic_file(tmp_path / "a.txt") as first:
+        first.write_text("first")
+        with atomic_file(tmp_path / "a.txt") as second:
+            second.write_text("second")
+        assert (tmp_path / "a.txt").read_text() == "second"
+    assert contents(tmp_path) == {"a.txt": b"first"}

@@ -1,0 +1,91 @@
+"""What is no place for an output is refused, and before any work."""
+
+import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import pytest
+
+from mereo import __main__ as command_line
+from mereo.io.atomic_files import atomic_file
+from mereo.io.output_folders import check_new_directory, claim_directory, new_directory
+
+NO_PLACES = {
+    "": "the output '.' has no name of its own",
+    ".": "has no name of its own, which it needs: name it, as in out",
+    "..": "the output '..' has no name of its own",
+    "deep/..": "has no name of its own",
+    "/": "the output '/' has no name of its own",
+    "x" * 250: r"has a name of 250 bytes \(x+\.\.\.\); at most 237 can be written: choose a shorter one",
+    f"{'ü' * 130}/out": "has a name of 260 bytes",
+    "a\udcff": r"the output 'a\\udcff' has bytes that are no UTF-8 text: choose another name",
+    "a\0b": r"the output 'a\\x00b' has a zero byte",
+    "link": "link is a link, which would be lost; an output is written in its own place: name that",
+    "dangling": "is a link",
+    "pipe/deep/out": "pipe is no folder, so out cannot be made in it: choose another --output",
+    "pipe": "is a device or pipe; an output is a file or folder: choose another --output",
+}
+
+
+@pytest.mark.parametrize("name", NO_PLACES)
+@pytest.mark.parametrize("make", [new_directory, atomic_file], ids=["folder", "file"])
+def test_what_is_no_place_for_an_output_is_refused_before_the_work(
+    make: Callable[..., AbstractContextManager[Path]], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("target").mkdir()
+    Path("link").symlink_to("target")
+    Path("dangling").symlink_to("nowhere")
+    os.mkfifo("pipe")
+    before = sorted(tmp_path.rglob("*"))
+    for force in (True, False):
+        with pytest.raises(ValueError, match=NO_PLACES[name]), make(name, force=force):
+            pytest.fail("the work was begun")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_run_may_lie_behind_a_link(tmp_path: Path) -> None:
+    """Nothing is put in the place of a folder in which work is continued."""
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "run").symlink_to("disk")
+    assert claim_directory(tmp_path / "run", "config.json", {"a": 1}, "a run") is None
+    assert os.listdir(tmp_path / "disk") == ["config.json"] and (tmp_path / "run").is_symlink()
+    os.mkfifo(tmp_path / "pipe")
+    for path in (Path(""), Path(".."), tmp_path / "pipe"):
+        with pytest.raises(ValueError, match="has no name|is a device"):
+            claim_directory(path, "config.json", {}, "a run")
+
+
+def test_a_mount_point_is_no_place_for_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os.path, "ismount", lambda path: path == tmp_path)
+    with pytest.raises(ValueError, match="is a mount point, which cannot be renamed: name a folder in it"):
+        check_new_directory(tmp_path, force=True)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "reconstruct cloud.npy --weights rope --output {}",
+        "export rope --output {}",
+        "release rope --name rope --output {}",
+        "evaluate rope --output {}",
+        "generate rope --examples 2 --output {}",
+        "train data --output {}",
+        "align cloud.npy --scene rope --weights rope --output {}",
+        "stream . --weights rope --surfaces {}",
+        "scene preview rope --output {}",
+        "scene export rope --output {}",
+        "scene modes rope --output {}",
+        "bench --weights rope --output {}",
+        "demo --output {}",
+    ],
+)
+def test_every_command_refuses_a_pipe_first(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    assert command_line.main(command.format("pipe").split()) == 2
+    assert "mereo: error: pipe is a device or pipe" in capsys.readouterr().err
+    assert Path("pipe").is_fifo() and os.listdir() == ["pipe"]
