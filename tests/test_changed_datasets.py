@@ -126,14 +126,21 @@ def test_a_template_of_another_object_is_noticed(data: Path) -> None:
             Dataset.load(data)
 
 
-@pytest.mark.parametrize("text", ["[]", '{"scene": "toy"}', "{", "\ufffe"])
-def test_a_manifest_that_is_none_is_one_sentence(data: Path, text: str) -> None:
-    (data / "manifest.json").write_bytes(text.encode("utf-16"))
+@pytest.mark.parametrize("content", [b"[]", b'{"scene": "toy"}', b"{", b"\xff\xfe"])
+def test_a_manifest_that_is_none_is_one_sentence(data: Path, content: bytes) -> None:
+    (data / "manifest.json").write_bytes(content)
     with pytest.raises(ValueError, match=r"manifest\.json is not .*; generate the dataset again"):
         Dataset.load(data)
-    (data / "manifest.json").write_text(json.dumps([1]))
-    with pytest.raises(ValueError, match=r"manifest\.json is not the manifest of a dataset"):
-        Dataset.load(data)
+
+
+def test_a_manifest_that_was_changed_does_not_fit_its_files(data: Path) -> None:
+    manifest = json.loads((data / "manifest.json").read_text())
+    for change in ({"seed": 4}, {"any_roll": True}, {"segments": manifest["segments"][::-1]}):
+        (data / "manifest.json").write_text(json.dumps(manifest | change))
+        with pytest.raises(ValueError, match="it is of another dataset"):
+            Dataset.load(data)
+    (data / "manifest.json").write_text(json.dumps(manifest | {"unit_m": 0.01}))
+    assert Dataset.load(data).visible_m is not None, "the unit may be said afterwards"
 
 
 def test_more_examples_than_the_disk_has_room_for_are_refused_at_once(tmp_path: Path) -> None:

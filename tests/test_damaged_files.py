@@ -113,6 +113,12 @@ LYING_MESHES = {
     "fewer than none.ply": (ply(BINARY, -57, DATA, 1), "its header states -57 of element 'vertex'"),
     "fewer faces.off": (b"OFF\n3 5 0\n0 0 0\n1 0 0\n0 1 0\n" + TRIANGLE, "truncated: 1 of 5 faces"),
     "fewer than none.off": (b"OFF\n-3 1 0\n0 0 0\n" + TRIANGLE, "its header states -3 vertices"),
+    "no end.stl": (
+        b"solid a\nfacet normal 0 0 1\nouter loop\n"
+        + b"".join(b"vertex %d %d 0\n" % place for place in ((0, 0), (1, 0), (0, 1)))
+        + b"endloop\nendfacet\n",
+        "it is truncated: it does not end in endsolid",
+    ),
     "huge.stl": (bytes(80) + b"\xff" * 4 + bytes(100), "states 4294967295 triangles, and its 184 bytes hold 2"),
     "vertices.glb": (glb(10**10, 3), "truncated: 3 of 10000000000 elements"),
     "indices.glb": (glb(3, -3), "its header states -3 elements"),
@@ -177,6 +183,16 @@ def test_what_unpacks_to_too_much_is_refused_before_memory_is_taken(tmp_path: Pa
     one_sentence(read_segmented_mesh, tmp_path / "c.3mf", zipped("3D/3dmodel.model", zeros), refused)
     assert tracemalloc.get_traced_memory()[1] < 60_000_000
     tracemalloc.stop()
+
+
+@pytest.mark.usefixtures("small_limit")
+def test_a_depth_image_of_too_many_floats_is_refused(tmp_path: Path) -> None:
+    openexr = pytest.importorskip("OpenEXR", reason="OpenEXR comes with the extra sensors")
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    with openexr.File(header, {"Z": np.ones((1500, 2000), np.float32)}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(ValueError, match=r"a\.exr unpacks to 0\.012 GB; at most 0\.01 GB are read"):
+        read_raw_depth(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize("encoding, pack", [("gzip", gzip.compress), ("bzip2", bz2.compress)])

@@ -44,9 +44,15 @@ def _check_stl(path: Path) -> None:
     size = path.stat().st_size
     with path.open("rb") as file:
         start = file.read(84)
+        file.seek(max(0, size - 1024))
+        end = file.read().strip().splitlines()[-1:]
     count = int.from_bytes(start[80:84], "little")
-    if not start.lstrip().startswith(b"solid") and size != 84 + 50 * count:
+    if size == 84 + 50 * count:
+        return
+    if not start.lstrip().lower().startswith(b"solid"):
         raise ValueError(f"its header states {count} triangles, and its {size} bytes hold {max(size - 84, 0) / 50:g}")
+    if not end or not end[0].strip().lower().startswith(b"endsolid"):
+        raise ValueError("it is truncated: it does not end in endsolid")
 
 
 def _check_gltf(path: Path) -> None:

@@ -11,7 +11,7 @@ import os
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -118,7 +118,7 @@ def check_stream(path: Path, start: int, encoding: str, wanted: int) -> None:
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
-def open_image(source: str | Path | BytesIO, name: str | Path, formats: Sequence[str] | None = None) -> Image.Image:
+def open_image(source: str | Path | BytesIO, name: str | Path, formats: tuple[str, ...] | None = None) -> Image.Image:
     """Open an image whose pixels are not too many and, in a PNG, whose checksums are right.
 
     Pillow does not compare the checksums of a PNG when it reads one, so damage came out as other values.
@@ -140,7 +140,7 @@ def open_image(source: str | Path | BytesIO, name: str | Path, formats: Sequence
     return _opened(source, name, formats)
 
 
-def _opened(source: str | Path | BytesIO, name: str | Path, formats: Sequence[str] | None) -> Image.Image:
+def _opened(source: str | Path | BytesIO, name: str | Path, formats: tuple[str, ...] | None) -> Image.Image:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # half of what it refuses, and within the limit
         try:
