@@ -76,6 +76,7 @@ LYING_CLOUDS = {
         pcd(4, "binary_compressed", struct.pack("<II", 5, 48) + bytes([1, 65, 66, 32, 10])),
         "its compressed data are damaged",
     ),
+    "cut short.pts": (b"58\n" + TEXT, "truncated: 57 of 58 points"),
     "huge.npy": (npy(10**15, 3) + DATA, r"an array of shape \[1000000000000000, 3\], which its \d+ bytes cannot hold"),
     "huge.npz": (zipped("points.npy", npy(10**15, 3) + DATA), r"array of shape \[1000000000000000, 3\]"),
 }

@@ -117,6 +117,8 @@ def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
     header = [cell.strip().strip('"').lower() for cell in title.split(delimiter)]
     columns = [header.index(axis) if set("xyz") <= set(header) else i for i, axis in enumerate("xyz")]
     rows = [line for line in lines[first:] if not line.lstrip().startswith(("#", "//"))]
+    if path.suffix.lower() == ".pts" and title.strip().isdecimal():
+        check_count(int(title), len(rows), "points")
     return np.loadtxt(rows, delimiter=delimiter, usecols=columns, ndmin=2)
 
 
