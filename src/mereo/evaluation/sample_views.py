@@ -13,6 +13,7 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.labels import LabelGrid
 from mereo.io.atomic_files import atomic_file
+from mereo.io.size_limits import check_arrays
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -94,6 +95,7 @@ def load_view(name: str | Path) -> SampleView:
         known = ", ".join(shipped_views()) or "none"
         raise FileNotFoundError(f"there is no sample view {str(name)!r}; give a .npz file or a shipped name: {known}")
     try:
+        check_arrays(path)
         # opened here because numpy leaves a damaged file open
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             return _view_of({key: file[key] for key in file.files})

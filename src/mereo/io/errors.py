@@ -4,16 +4,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mereo.io.size_limits import SizeError, check_bytes
+
 
 @contextmanager
 def readable(path: Path, kind: str) -> Iterator[None]:
-    """Refuse missing and empty files, and turn what a library raises in the block into one sentence.
+    """Refuse missing, empty and too large files; turn what a library raises in the block into one sentence.
 
     Args:
         path: the file that is read.
         kind: what it should be, for the sentence: "point cloud".
 
-    Raises ``FileNotFoundError`` or ``ValueError``; ``MemoryError`` and ``ImportError`` pass as they are.
+    Raises ``FileNotFoundError`` or ``ValueError``; ``MemoryError``, ``ImportError`` and ``SizeError`` pass as they are.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a {kind} is needed: check the path")
@@ -21,9 +23,10 @@ def readable(path: Path, kind: str) -> Iterator[None]:
         raise ValueError(f"{path} is a directory; a {kind} is needed: name a file in it")
     if path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes); a {kind} is needed: export or download it again")
+    check_bytes(path, path.stat().st_size)
     try:
         yield
-    except (MemoryError, ImportError):
+    except (MemoryError, ImportError, SizeError):
         raise
     except Exception as error:
         # a library's text may be several sentences: its first line is the reason

@@ -4,8 +4,9 @@ Both formats come out in one frame: RAS, x to the right, y to the front, z to th
 by NIfTI's convention). NRRD files say which frame they are in; those of 3D Slicer are LPS and are turned.
 """
 
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -18,6 +19,7 @@ from skimage.measure import marching_cubes
 
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.errors import readable
+from mereo.io.size_limits import ENGINES, check_bytes, check_stream
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
 
@@ -30,6 +32,9 @@ MARGIN = 4
 LEAST_VOLUME = 0.6
 """Share of its volume that a segment keeps at least; what keeps less is too thin for the grid."""
 
+
+WIDEST = 8
+"""Bytes of a label in memory, and of the widest one in a file."""
 
 LEAST_MARGIN = 1e-3
 """Least distance of a margin from zero: a tie between two segments at a node would make faces without area there."""
@@ -87,11 +92,20 @@ Content = tuple[np.ndarray, Float[np.ndarray, "4 4"], dict[int, str]]
 
 def _nifti(nibabel: Any, path: Path) -> Content:
     image = nibabel.load(path)
+    _check_voxels(path, image.shape)
     values = np.asarray(image.dataobj)
     return values[..., 0] if values.ndim == 4 and values.shape[3] == 1 else values, np.asarray(image.affine, float), {}
 
 
 def _nrrd(nrrd: Any, path: Path) -> Content:
+    with path.open("rb") as file:
+        header, start = nrrd.read_header(file), file.tell()
+    _check_voxels(path, header["sizes"])
+    detached = header.get("data file", header.get("datafile"))
+    data, start = (path, start) if detached is None else (path.parent / detached, 0)
+    # pynrrd unpacks all there is, whatever the header says
+    if header["encoding"] in ENGINES and not header.get("line skip", header.get("lineskip")) and data.is_file():
+        check_stream(data, start, header["encoding"], math.prod(map(int, header["sizes"])) * WIDEST)
     values, header = nrrd.read(str(path))
     transform = np.eye(4)
     directions = header.get("space directions")
@@ -101,6 +115,14 @@ def _nrrd(nrrd: Any, path: Path) -> Content:
         transform[:3, :3] = np.diag(header["spacings"][-3:])
     transform[:3, 3] = header.get("space origin", np.zeros(3))
     return values, _to_ras(str(header.get("space", ""))) @ transform, _slicer_names(header)
+
+
+def _check_voxels(path: Path, sizes: Iterable[Any]) -> None:
+    """Refuse the sizes in a header that are none, or too large as the 64-bit numbers that labels become."""
+    sides = [int(side) for side in sizes]
+    if min(sides, default=0) < 1:
+        raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
+    check_bytes(path, math.prod(sides) * WIDEST)
 
 
 def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.io.errors import readable
+from mereo.io.mesh_headers import check_mesh
 
 VIEWER_ROOT = "camera_frame"
 """Name of the root node of our own GLB files; below it, vertices are in the input's camera frame."""
@@ -62,6 +63,7 @@ def _parts(path: Path) -> list[Part]:
     if path.suffix.lower() == ".3mf" and find_spec("lxml") is None:
         raise ImportError(f"{path} needs lxml, which reads 3MF files and is not installed: pip install 'mereo[cad]'")
     with readable(path, "mesh"):
+        check_mesh(path)
         parts = _obj_parts(path) if path.suffix.lower() == ".obj" else _scene_parts(path)
         if not parts:
             raise ValueError("it has no faces")

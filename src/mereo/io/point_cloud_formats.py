@@ -14,6 +14,10 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from mereo.io.size_limits import check_arrays, check_bytes, check_count
+
+PLY_ORDERS = ("ascii", "binary_little_endian", "binary_big_endian")
+
 PLY_TYPES = {
     "char": "i1",
     "uchar": "u1",
@@ -48,11 +52,11 @@ def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     names = [name for _, name in properties]
     if order == "ascii":
         rows = [row for row in content[start:].decode("ascii").splitlines() if row.strip()]
-        _expect(len(rows), count)
+        check_count(count, len(rows), "points")
         return np.loadtxt(rows[:count], usecols=[names.index(axis) for axis in "xyz"], ndmin=2)
     end = "<>"[order == "binary_big_endian"]
     record = np.dtype([(name, end + PLY_TYPES[kind]) for kind, name in properties])
-    _expect((len(content) - start) // record.itemsize, count)
+    check_count(count, (len(content) - start) // record.itemsize, "points")
     vertices = np.frombuffer(content, record, count, start)
     return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
 
@@ -61,6 +65,16 @@ def ply_counts(path: Path) -> dict[str, int]:
     """Number of each kind of element (vertex, face) that a PLY file's header states."""
     with path.open("rb") as file:
         return {name: count for name, count, _ in _ply_header(file.read(65536))[1]}
+
+
+def check_ply(path: Path) -> None:
+    """Raise ``ValueError`` for a PLY file that trimesh would read in part: with a wrong header, or text cut short."""
+    with path.open("rb") as file:
+        order, elements, start = _ply_header(file.read(65536))
+        file.seek(start)
+        rows = sum(1 for row in file if row.strip()) if order == "ascii" else 0
+    if order == "ascii":
+        check_count(sum(count for _, count, _ in elements), rows, "rows")
 
 
 def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str]]]], int]:
@@ -73,9 +87,13 @@ def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str
         if key == "format":
             order = values[0]
         elif key == "element":
-            elements.append((values[0], int(values[1]), list[list[str]]()))
+            count = int(values[1])
+            check_count(count, max(count, 0), f"of element {values[0]!r}")
+            elements.append((values[0], count, list[list[str]]()))
         elif key == "property":
             elements[-1][2].append(values)
+    if order not in PLY_ORDERS:
+        raise ValueError(f"its format is {order!r}, not one of {', '.join(PLY_ORDERS)}")
     return order, elements, match.end()
 
 
@@ -83,7 +101,7 @@ def _ply_by_trimesh(path: Path, count: int) -> Float[np.ndarray, "n 3"]:
     """Vertices of unusual PLY files, where something stands before the vertices."""
     loaded: Any = trimesh.load(path, file_type="ply", process=False)
     # trimesh returns the rows it finds; a file cut short is only noticed by counting them
-    _expect(len(loaded.vertices), count)
+    check_count(count, len(loaded.vertices), "points")
     return np.asarray(loaded.vertices, dtype=np.float64)
 
 
@@ -99,6 +117,8 @@ def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
     header = [cell.strip().strip('"').lower() for cell in title.split(delimiter)]
     columns = [header.index(axis) if set("xyz") <= set(header) else i for i, axis in enumerate("xyz")]
     rows = [line for line in lines[first:] if not line.lstrip().startswith(("#", "//"))]
+    if path.suffix.lower() == ".pts" and title.strip().isdecimal():
+        check_count(int(title), len(rows), "points")
     return np.loadtxt(rows, delimiter=delimiter, usecols=columns, ndmin=2)
 
 
@@ -118,6 +138,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    check_arrays(path)
     with path.open("rb") as file:  # by its name, numpy would leave a damaged archive open
         loaded = np.load(file, allow_pickle=False)
         if isinstance(loaded, np.ndarray):
@@ -146,6 +167,9 @@ def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Points of a PCD file: ascii, binary, binary_compressed; organized clouds come row by row, with their NaN rows."""
     header, body = _pcd_header(path.read_bytes())
     count, row = int(header["POINTS"][0]), _pcd_row(header)
+    width, height = (int(header.get(key, [str(count)])[0]) for key in ("WIDTH", "HEIGHT"))
+    if count < 0 or ({"WIDTH", "HEIGHT"} <= header.keys() and width * height != count):
+        raise ValueError(f"its header states {count} points and {width} x {height}")
     if not {"x", "y", "z"} <= set(row.names or ()):
         raise ValueError(f"its fields are {', '.join(header['FIELDS'])}, without x, y and z")
     layout = header["DATA"][0]
@@ -155,7 +179,7 @@ def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
         return _pcd_compressed(body, row, count)
     if layout != "binary":
         raise ValueError(f"its DATA is {layout!r}, not ascii, binary or binary_compressed")
-    _expect(len(body) // row.itemsize, count)
+    check_count(count, len(body) // row.itemsize, "points")
     records = np.frombuffer(body, row, count)
     return np.stack([records[axis].astype(np.float64).reshape(count) for axis in "xyz"], axis=1)
 
@@ -187,7 +211,7 @@ def _pcd_ascii(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3
     sizes = [int(np.prod(row[name].shape)) for name in row.names or ()]
     starts = dict(zip(row.names or (), np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
     lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
-    _expect(len(lines), count)
+    check_count(count, len(lines), "points")
     if count == 0:
         return np.empty((0, 3))
     return np.loadtxt(lines[:count], usecols=[starts[axis] for axis in "xyz"], ndmin=2)
@@ -198,8 +222,8 @@ def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray,
     if len(body) < 8:
         raise ValueError("it is truncated after its header")
     packed, unpacked = (int(size) for size in np.frombuffer(body, "<u4", 2))
+    check_count(count, unpacked // row.itemsize, "points")
     data = _lzf_decompress(body[8 : 8 + packed], unpacked)
-    _expect(len(data) // row.itemsize, count)
     axes, start = {}, 0
     for name in row.names or ():
         length = row[name].itemsize * count
@@ -223,6 +247,8 @@ def _lzf_decompress(data: bytes, size: int) -> bytes:
             length, at = length + data[at], at + 1
         offset, at = ((control & 31) << 8) + data[at] + 1, at + 1
         start, length = len(output) - offset, length + 2
+        if start < 0:
+            raise ValueError("its compressed data are damaged")
         # a copy may overlap what it writes: it then repeats the last `offset` bytes
         chunk = output[start : start + length]
         output += (chunk * (length // len(chunk) + 1))[:length]
@@ -241,13 +267,10 @@ def _zdf_points(path: Path) -> Float[np.ndarray, "n 3"]:
     import netCDF4
 
     with netCDF4.Dataset(path) as file:
-        cloud = file["data"]["pointcloud"][:]
+        stored = file["data"]["pointcloud"]
+        check_bytes(path, 8 * int(np.prod(stored.shape, dtype=object)))
+        cloud = stored[:]
     return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))
-
-
-def _expect(found: int, declared: int) -> None:
-    if found < declared:
-        raise ValueError(f"it is truncated: {found} of {declared} points")
 
 
 CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n 3"]]] = {

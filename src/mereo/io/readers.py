@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
-from PIL import Image
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.depth_formats import DEPTH_READERS, metres, read_raw_depth
 from mereo.io.errors import readable
 from mereo.io.point_cloud_formats import CLOUD_READERS
+from mereo.io.size_limits import open_image
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
 """Range of an image's median depth, unless the caller says otherwise; beyond it the unit is wrong."""
@@ -131,7 +131,7 @@ def usable_depth(
 def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
     """Pixels of an image that are not 0 (in any channel but alpha); ``size`` is the expected (width, height)."""
     path = Path(path)
-    with readable(path, "mask image"), Image.open(path) as image:
+    with readable(path, "mask image"), open_image(path, path) as image:
         # a 1-bit or palette image is taken by what it shows, anything else by its stored values
         pixels = np.asarray(image.convert("RGB") if image.mode in ("1", "P", "RGBA", "LA", "CMYK") else image)
     mask = np.asarray(pixels.reshape(*pixels.shape[:2], -1).any(axis=-1))

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from PIL import Image
+from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.io.depth_formats import metres
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
+from mereo.io.size_limits import check_count, open_image
 
 IMAGE, CLOUD, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -220,7 +220,7 @@ def _depth_image(message: Any, camera: Camera, depth_scale: float | None) -> Dep
     if kind is None:
         raise ValueError(f"its encoding is {message.encoding!r}, not one of {', '.join(DEPTH_ENCODINGS)}")
     value = np.dtype(f"{'>' if message.is_bigendian else '<'}{kind}")
-    rows = np.asarray(message.data, dtype=np.uint8)[: message.height * message.step].reshape(message.height, -1)
+    rows = _rows(message, message.step, value.itemsize)
     raw = np.ascontiguousarray(rows[:, : message.width * value.itemsize]).view(value).astype(kind)
     return DepthImage(metres(raw, depth_scale if kind == "u2" else None), camera)
 
@@ -233,7 +233,7 @@ def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -
             f"its format is {message.format!r}, not PNG-compressed depth ('16UC1; compressedDepth png' or 32FC1)"
         )
     data = np.asarray(message.data, dtype=np.uint8).tobytes()
-    with Image.open(BytesIO(data[COMPRESSED_HEADER:]), formats=("PNG",)) as image:
+    with open_image(BytesIO(data[COMPRESSED_HEADER:]), "its image", ("PNG",)) as image:
         raw = np.asarray(image).astype(np.uint16)
     if DEPTH_ENCODINGS[encoding] == "u2":
         return DepthImage(metres(raw, depth_scale), camera)
@@ -241,6 +241,15 @@ def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -
     with np.errstate(divide="ignore"):
         depth = np.where(raw > 0, a / (raw - b), 0.0)
     return DepthImage(depth, camera)
+
+
+def _rows(message: Any, step: int, item: int) -> UInt8[np.ndarray, "h s"]:
+    """Bytes of each row of an image or cloud; fewer than are stated would come out as fewer pixels or points."""
+    data = np.asarray(message.data, dtype=np.uint8)
+    if step < message.width * item:
+        raise ValueError(f"its rows have {step} bytes, less than {message.width} of {item}")
+    check_count(message.height * step, len(data), "bytes")
+    return data[: message.height * step].reshape(message.height, step)
 
 
 def _cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
@@ -256,6 +265,6 @@ def _cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
             "itemsize": message.point_step,
         }
     )
-    rows = np.asarray(message.data, dtype=np.uint8)[: message.height * message.row_step].reshape(message.height, -1)
+    rows = _rows(message, message.row_step, message.point_step)
     points = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(point).reshape(-1)
     return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1)

@@ -13,6 +13,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from mereo.io.errors import readable
+from mereo.io.size_limits import check_arrays
 
 FRAME_SUFFIXES = (".npz", ".ply", ".obj", ".stl", ".off")
 """Suffixes of files that hold a state each."""
@@ -80,8 +81,10 @@ def read_states(path: Path, names: tuple[str, ...]) -> TetrahedralRecord | Surfa
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    with readable(path, "NPZ file"), np.load(path, allow_pickle=False) as file:
-        return {key: file[key] for key in file.files}
+    with readable(path, "NPZ file"):
+        check_arrays(path)
+        with np.load(path, allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
 
 
 def _archive(path: Path, names: tuple[str, ...]) -> TetrahedralRecord | SurfaceRecord:

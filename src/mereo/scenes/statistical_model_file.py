@@ -8,7 +8,6 @@ keep float32.
 Notation: v vertices, m material points, k modes, n states, q pairs.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +15,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
+from mereo.io.checked_tensors import Tensors, pack_tensors, read_tensors
 from mereo.scenes.pair_distances import PairDistances
 from mereo.scenes.source_frame import SourceFrame
 from mereo.scenes.statistical_model import StatisticalModel
@@ -30,10 +28,6 @@ LIBRARY_STEP = 1 / 32
 
 WIDE_MODES = 12
 """The first ones, in two bytes: they move most, and so would be rounded most."""
-
-HEADER = "mereo"
-
-Tensors = Mapping[str, np.ndarray]
 
 
 def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -86,20 +80,21 @@ def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel
     )
 
 
-def save_statistical_model(model: StatisticalModel, path: Path) -> None:
-    """Write a statistical model as one safetensors file, whole or not at all."""
+def save_statistical_model(model: StatisticalModel, path: Path, dataset: str | None = None) -> None:
+    """Write a statistical model as one safetensors file, whole or not at all; ``dataset`` is the key of its dataset."""
     tensors, facts = pack_model(model)
     with atomic_file(path) as partial:
-        partial.write_bytes(save(tensors, metadata={HEADER: json.dumps(facts)}))
+        partial.write_bytes(pack_tensors(tensors, {**facts, "dataset": dataset}))
 
 
-def load_statistical_model(path: Path) -> StatisticalModel:
-    """Read what ``save_statistical_model`` wrote; ``ValueError`` for another file."""
+def load_statistical_model(path: Path, dataset: str | None = None) -> StatisticalModel:
+    """Read what ``save_statistical_model`` wrote; ``ValueError`` for another file, or one of another dataset."""
     try:
-        with safe_open(path, framework="numpy") as file:
-            facts = json.loads((file.metadata() or {})[HEADER])
-            return unpack_model({key: file.get_tensor(key) for key in file.keys()}, facts)  # noqa: SIM118
-    except (SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
+        tensors, facts = read_tensors(path)
+        if dataset is not None and facts.get("dataset") not in (None, dataset):
+            raise ValueError("it is of another dataset")
+        return unpack_model(tensors, facts)
+    except (FileNotFoundError, KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(
             f"{path} is no statistical model of mereo ({error}); delete it and run `mereo generate ... --resume`"
         ) from None

@@ -25,10 +25,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from mereo.io.atomic_files import atomic_file
+from mereo.io.checked_tensors import pack_tensors
 from mereo.io.output_folders import claim_directory
 from mereo.io.scratch_folders import check_place
 from mereo.scenes.random_states import scene_model, states_for
@@ -36,8 +35,9 @@ from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.rest_pose import rest_distances
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.scenes.statistical_model_file import save_statistical_model
+from mereo.scenes.statistical_model_file import load_statistical_model, save_statistical_model
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
+from mereo.synthesis.dataset_files import check_space, dataset_key, read_shard, read_template
 from mereo.synthesis.depth_sensor import check_sensor
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.progress import progress
@@ -60,6 +60,7 @@ class _Work:
     scene: str | Scene
     settings: GenerateConfig
     seed: int
+    dataset: str
 
 
 @dataclass(frozen=True)
@@ -70,18 +71,9 @@ class _Shard:
     first: int
     end: int
 
-    def is_complete(self) -> bool:
-        """Whether the file is there with all its examples; a file cut off by a crashed machine is reported."""
-        try:
-            with safe_open(self.path, framework="numpy") as file:
-                if file.get_slice("labels").get_shape()[0] == self.end - self.first:
-                    return True
-        except FileNotFoundError:
-            return False
-        except (SafetensorError, OSError):
-            pass
-        print(f"{self.path.name} is damaged and is made again", flush=True)
-        return False
+    def is_complete(self, dataset: str) -> bool:
+        """Whether the file is there with all its examples, and those of this dataset."""
+        return _is_whole(self.path, lambda path: read_shard(path, dataset, self.first, self.end))
 
 
 def generate(
@@ -122,22 +114,24 @@ def generate(
     check_sensor(settings.sensor)
     loaded = load_scene(scene) if isinstance(scene, str) else scene
     manifest = make_manifest(loaded, settings, examples, seed)
+    check_space(output, examples, manifest["bytes"] // examples, shard[1])
     shards = [
         _Shard(output / f"shard-{n:05d}.safetensors", n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
         for n in range(shard[0], -(-examples // SHARD_SIZE), shard[1])
     ]
-    _claim(output, manifest, shards, resume, alone=shard[1] == 1)
-    if not (output / TEMPLATE).exists():
+    key = dataset_key(_claim(output, manifest, shards, resume, alone=shard[1] == 1))
+    if not _is_whole(output / TEMPLATE, lambda path: read_template(path, key, len(loaded.rest.segments))):
         with atomic_file(output / TEMPLATE) as temporary:
-            temporary.write_bytes(save({"distance": rest_distances(loaded.rest)}))
-    if not test and not (output / STATISTICAL_MODEL).exists():  # nothing is trained on a test set
+            temporary.write_bytes(pack_tensors({"distance": rest_distances(loaded.rest)}, {"dataset": key}))
+    # nothing is trained on a test set
+    if not test and not _is_whole(output / STATISTICAL_MODEL, lambda path: load_statistical_model(path, key)):
         states = states_for(examples)
         print(f"modes of {states} random states, for registration", flush=True)
-        save_statistical_model(scene_model(loaded, states), output / STATISTICAL_MODEL)
-    missing = [item for item in shards if not item.is_complete()]
+        save_statistical_model(scene_model(loaded, states), output / STATISTICAL_MODEL, key)
+    missing = [item for item in shards if not item.is_complete(key)]
     total = sum(item.end - item.first for item in missing)
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile
-    work = partial(_make_shard, _Work(loaded if is_yaml(scene) else scene, settings, seed))
+    work = partial(_make_shard, _Work(loaded if is_yaml(scene) else scene, settings, seed, key))
     with closing(in_processes(work, missing, workers)) as made, progress(total) as advance:
         for item, data in made:
             with atomic_file(item.path) as temporary:
@@ -202,13 +196,17 @@ def example_bytes(settings: GenerateConfig, segments: int) -> int:
     return per_point * settings.points + per_query * settings.sampling.total(segments) + once
 
 
-def _claim(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> None:
-    """Create the directory with its manifest, or check that it is this very dataset; others may write shards there."""
+def _claim(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> dict[str, Any]:
+    """Create the directory with its manifest, or check that it is this very dataset; others may write shards there.
+
+    Returns the manifest that it holds.
+    """
     before = claim_directory(output, MANIFEST, manifest, "a dataset")
     if before is not None:
         if not resume and (alone or any(item.path.exists() for item in shards)):
             raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
         _check_same(output, before, manifest)
+    return manifest if before is None else before
 
 
 def _check_same(output: Path, before: dict[str, Any], manifest: dict[str, Any]) -> None:
@@ -231,6 +229,18 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def _is_whole(path: Path, read: Callable[[Path], object]) -> bool:
+    """Whether a file is there and can be read; one that a crash cut off or that was changed since is reported."""
+    if not path.exists():
+        return False
+    try:
+        read(path)
+    except ValueError:
+        print(f"{path.name} is damaged and is made again", flush=True)
+        return False
+    return True
+
+
 # --- the work ---------------------------------------------------------------------------------------------------------
 
 
@@ -243,7 +253,8 @@ def _make_shard(work: _Work, shard: _Shard, cancelled: Callable[[], bool]) -> by
         if cancelled():
             return b""
         rows.append(pack(synthesize(scene, work.settings, example_rng(work.seed, index)), work.settings.points))
-    return save({key: np.stack([row[key] for row in rows]) for key in rows[0]})
+    tensors = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+    return pack_tensors(tensors, {"dataset": work.dataset, "first": shard.first})
 
 
 def pack(example: Example, points: int) -> dict[str, np.ndarray]:

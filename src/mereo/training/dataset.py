@@ -4,20 +4,21 @@ Notation: e examples, b of them in a batch, p stored points, n points that the n
 """
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int, UInt8
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.scenes.statistical_model_file import load_statistical_model
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE
+from mereo.synthesis.dataset_files import dataset_key, read_shard, read_template
 from mereo.training.config import AugmentConfig
 
 
@@ -72,8 +73,9 @@ class Dataset:
     def load(cls, directory: Path, device: torch.device | str = "cpu") -> "Dataset":
         """Dataset of a directory; ``ValueError`` or ``FileNotFoundError`` when that is not a whole dataset."""
         manifest = read_manifest(directory)
+        key = dataset_key(manifest)
         shards = sorted(directory.glob("shard-*.safetensors"))
-        parts = [_read_shard(path) for path in shards]
+        parts = [_read_part(path, key, manifest.get("shard_size")) for path in shards]
         have = sum(len(part["cloud"]) for part in parts)
         if have != manifest["examples"]:
             raise ValueError(
@@ -82,18 +84,18 @@ class Dataset:
             )
         queries = ("positions", "labels", "distances", "directions", "rest")
         joined = {}
-        for key in ("cloud", "cloud_count", "center", "scale", *queries):
-            joined[key] = torch.cat([part.pop(key) for part in parts]).to(device)
+        for name in ("cloud", "cloud_count", "center", "scale", *queries):
+            joined[name] = torch.cat([part.pop(name) for part in parts]).to(device)
         viewpoint = (-joined["center"] * joined["scale"][:, None]).float()
         return cls(
             cloud=joined["cloud"],
             count=joined["cloud_count"].long(),
             viewpoint=viewpoint,
-            **{key: joined[key] for key in queries},
+            **{name: joined[name] for name in queries},
             manifest=manifest,
-            template=_read_template(directory),
+            template=_read_template(directory / TEMPLATE, key, len(manifest["segments"])),
             visible_m=_visible_m(joined["scale"], manifest.get("unit_m")),
-            statistical_model=_read_statistical_model(directory),
+            statistical_model=_read_statistical_model(directory / STATISTICAL_MODEL, key),
         )
 
     @property
@@ -155,16 +157,27 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{directory} has no manifest.json; a dataset is a directory made by mereo generate")
     try:
-        manifest: dict[str, Any] = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
+        manifest = json.loads(path.read_text("utf-8"))
+    except ValueError as error:
         raise ValueError(f"{path} is not valid JSON ({error}); generate the dataset again") from None
+    if not isinstance(manifest, dict) or not {"scene", "segments", "settings", "seed", "examples"} <= manifest.keys():
+        raise ValueError(f"{path} is not the manifest of a dataset; generate the dataset again")
     return manifest
 
 
-def _read_shard(path: Path) -> dict[str, Tensor]:
+def _read_part(path: Path, key: str, size: int | None) -> dict[str, Tensor]:
+    """Tensors of the shard that ``path`` names; ``size`` is the number of examples of a whole one, if known."""
+    number = path.stem.partition("-")[2]
+    first = int(number) * size if size is not None and number.isdecimal() else None
+    with _part_of_dataset(path):
+        return {name: torch.from_numpy(value) for name, value in read_shard(path, key, first).items()}
+
+
+@contextmanager
+def _part_of_dataset(path: Path) -> Iterator[None]:
     try:
-        return load_file(path)
-    except (SafetensorError, OSError) as error:
+        yield
+    except ValueError as error:
         raise ValueError(f"{path} cannot be read ({error}); delete it and run mereo generate ... --resume") from None
 
 
@@ -173,14 +186,15 @@ def _visible_m(scale: Float[Tensor, " e"], unit_m: float | None) -> tuple[float,
     return None if unit_m is None else (2 * unit_m / float(scale.max()), 2 * unit_m / float(scale.min()))
 
 
-def _read_statistical_model(directory: Path) -> StatisticalModel | None:
-    path = directory / STATISTICAL_MODEL
-    return load_statistical_model(path) if path.exists() else None
+def _read_statistical_model(path: Path, key: str) -> StatisticalModel | None:
+    return load_statistical_model(path, key) if path.exists() else None
 
 
-def _read_template(directory: Path) -> Tensor | None:
-    path = directory / TEMPLATE
-    return _read_shard(path)["distance"].float() if path.is_file() else None
+def _read_template(path: Path, key: str, segments: int) -> Tensor | None:
+    if not path.is_file():
+        return None
+    with _part_of_dataset(path):
+        return torch.from_numpy(read_template(path, key, segments)).float()
 
 
 def choose_points(

@@ -1,0 +1,94 @@
+"""Checks of what headers of mesh files state, before trimesh reads them.
+
+trimesh takes memory for glTF accessors without data, unpacks any zip, and leaves out the faces that a text file was cut
+short of. Each check raises ``ValueError`` with its reason only, or ``SizeError``.
+"""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mereo.io.point_cloud_formats import check_ply
+from mereo.io.size_limits import check_archive, check_bytes, check_count
+
+COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+"""Bytes of each of glTF's component types."""
+
+COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+"""Components of each of glTF's element types."""
+
+
+def check_mesh(path: Path) -> None:
+    """Check the header of a mesh file in one of the formats that have counts."""
+    check = CHECKS.get(path.suffix.lower())
+    if check is not None:
+        check(path)
+
+
+def _check_off(path: Path) -> None:
+    lines = (line.partition("#")[0].strip() for line in path.read_text("utf-8", errors="replace").splitlines())
+    rows = [line for line in lines if line]
+    keyword = re.match(r"[A-Za-z0-9]*OFF\b", rows[0]) if rows else None
+    if keyword is None:
+        raise ValueError("it has no OFF header")
+    rest = rows[0][keyword.end() :].split()
+    counts, body = (rest, rows[1:]) if rest else (rows[1].split(), rows[2:])
+    vertices, faces = int(counts[0]), int(counts[1])
+    check_count(vertices, len(body), "vertices")
+    check_count(faces, len(body) - vertices, "faces")
+
+
+def _check_stl(path: Path) -> None:
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        start = file.read(84)
+        file.seek(max(0, size - 1024))
+        end = file.read().strip().splitlines()[-1:]
+    count = int.from_bytes(start[80:84], "little")
+    if size == 84 + 50 * count:
+        return
+    if not start.lstrip().lower().startswith(b"solid"):
+        raise ValueError(f"its header states {count} triangles, and its {size} bytes hold {max(size - 84, 0) / 50:g}")
+    if not end or not end[0].strip().lower().startswith(b"endsolid"):
+        raise ValueError("it is truncated: it does not end in endsolid")
+
+
+def _check_gltf(path: Path) -> None:
+    if path.suffix.lower() == ".gltf":
+        document = json.loads(path.read_text("utf-8"))
+    else:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(20)[12:16], "little")
+            document = json.loads(file.read(min(length, path.stat().st_size)))
+    views = document.get("bufferViews", [])
+    for view in views:
+        room = document["buffers"][view["buffer"]]["byteLength"] - view.get("byteOffset", 0)
+        check_count(view["byteLength"], room, "bytes")
+    for accessor in document.get("accessors", []):
+        _check_accessor(path, accessor, views)
+
+
+def _check_accessor(path: Path, accessor: dict[str, Any], views: list[dict[str, Any]]) -> None:
+    """Compare an accessor's count with its view; one without any is all zeros, or compressed elsewhere."""
+    count, item = accessor["count"], COMPONENT_BYTES[accessor["componentType"]] * COMPONENTS[accessor["type"]]
+    check_count(count, max(count, 0), "elements")
+    if "bufferView" not in accessor:
+        check_bytes(path, 8 * COMPONENTS[accessor["type"]] * count)
+        return
+    view = views[accessor["bufferView"]]
+    stride = view.get("byteStride", item)
+    room = view["byteLength"] - accessor.get("byteOffset", 0)
+    check_count(count, max(0, (room - item) // stride + 1), "elements")
+
+
+CHECKS: dict[str, Callable[[Path], None]] = {
+    ".ply": check_ply,
+    ".off": _check_off,
+    ".stl": _check_stl,
+    ".glb": _check_gltf,
+    ".gltf": _check_gltf,
+    ".3mf": check_archive,
+}
+"""Check of each suffix; OBJ has no counts."""
