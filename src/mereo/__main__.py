@@ -14,6 +14,7 @@ import tyro
 from tyro.conf import subcommand
 
 from mereo.cli import commands, scene_commands, tool_commands
+from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
@@ -23,8 +24,8 @@ Choice = TypeVar("Choice")
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 """Environment variable that shows where an error comes from."""
 
-USER_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
-"""Exit codes; the last two are 128 plus the signal's number, as shells report them."""
+USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
+"""Exit codes; 70 is EX_SOFTWARE of sysexits.h, the last two are 128 plus the signal's number, as shells report them."""
 
 
 @runtime_checkable
@@ -54,10 +55,12 @@ def main(arguments: list[str] | None = None) -> int:
         # the reader (head, less) has gone; without this, flushing at exit would complain again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
-    except (ValueError, OSError, ImportError) as error:
+    except Exception as error:
         if os.environ.get(TRACEBACK_VARIABLE) == "1":
             raise
-        return _stop(f"mereo: error: {one_line(error)}", USER_ERROR)
+        if is_foreseen(error):
+            return _stop(f"mereo: error: {one_line(error)}", USER_ERROR)
+        return _stop(f"mereo: error: {sentence(error, arguments, TRACEBACK_VARIABLE)}", FAULT)
     return 0
 
 
