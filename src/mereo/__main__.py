@@ -1,11 +1,12 @@
 """``mereo`` and ``python -m mereo``: run one command, and answer what a user can cause with one line."""
 
 import importlib.metadata
+import io
 import os
 import sys
 import warnings
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import redirect_stderr, suppress
 from dataclasses import field, make_dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
@@ -16,6 +17,7 @@ from tyro.conf import subcommand
 from mereo.cli import commands, scene_commands, tool_commands
 from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.stop_signals import Stopped, stop_signals
+from mereo.io.bounds import check_bounds
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
@@ -93,7 +95,28 @@ def _stop(message: str, code: int) -> int:
 
 
 def parse(arguments: list[str]) -> Command:
-    """Command that these arguments mean; exits with 2 after a message when they mean none."""
+    """Command that these arguments mean; exits with 2 after a message when they mean none.
+
+    Raises ``ValueError`` for settings that are refused, such as a number out of its bounds.
+    """
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            command = _read(arguments)
+    except SystemExit as end:
+        refused = end.__context__
+        while refused is not None and not (isinstance(refused, ValueError) and is_foreseen(refused)):
+            refused = refused.__context__
+        if refused is not None:  # tyro frames the sentence of our own settings; it is enough by itself
+            raise refused from None
+        print(said.getvalue(), end="", file=sys.stderr)
+        raise
+    check_bounds(command, "--")
+    return command
+
+
+def _read(arguments: list[str]) -> Command:
+    """Command that tyro makes of these arguments, which exits where it cannot."""
     command: Command = tyro.cli(
         _syntax(_chosen(arguments, "--preset", PRESETS, "base"), _chosen(arguments, "--sensor", SENSORS, "paper")),
         args=arguments or ["--help"],
