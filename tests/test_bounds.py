@@ -93,6 +93,10 @@ def test_an_option_out_of_its_bounds_is_refused_before_anything_is_read_or_writt
     assert not list(tmp_path.iterdir())
 
 
+def test_a_whole_number_may_be_larger_than_any_float() -> None:
+    check_values(TrainConfig, {"batch": 10**400})
+
+
 def test_the_help_shows_bounds(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         command_line.main(["bench", "--help"])

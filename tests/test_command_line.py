@@ -1,6 +1,5 @@
 """The command line as a user meets it: help at once, one line for every error, the exit codes of a good citizen."""
 
-import json
 import os
 import signal
 import subprocess
@@ -216,40 +215,6 @@ def test_each_kind_of_error(
     assert printed.out == ""
     assert printed.err.startswith(f"mereo: error: {line}")
     assert printed.err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("error", "end"),
-    [
-        (TypeError("a\nbug"), "TypeError: a bug; this is a fault of mereo: run it again with MEREO_TRACEBACK=1, and "),
-        (KeyError(), "KeyError; this is a fault of mereo"),
-        (MemoryError(), "MemoryError; the memory does not suffice: ask for less"),
-        (RuntimeError("CUDA out of memory. " + 99 * "Tried. "), "...; the memory does not suffice: ask for less"),
-        (RecursionError("too deep"), "RecursionError: too deep; something is nested too deeply, or in itself: look"),
-    ],
-)
-def test_whatever_else_happens_is_one_line_that_names_command_and_files(
-    error: Exception, end: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)
-    monkeypatch.setattr(command_line, "parse", lambda arguments: raising(error))
-    assert command_line.main(["scene", "check", "cube", "--output", str(tmp_path), "\0"]) == command_line.FAULT == 70
-    printed = capsys.readouterr().err
-    assert printed.startswith(f"mereo: error: mereo scene check on {tmp_path}: {type(error).__name__}")
-    assert end in printed and printed.count("\n") == 1
-    monkeypatch.setenv(command_line.TRACEBACK_VARIABLE, "1")
-    with pytest.raises(type(error)):
-        command_line.main([])
-
-
-def test_what_a_library_says_of_its_arguments_is_no_sentence_for_users(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """``json`` names neither the file nor a cure, and a ``ValueError`` of its own is a ``ValueError``."""
-    monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)
-    monkeypatch.setattr(command_line, "parse", lambda _: SimpleNamespace(run=lambda: json.loads("{")))
-    assert command_line.main(["align", __file__]) == command_line.FAULT
-    assert f"mereo align on {__file__}: JSONDecodeError: Expecting" in capsys.readouterr().err
 
 
 def test_traceback_on_request() -> None:

@@ -47,7 +47,8 @@ def sentence(error: Exception, arguments: list[str], variable: str) -> str:
         return f"{where}; the memory does not suffice: ask for less (resolution, points, batch, workers) or free some"
     if isinstance(error, RecursionError):
         return f"{where}; something is nested too deeply, or in itself: look into the files that are named"
-    return f"{where}; this is a fault of mereo: run it again with {variable}=1, and report the text that it prints"
+    whose = "mereo, or of the Python file" if any(word.endswith(".py") for word in arguments) else "mereo"
+    return f"{where}; this is a fault of {whose}: run it again with {variable}=1, and report the text that it prints"
 
 
 def _command(arguments: list[str]) -> str:

@@ -41,7 +41,7 @@ class Bounds:
 
     def holds(self, value: float) -> bool:
         """Whether a number lies in the interval."""
-        inside = self.least <= value <= self.most and math.isfinite(value)
+        inside = self.least <= value <= self.most and abs(value) < math.inf
         return inside and not (self.above and value == self.least) and not (self.below and value == self.most)
 
 
@@ -98,7 +98,7 @@ def _kinds(settings: type) -> dict[str, Any]:
     return get_type_hints(settings, include_extras=True)
 
 
-def _broken_rule(kind: Any, value: object) -> str | None:
+def _broken_rule(kind: Any, value: Any) -> str | None:
     """Rule that a value breaks; None where it breaks none, or its kind has none."""
     if get_origin(kind) is Literal:
         return None if value in get_args(kind) else f"one of {', '.join(map(str, get_args(kind)))}"
@@ -113,10 +113,13 @@ def _broken_rule(kind: Any, value: object) -> str | None:
     many = get_origin(plain) is tuple
     whole = plain is int or int in get_args(plain)
     values = value if many and isinstance(value, tuple) else (value,) if not many else ()
-    number = Integral if whole else Real
-    if values and all(isinstance(v, number) and not isinstance(v, bool) and bounds.holds(v) for v in values):
+    if values and all(_is_number(v, Integral if whole else Real) and bounds.holds(v) for v in values):
         return None
     return f"{'whole numbers, each ' if many and whole else 'a whole number, ' if whole else ''}{bounds.rule}"
+
+
+def _is_number(value: object, kind: type) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def _text(value: object) -> str:

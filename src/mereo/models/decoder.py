@@ -63,7 +63,8 @@ class FrequencyEncoding(nn.Module):
 
     def __init__(self, lowest: int, highest: int) -> None:
         super().__init__()
-        frequency = torch.pi * 2.0 ** torch.arange(lowest, highest + 1)
+        # from Python numbers: arithmetic on the device "meta", where weights are described, loads much of torch
+        frequency = torch.tensor([torch.pi * 2.0**exponent for exponent in range(lowest, highest + 1)])
         self.frequency: Tensor
         self.register_buffer("frequency", frequency, persistent=False)
         self.channels = 6 * len(frequency)
