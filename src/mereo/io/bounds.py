@@ -14,6 +14,8 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from tyro.conf import arg
 
+from mereo.geometry.conventions import MIN_POINTS
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -54,10 +56,13 @@ _COUNT, _COUNT_OR_NONE = Bounds(1), Bounds(0)
 _POSITIVE, _NOT_NEGATIVE = Bounds(0, above=True), Bounds(0)
 _PROBABILITY, _BELOW_ONE, _SHARE = Bounds(0, 1), Bounds(0, 1, below=True), Bounds(0, 1, above=True)
 _EXPONENT, _DEPTH, _CELLS, _PORT = Bounds(-30, 30), Bounds(1, 1000), Bounds(4, 4096), Bounds(0, 65535)
+_POINTS, _IMAGE = Bounds(MIN_POINTS), Bounds(8, 8192)
 _SEED = Bounds(0, 2**63, below=True)  # what torch takes
 
 Count = Annotated[int, _COUNT, _shown(_COUNT)]
 CountOrNone = Annotated[int, _COUNT_OR_NONE, _shown(_COUNT_OR_NONE)]
+Points = Annotated[int, _POINTS, _shown(_POINTS)]
+ImageSize = Annotated[int, _IMAGE, _shown(_IMAGE)]
 Counts = Annotated[tuple[int, ...], _COUNT, _shown(_COUNT)]
 Positive = Annotated[float, _POSITIVE, _shown(_POSITIVE)]
 PositiveOrUnknown = Annotated[float | None, _POSITIVE, _shown(_POSITIVE)]

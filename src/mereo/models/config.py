@@ -19,6 +19,7 @@ from mereo.io.bounds import (
     Depth,
     Exponent,
     NotNegative,
+    Points,
     Positive,
     Share,
     check_bounds,
@@ -33,6 +34,9 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
 """Terms by which networks are trained, as options and weights name them."""
+
+HEADS = 4
+"""Number of heads of the attention to local features."""
 
 MOST_ORDERED = 16384
 """Number of points of one cloud that a program of the GPU can keep: 16 in each of 1024 threads."""
@@ -193,6 +197,11 @@ class AdditionsConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self, "network.")
+        if self.local_width % HEADS:
+            raise ValueError(
+                f"network.local_width is {self.local_width}; it must be a multiple of its {HEADS} heads: "
+                "give for example 128"
+            )
 
 
 PARTS: dict[str, type[Any]] = {
@@ -223,7 +232,7 @@ class NetworkConfig:
     """
 
     encoder: Encoder = "pointnet2"
-    points: Count = 1024
+    points: Points = 1024
     # empty names keep the options --network.width, --network.mlp1 and so on, without those of the parts
     pointnet2: Annotated[PointNet2Config, arg(name="")] = field(default_factory=PointNet2Config)
     transformer: Annotated[PointTransformerConfig, arg(name="")] = field(default_factory=PointTransformerConfig)

@@ -153,7 +153,7 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
         names=header.names,
         colors=header.colors,
         loss=header.loss,
-        provenance=header.provenance.model_dump(exclude_unset=True),
+        provenance=header.provenance,
         domain=header.domain,
         nested=header.nested,
         statistical_model=_unpacked(path, states, header) if states else None,

@@ -3,10 +3,10 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 from torch import Tensor
 
 from mereo.models.config import Loss, NetworkConfig
@@ -17,6 +17,8 @@ FORMAT_VERSION = 3
 
 CURE = "the file is damaged or was changed: take it anew, or train again"
 
+Checked = TypeVar("Checked", bound=BaseModel)
+
 Name = Annotated[str, Field(min_length=1)]
 Byte = Annotated[int, Field(ge=0, le=255)]
 Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
@@ -24,8 +26,6 @@ Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 class Provenance(BaseModel):
     """What programs read of a training's provenance; the rest is for people."""
-
-    model_config = ConfigDict(extra="allow")
 
     scene: str | None = None
     source: str | None = None
@@ -47,7 +47,7 @@ class Header(BaseModel):
     names: Annotated[tuple[Name, ...], Field(min_length=1, max_length=255)]
     colors: tuple[tuple[Byte, Byte, Byte], ...]
     loss: Loss
-    provenance: Provenance
+    provenance: dict[str, Any]
     domain: tuple[Corner, Corner] | None
     nested: tuple[tuple[Name, Name], ...] = ()
     states: dict[str, Any] | None = None
@@ -67,12 +67,8 @@ def read_header(path: Path, metadata: Mapping[str, str]) -> Header:
             f"{path} has weights format {version}; this mereo reads formats up to {FORMAT_VERSION}: "
             "train again, or install the matching version"
         )
-    try:
-        header = Header.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ValueError(f"{path} has a header with a wrong {place!r} ({first['msg']}); {CURE}") from None
+    header = _checked(path, Header, content)
+    _checked(path, Provenance, header.provenance, "provenance")
     strangers = {name for pair in header.nested for name in pair} - set(header.names)
     if len(header.colors) != len(header.names) or len(set(header.names)) != len(header.names) or strangers:
         raise ValueError(
@@ -80,6 +76,16 @@ def read_header(path: Path, metadata: Mapping[str, str]) -> Header:
             f"segments disagree; {CURE}"
         )
     return header
+
+
+def _checked(path: Path, model: type[Checked], content: Any, *within: str) -> Checked:
+    """Content as this model; ``ValueError`` names what is wrong in it first."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, (*within, *first["loc"])))
+        raise ValueError(f"{path} has a header with a wrong {place!r} ({first['msg']}); {CURE}") from None
 
 
 def read_config(path: Path, header: Header) -> NetworkConfig:

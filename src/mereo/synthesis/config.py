@@ -8,7 +8,7 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes
 
-from mereo.io.bounds import Count, NotNegative, Positive, Probability, check_bounds
+from mereo.io.bounds import Count, ImageSize, NotNegative, Points, Positive, Probability, check_bounds
 
 SensorModel = Literal["structured-light", "time-of-flight"]
 
@@ -151,9 +151,9 @@ class GenerateConfig:
         sensor: what else is wrong with the depth image; nothing in the paper.
     """
 
-    image_size: Count = 96
+    image_size: ImageSize = 96
     noise_std: NotNegative = 0.1
-    points: Count = 1024
+    points: Points = 1024
     # the marker keeps --sampler short on the command line, where --sensor.axial keeps its prefix
     sampling: OmitArgPrefixes[SamplingConfig] = field(default_factory=SamplingConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)

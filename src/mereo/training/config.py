@@ -100,6 +100,10 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
+        if self.batch * self.queries == 1:
+            raise ValueError(
+                "batch and queries are both 1; batch normalization needs several values at a time: give more of either"
+            )
 
     @property
     def supervision(self) -> Supervision:
