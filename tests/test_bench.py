@@ -101,8 +101,6 @@ def test_the_table_names_ratio_and_floor() -> None:
 
 
 def test_bad_options_are_refused() -> None:
-    with pytest.raises(ValueError, match="0 repeats are asked for"):
-        tool_commands.BenchCommand(repeats=0).run()
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match="torch sees no CUDA device"):
             tool_commands.BenchCommand(device="cuda").run()

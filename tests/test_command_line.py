@@ -217,12 +217,6 @@ def test_each_kind_of_error(
     assert printed.err.count("\n") == 1
 
 
-def test_a_mistake_in_the_program_is_not_dressed_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command_line, "parse", lambda arguments: raising(TypeError("a bug")))
-    with pytest.raises(TypeError, match="a bug"):
-        command_line.main([])
-
-
 def test_traceback_on_request() -> None:
     result = mereo("assets", "get", "nothing", MEREO_TRACEBACK="1")
     assert result.returncode == 1

@@ -13,7 +13,7 @@ from mereo.training.config import PRESETS, TrainConfig
 
 OTHERS: dict[type, Any] = {
     bool: lambda value: not value,
-    int: lambda value: value + 1,
+    int: lambda value: value + 4,
     float: lambda value: value + 0.25,
 }
 

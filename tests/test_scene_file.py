@@ -1,6 +1,7 @@
 """Scenes of a user's own, from YAML and from Python: what the file says is what the scene is, and errors name lines."""
 
 import pickle
+import time
 from pathlib import Path
 from typing import get_args
 
@@ -180,6 +181,30 @@ def test_errors_name_file_line_value_rule_and_cure(
     assert text.startswith(f"{path}:{line}: ")
     assert all(part in text for part in parts), text
     assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("deformations: &d [*d]\n", ":9: this value contains itself by an alias; it must end: spell it out"),
+        ("a: &a {<<: *a}\n", ":9: this value contains itself"),
+        (
+            "a0: &a0 [1,1,1,1,1,1,1,1,1]\n"
+            + "".join(f"a{i}: &a{i} [{','.join(9 * [f'*a{i - 1}'])}]\n" for i in range(1, 30)),
+            "values; at most 100000 can be read: use fewer aliases",
+        ),
+        ("deformations: " + "[" * 3000 + "]" * 3000, "is nested too deeply"),
+        ("deformations: " + "[" * 90 + "]" * 90, "...; it must be a block of keys"),
+        ("source: 2001-99-99\n", "has a value that YAML cannot read (month must be in 1..12): put it in quotes"),
+        ("size: !!bool 3\n", "has a value that YAML cannot read ('3'): put it in quotes"),
+    ],
+)
+def test_documents_without_an_end_are_refused_at_once(text: str, message: str, tmp_path: Path) -> None:
+    start = time.process_time()
+    with pytest.raises(ValueError) as caught:
+        load_scene(write_bar(tmp_path, text))
+    assert str(caught.value).startswith(str(tmp_path)) and message in str(caught.value)
+    assert time.process_time() - start < 5 and len(str(caught.value)) < 500
 
 
 @pytest.mark.parametrize("text", ["", "just words", "- a\n- b\n", "\x00", "a: [1"])

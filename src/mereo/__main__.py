@@ -1,11 +1,12 @@
 """``mereo`` and ``python -m mereo``: run one command, and answer what a user can cause with one line."""
 
 import importlib.metadata
+import io
 import os
 import sys
 import warnings
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import redirect_stderr, suppress
 from dataclasses import field, make_dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
@@ -14,7 +15,9 @@ import tyro
 from tyro.conf import subcommand
 
 from mereo.cli import commands, scene_commands, tool_commands
+from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.stop_signals import Stopped, stop_signals
+from mereo.io.bounds import check_bounds
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
@@ -23,8 +26,8 @@ Choice = TypeVar("Choice")
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 """Environment variable that shows where an error comes from."""
 
-USER_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
-"""Exit codes; the last two are 128 plus the signal's number, as shells report them."""
+USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
+"""Exit codes; 70 is EX_SOFTWARE of sysexits.h, the last two are 128 plus the signal's number, as shells report them."""
 
 
 @runtime_checkable
@@ -54,10 +57,12 @@ def main(arguments: list[str] | None = None) -> int:
         # the reader (head, less) has gone; without this, flushing at exit would complain again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
-    except (ValueError, OSError, ImportError) as error:
+    except Exception as error:
         if os.environ.get(TRACEBACK_VARIABLE) == "1":
             raise
-        return _stop(f"mereo: error: {one_line(error)}", USER_ERROR)
+        if is_foreseen(error):
+            return _stop(f"mereo: error: {one_line(error)}", USER_ERROR)
+        return _stop(f"mereo: error: {sentence(error, arguments, TRACEBACK_VARIABLE)}", FAULT)
     return 0
 
 
@@ -90,7 +95,28 @@ def _stop(message: str, code: int) -> int:
 
 
 def parse(arguments: list[str]) -> Command:
-    """Command that these arguments mean; exits with 2 after a message when they mean none."""
+    """Command that these arguments mean; exits with 2 after a message when they mean none.
+
+    Raises ``ValueError`` for settings that are refused, such as a number out of its bounds.
+    """
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            command = _read(arguments)
+    except SystemExit as end:
+        refused = end.__context__
+        while refused is not None and not (isinstance(refused, ValueError) and is_foreseen(refused)):
+            refused = refused.__context__
+        if refused is not None:  # tyro frames the sentence of our own settings; it is enough by itself
+            raise refused from None
+        print(said.getvalue(), end="", file=sys.stderr)
+        raise
+    check_bounds(command, "--")
+    return command
+
+
+def _read(arguments: list[str]) -> Command:
+    """Command that tyro makes of these arguments, which exits where it cannot."""
     command: Command = tyro.cli(
         _syntax(_chosen(arguments, "--preset", PRESETS, "base"), _chosen(arguments, "--sensor", SENSORS, "paper")),
         args=arguments or ["--help"],

@@ -111,7 +111,7 @@ def print_placement(placement: Placement, title: str, unit: str) -> None:
         by = one.placed_by if one.seen else f"unseen: {one.placed_by}"
         held = str(one.held) if one.held else ""
         table.add_row(one.name, by, str(one.points), *fit, f"{mm * one.shift:.2f}", f"{one.turn_deg:.1f}", held)
-    console = Console()
+    console = Console(markup=False, emoji=False)
     console.print(table)
     console.print(
         f"{placement.explained:.1%} of the scan lies within {mm * placement.limit:.3g} mm of the placed segments",

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from mereo.fitting.config import FitChoice
+from mereo.io.bounds import Cells, Count, CountOrNone, NotNegative
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -95,10 +96,10 @@ class Generate:
     """
 
     scene: Positional[str]
-    examples: int
+    examples: Count
     output: Path
-    seed: int = 0
-    workers: int = 0
+    seed: CountOrNone = 0
+    workers: CountOrNone = 0
     shard: str = "0/1"
     resume: bool = False
     test: bool = False
@@ -169,12 +170,12 @@ class Evaluate:
 
     weights: Positional[str]
     output: Path
-    examples: int = 128
-    seed: int = 1_000_000
+    examples: Count = 128
+    seed: CountOrNone = 1_000_000
     scene: str | None = None
     scans: tuple[Path, ...] | None = None
     sensor: Sensor = "paper"
-    noise_std: float = 0.1
+    noise_std: NotNegative = 0.1
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
     fit: FitChoice = "auto"
@@ -231,7 +232,7 @@ class Reconstruct:
     input: Positional[Path]
     weights: str
     output: Path
-    resolution: int = 128
+    resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)

@@ -87,7 +87,7 @@ class Column:
 def main(output: str | Path = Path("out/demo")) -> None:
     """Reconstruct every input that can be had, print tables, and write a folder each below ``output``."""
     check_place(Path(output), may_be_link=True)
-    console, started = Console(), time.perf_counter()
+    console, started = Console(markup=False, emoji=False), time.perf_counter()
     for make in _inputs():
         try:
             case = make()
@@ -97,7 +97,7 @@ def main(output: str | Path = Path("out/demo")) -> None:
         check_new_directory(Path(output) / case.name, force=True)
         _show(case, load_model(case.weights), Path(output) / case.name, console)
     console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
-    console.print(OWN_OBJECT, highlight=False, soft_wrap=True)
+    console.print(OWN_OBJECT, markup=True, highlight=False, soft_wrap=True)
 
 
 def _inputs() -> Iterator[Callable[[], Case]]:

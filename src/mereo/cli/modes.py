@@ -33,7 +33,7 @@ def show_modes(scene: str, output: Path | None, states: int) -> None:
     if output is not None and output.suffix.lower() != ".png":
         raise ValueError(f"{output} has the suffix {output.suffix!r}; the picture is a PNG file: rename it")
     name, model = _model_of(scene, states)
-    console = Console()
+    console = Console(markup=False, emoji=False)
     console.print(_table(name, model))
     console.print(_needed(model), highlight=False, soft_wrap=True)
     if output is not None:

@@ -154,7 +154,7 @@ def print_segments(result: Reconstruction, title: str) -> None:
         place = " ".join(f"{value:.4g}" for value in found.centroid)
         row = (f"{found.volume:.4g}", f"{found.confidence:.2f}", str(found.components), place)
         table.add_row(found.name, *(row if found.voxels else ("0", "not found", "0", "")))
-    console = Console()
+    console = Console(markup=False, emoji=False)
     console.print(table)
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in result.timings_s.items())
     console.print(f"seconds: {stages}", highlight=False, soft_wrap=True)

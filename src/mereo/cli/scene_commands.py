@@ -9,6 +9,8 @@ from typing import Literal
 
 from tyro.conf import Positional
 
+from mereo.io.bounds import Count, CountOrNone
+
 
 @dataclass(frozen=True)
 class SceneList:
@@ -80,7 +82,7 @@ class ScenePreview:
     output: Path
     scene: Positional[str] = ""
     all: bool = False
-    seed: int = 0
+    seed: CountOrNone = 0
 
     def run(self) -> None:
         """Write the picture of random states."""
@@ -112,7 +114,7 @@ class SceneModes:
 
     scene: Positional[str]
     output: Path | None = None
-    states: int = 1500
+    states: Count = 1500
 
     def run(self) -> None:
         """Print how many modes are needed, and write the picture."""

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
+from mereo.io.bounds import Cells, Count, CountOrNone, Port, Positive, PositiveOrUnknown
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig, Precision
 from mereo.reconstruction.config import IsolationConfig
@@ -43,7 +44,7 @@ class Align:
     start: Path | None = None
     weights: str | None = None
     unit: Literal["m", "cm", "mm", "in"] = "m"
-    scene_unit_mm: float | None = None
+    scene_unit_mm: PositiveOrUnknown = None
     frame: Literal["camera", "scanner"] = "camera"
     as_one: bool = False
     hold: tuple[str, ...] = ()
@@ -89,8 +90,8 @@ class ViewCommand:
     weights: str | None = None
     scene: str | None = None
     state: Path | None = None
-    port: int = 8080
-    resolution: int = 128
+    port: Port = 8080
+    resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
@@ -139,8 +140,8 @@ class StreamCommand:
 
     source: Positional[str]
     weights: str
-    resolution: int = 48
-    rate: float = 30.0
+    resolution: Cells = 48
+    rate: Positive = 30.0
     every_frame: bool = False
     watch: bool = False
     surfaces: Path | None = None
@@ -186,7 +187,7 @@ class BenchCommand:
     preset: PresetName = "paper"
     device: Literal["cpu", "cuda"] = "cpu"
     precision: Precision = "float32"
-    repeats: int = 7
+    repeats: Count = 7
     rival: bool = False
     output: Path | None = None
 
@@ -195,8 +196,6 @@ class BenchCommand:
         from mereo.experiments.speed.report import benchmark
         from mereo.models.device import find_device
 
-        if self.repeats < 1:
-            raise ValueError(f"{self.repeats} repeats are asked for; at least 1 is needed: 7 are usual")
         device = find_device(self.device)
         benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.output)
 
@@ -215,7 +214,7 @@ class Experiment:
     name: Positional[ExperimentName]
     scale: ScaleName = "smoke"
     output: Path = Path("out/experiments")
-    workers: int = 0
+    workers: CountOrNone = 0
 
     def run(self) -> None:
         """Run the experiment and print its table."""

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from mereo.geometry.conventions import CloudAxes
+from mereo.io.bounds import PositiveOrUnknown, check_bounds
 
 Format = Literal["glb", "ply", "obj", "stl", "npz", "vti", "nifti", "seg.nrrd", "points", "json"]
 
@@ -46,14 +47,15 @@ class InputConfig:
     """
 
     intrinsics: Path | None = None
-    depth_scale: float | None = None
+    depth_scale: PositiveOrUnknown = None
     mask: Path | None = None
     frame: CloudAxes = "camera"
     drop_invalid: bool = False
-    unit_m: float | None = None
+    unit_m: PositiveOrUnknown = None
     topic: str | None = None
     frame_index: int | None = None
 
     def __post_init__(self) -> None:
         if self.unit_m is not None and not 0 < self.unit_m < math.inf:
             raise ValueError(f"the unit is {self.unit_m} m; it must be positive: give 0.001 for millimetres")
+        check_bounds(self)

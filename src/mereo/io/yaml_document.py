@@ -19,6 +19,18 @@ Place = Sequence[int | str]
 """Keys and indices from the top of the document, for example ("deformations", 0, "angle")."""
 
 
+MOST_VALUES = 100_000
+"""Values of a document, those of aliases counted where they stand: a few lines of nested aliases are billions."""
+
+
+MOST_CHARACTERS = 120
+"""Length of a quoted value."""
+
+
+class _TooMuch(ValueError):
+    """Refusal of a document that is small as a text and endless as values."""
+
+
 class Document:
     """YAML mapping with the lines that its values stand on.
 
@@ -37,6 +49,7 @@ class Document:
             self.text = path.read_text(encoding="utf-8")
             # two passes, because only nodes know their lines and only values their types
             root = yaml.compose(self.text, Loader=yaml.SafeLoader)
+            self._measure(root, {})
             self.data: Any = yaml.safe_load(self.text)
         except UnicodeDecodeError:
             raise ValueError(f"{path} is not text in UTF-8; a YAML file is needed: save it as UTF-8") from None
@@ -46,10 +59,36 @@ class Document:
             raise ValueError(f"{place}: this is not YAML ({error.problem}): correct the line, or its indent") from None
         except yaml.YAMLError as error:
             raise ValueError(f"{path}: this is not YAML ({error}): save it as plain text") from None
+        except RecursionError:
+            raise ValueError(f"{path} is nested too deeply; a scene file has lists in blocks: write it anew") from None
+        except _TooMuch:
+            raise
+        except (ValueError, KeyError) as error:  # of dates, numbers and truth values
+            raise ValueError(f"{path} has a value that YAML cannot read ({_short(error)}): put it in quotes") from None
         if not isinstance(root, yaml.MappingNode):
             raise ValueError(f"{path} holds no `key: value` lines; a scene file starts with `name:`: write one anew")
         self._root: yaml.Node = root
         self._refuse_repeated(root)
+
+    def _measure(self, node: yaml.Node | None, known: dict[int, int]) -> int:
+        """Number of values in a node with all its aliases spelt out; refuses what contains itself or has too many.
+
+        ``known`` has the numbers of nodes that were met before, by their ``id``; 0 of those that are not yet counted.
+        """
+        if not isinstance(node, yaml.CollectionNode):
+            return 1
+        if id(node) not in known:
+            known[id(node)] = 0
+            inner = (
+                node.value if isinstance(node, yaml.SequenceNode) else [part for pair in node.value for part in pair]
+            )
+            known[id(node)] = 1 + sum(self._measure(part, known) for part in inner)
+        count, place = known[id(node)], f"{self.path}:{node.start_mark.line + 1}"
+        if count == 0:
+            raise _TooMuch(f"{place}: this value contains itself by an alias; it must end: spell it out")
+        if count > MOST_VALUES:
+            raise _TooMuch(f"{place}: this holds {count} values; at most {MOST_VALUES} can be read: use fewer aliases")
+        return count
 
     def _refuse_repeated(self, node: yaml.Node) -> None:
         """Refuse keys that stand twice: YAML takes the last of two in silence."""
@@ -131,7 +170,7 @@ class Document:
             return f"{rule}: correct this block"
         if kind == "model_attributes_type":
             rule = f"it must be a block of keys, such as `type: {_types(model)[0]}`"
-        return f"`{_key_of(place)}` is {value!r}; {rule}: correct it"
+        return f"`{_key_of(place)}` is {_short(repr(value))}; {rule}: correct it"
 
     def _known_keys(self, place: Place, model: type[BaseModel]) -> list[str]:
         """Keys that are allowed where an unknown one is, found by asking the models for a block like that."""
@@ -139,6 +178,11 @@ class Document:
         used = self.pair(place[:-1])[1]
         have = {k.value for k, _ in used.value} if isinstance(used, yaml.MappingNode) else set()
         return [name for name in fields if name not in have] or list(fields)
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
 
 
 def _key_of(place: Place) -> str:

@@ -11,6 +11,21 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
+from mereo.io.bounds import (
+    BelowOne,
+    Count,
+    CountOrNone,
+    Counts,
+    Depth,
+    Exponent,
+    NotNegative,
+    Points,
+    Positive,
+    Share,
+    check_bounds,
+    check_values,
+)
+
 Device = Literal["auto", "cpu", "cuda"]
 
 Encoder = Literal["pointnet2", "point-transformer", "autodecoder"]
@@ -19,6 +34,9 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
 """Terms by which networks are trained, as options and weights name them."""
+
+HEADS = 4
+"""Number of heads of the attention to local features."""
 
 MOST_ORDERED = 16384
 """Number of points of one cloud that a program of the GPU can keep: 16 in each of 1024 threads."""
@@ -36,6 +54,9 @@ class InferenceConfig:
 
     device: Device = "auto"
     precision: Precision = "auto"
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
 
 EXACT = InferenceConfig(precision="float32")
@@ -78,14 +99,17 @@ class PointNet2Config:
         mlp_global: layer widths before the global max pool; the last one is the latent size of every encoder.
     """
 
-    neighbors: int = 64
-    ratio1: float = 0.5
-    radius1: float = 0.2
-    mlp1: tuple[int, ...] = (64, 64, 128)
-    ratio2: float = 0.25
-    radius2: float = 0.4
-    mlp2: tuple[int, ...] = (128, 128, 256)
-    mlp_global: tuple[int, ...] = (256, 512, 1024)
+    neighbors: Count = 64
+    ratio1: Share = 0.5
+    radius1: Positive = 0.2
+    mlp1: Counts = (64, 64, 128)
+    ratio2: Share = 0.25
+    radius2: Positive = 0.4
+    mlp2: Counts = (128, 128, 256)
+    mlp_global: Counts = (256, 512, 1024)
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "network.")
 
 
 @dataclass(frozen=True)
@@ -97,8 +121,11 @@ class PointTransformerConfig:
         transformer_neighbors: nearest points that a point of it attends to; half as many in block one.
     """
 
-    transformer_widths: tuple[int, ...] = (32, 64, 128, 256, 512)
-    transformer_neighbors: int = 16
+    transformer_widths: Counts = (32, 64, 128, 256, 512)
+    transformer_neighbors: Count = 16
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "network.")
 
 
 @dataclass(frozen=True)
@@ -111,9 +138,12 @@ class AutodecoderConfig:
         code_penalty: weight of a code's squared length in it, beside the L1 distance.
     """
 
-    search_steps: int = 75
-    search_rate: float = 1e-3
-    code_penalty: float = 1e-4
+    search_steps: Count = 75
+    search_rate: Positive = 1e-3
+    code_penalty: NotNegative = 1e-4
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "network.")
 
 
 @dataclass(frozen=True)
@@ -130,13 +160,21 @@ class DecoderConfig:
         highest_exponent: greatest e of these frequencies.
     """
 
-    width: int = 512
-    depth: int = 7
-    skip_after: int = 4
-    dropout: float = 0.0
+    width: Count = 512
+    depth: Depth = 7
+    skip_after: Count = 4
+    dropout: BelowOne = 0.0
     encode_positions: bool = True
-    lowest_exponent: int = -4
-    highest_exponent: int = 5
+    lowest_exponent: Exponent = -4
+    highest_exponent: Exponent = 5
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "network.")
+        if self.lowest_exponent > self.highest_exponent:
+            raise ValueError(
+                f"network.lowest_exponent is {self.lowest_exponent} and network.highest_exponent is "
+                f"{self.highest_exponent}; the lowest must not be above the highest: give for example -4 and 5"
+            )
 
 
 @dataclass(frozen=True)
@@ -151,11 +189,19 @@ class AdditionsConfig:
         rest_template: look queries up in the rest pose's model, at predicted rest coordinates.
     """
 
-    local_neighbors: int = 0
-    local_width: int = 128
-    sight_neighbors: int = 0
-    align_points: int = 0
+    local_neighbors: CountOrNone = 0
+    local_width: Count = 128
+    sight_neighbors: CountOrNone = 0
+    align_points: CountOrNone = 0
     rest_template: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "network.")
+        if self.local_width % HEADS:
+            raise ValueError(
+                f"network.local_width is {self.local_width}; it must be a multiple of its {HEADS} heads: "
+                "give for example 128"
+            )
 
 
 PARTS: dict[str, type[Any]] = {
@@ -186,13 +232,16 @@ class NetworkConfig:
     """
 
     encoder: Encoder = "pointnet2"
-    points: int = 1024
+    points: Points = 1024
     # empty names keep the options --network.width, --network.mlp1 and so on, without those of the parts
     pointnet2: Annotated[PointNet2Config, arg(name="")] = field(default_factory=PointNet2Config)
     transformer: Annotated[PointTransformerConfig, arg(name="")] = field(default_factory=PointTransformerConfig)
     autodecoder: Annotated[AutodecoderConfig, arg(name="")] = field(default_factory=AutodecoderConfig)
     decoder: Annotated[DecoderConfig, arg(name="")] = field(default_factory=DecoderConfig)
     additions: Annotated[AdditionsConfig, arg(name="")] = field(default_factory=AdditionsConfig)
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "network.")
 
     @property
     def latent(self) -> int:
@@ -222,9 +271,11 @@ class NetworkConfig:
         What older weights do not state has its default: what it switches on did not exist then.
 
         Raises:
-            ValueError: a name is unknown.
+            ValueError: a name is unknown, or a value of another type or out of its bounds.
         """
         given = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+        for part in (cls, *PARTS.values()):
+            check_values(part, given, "network.")
         parts: dict[str, Any] = {
             name: part(**{item.name: given.pop(item.name) for item in fields(part) if item.name in given})
             for name, part in PARTS.items()

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mereo.models.config import NetworkConfig
+from mereo.models.config import HEADS, NetworkConfig
 from mereo.models.device import exact
 from mereo.models.encoders.encoding import Encoding, Level
 from mereo.models.ops.neighbors import gather, nearest
@@ -63,7 +63,8 @@ class FrequencyEncoding(nn.Module):
 
     def __init__(self, lowest: int, highest: int) -> None:
         super().__init__()
-        frequency = torch.pi * 2.0 ** torch.arange(lowest, highest + 1)
+        # from Python numbers: arithmetic on the device "meta", where weights are described, loads much of torch
+        frequency = torch.tensor([torch.pi * 2.0**exponent for exponent in range(lowest, highest + 1)])
         self.frequency: Tensor
         self.register_buffer("frequency", frequency, persistent=False)
         self.channels = 6 * len(frequency)
@@ -81,14 +82,12 @@ class LocalAttention(nn.Module):
     ``A f_k`` is computed once per centre, so a neighbour costs the query only a gather and the small product with B.
     """
 
-    HEADS = 4
-
     def __init__(self, channels: int, width: int, neighbors: int) -> None:
         super().__init__()
         self.neighbors = neighbors
         self.project = nn.Linear(channels, width)
         self.offset = nn.Linear(4, width, bias=False)
-        self.score = nn.Linear(width, self.HEADS)
+        self.score = nn.Linear(width, HEADS)
 
     def forward(self, level: Level, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q w"]:
         """Attended features at each query; ``level.features`` are already projected."""
@@ -97,7 +96,7 @@ class LocalAttention(nn.Module):
         offset = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], dim=-1)
         hidden = torch.relu(gather(level.features, index) + self.offset(offset))
         weight = self.score(hidden).softmax(dim=2)
-        heads = hidden.unflatten(-1, (self.HEADS, -1))
+        heads = hidden.unflatten(-1, (HEADS, -1))
         return (weight[..., None] * heads).sum(dim=2).flatten(-2)
 
 

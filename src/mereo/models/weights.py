@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int8
 from safetensors import SafetensorError, safe_open
@@ -11,15 +12,14 @@ from safetensors.torch import save
 from torch import Tensor
 
 from mereo.io.atomic_files import atomic_file
-from mereo.models.config import InferenceConfig, NetworkConfig
+from mereo.models.config import InferenceConfig
 from mereo.models.device import find_device
 from mereo.models.encoders.autodecoder import CODES
 from mereo.models.model import Model
 from mereo.models.network import Network
+from mereo.models.weights_header import CURE, FORMAT_VERSION, Header, check_tensors, read_config, read_header
+from mereo.scenes.statistical_model import StatisticalModel
 from mereo.scenes.statistical_model_file import pack_model, unpack_model
-
-FORMAT_VERSION = 3
-"""Version of the files: 2 may hold the template in bytes, 3 holds a statistical model too; all are read."""
 
 STATES = "states."
 """Beginning of the names of a statistical model's tensors."""
@@ -117,7 +117,7 @@ def trained_steps(path: Path) -> int | None:
     try:
         with safe_open(path, framework="pt") as file:
             steps = json.loads((file.metadata() or {})["mereo"])["provenance"]["steps"]
-    except (SafetensorError, OSError, KeyError, ValueError):
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError):
         return None
     return steps if isinstance(steps, int) else None
 
@@ -141,27 +141,31 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
         raise ValueError(
             f"{path} is not a safetensors file ({error}); give the weights written by mereo train"
         ) from None
-    if "mereo" not in metadata:
-        raise ValueError(f"{path} holds tensors but no mereo header; give the weights.safetensors of a mereo run")
-    header = json.loads(metadata["mereo"])
-    if header.get("version") not in range(1, FORMAT_VERSION + 1):
-        raise ValueError(
-            f"{path} has weights format {header.get('version')}; this mereo reads formats up to {FORMAT_VERSION}: "
-            "train again, or install the matching version"
-        )
+    header = read_header(path, metadata)
     states = {key.removeprefix(STATES): tensors.pop(key).numpy() for key in list(tensors) if key.startswith(STATES)}
-    network = Network(NetworkConfig.from_dict(header["network"]), len(header["names"]))
-    try:
-        network.load_state_dict({name: _restored(name, value) for name, value in tensors.items()})
-    except RuntimeError as error:
-        raise ValueError(f"{path} does not fit its own header ({str(error).splitlines()[0]}); train again") from None
+    config = read_config(path, header)
+    restored = {name: _restored(name, value) for name, value in tensors.items()}
+    check_tensors(path, config, len(header.names), restored)
+    network = Network(config, len(header.names))
+    network.load_state_dict(restored)
     return Model(
         network=network.eval().requires_grad_(False).to(device),
-        names=tuple(header["names"]),
-        colors=tuple(tuple(color) for color in header["colors"]),
-        loss=header["loss"],
-        provenance=header["provenance"],
-        domain=None if header["domain"] is None else (tuple(header["domain"][0]), tuple(header["domain"][1])),
-        nested=tuple((inner, outer) for inner, outer in header.get("nested", ())),  # older weights have none
-        statistical_model=unpack_model(states, header["states"]) if states else None,
+        names=header.names,
+        colors=header.colors,
+        loss=header.loss,
+        provenance=header.provenance,
+        domain=header.domain,
+        nested=header.nested,
+        statistical_model=_unpacked(path, states, header) if states else None,
     )
+
+
+def _unpacked(path: Path, states: dict[str, np.ndarray], header: Header) -> StatisticalModel:
+    """Statistical model of a file; whatever does not fit in it is one sentence."""
+    try:
+        if lost := [name for name, value in states.items() if not np.isfinite(value).all()]:
+            raise ValueError(f"there is NaN or infinity in {STATES}{lost[0]}")
+        return unpack_model(states, header.states or {})
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        kind = "nothing is called " if isinstance(error, KeyError) else ""
+        raise ValueError(f"{path} has a statistical model that cannot be read ({kind}{error}); {CURE}") from None

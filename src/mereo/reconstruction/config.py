@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from mereo.io.bounds import NotNegative, check_bounds
+
 
 @dataclass(frozen=True)
 class IsolationConfig:
@@ -23,9 +25,10 @@ class IsolationConfig:
     remove_plane: bool = False
     remove_outliers: bool = False
     largest_cluster: bool = False
-    cluster_gap: float = 0.0
+    cluster_gap: NotNegative = 0.0
 
     def __post_init__(self) -> None:
+        check_bounds(self)
         if self.depth_range is not None and not 0 <= self.depth_range[0] < self.depth_range[1] < math.inf:
             raise ValueError(
                 f"the depth range is {_numbers(self.depth_range)}; it must be the nearest and the farthest depth in "
@@ -40,10 +43,10 @@ class IsolationConfig:
                 "corner, then the upper one, in metres"
             )
 
-        if not 0 <= self.cluster_gap < math.inf or (self.cluster_gap > 0 and not self.largest_cluster):
+        if self.cluster_gap > 0 and not self.largest_cluster:
             raise ValueError(
-                f"the cluster gap is {self.cluster_gap:g} m; it must not be negative and belongs to the largest "
-                "cluster: give for example --largest-cluster --cluster-gap 0.01"
+                f"the cluster gap is {self.cluster_gap:g} m; it belongs to the largest cluster: give for example "
+                "--largest-cluster --cluster-gap 0.01"
             )
 
     @property

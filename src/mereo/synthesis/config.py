@@ -8,6 +8,8 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes
 
+from mereo.io.bounds import Count, ImageSize, NotNegative, Points, Positive, Probability, check_bounds
+
 SensorModel = Literal["structured-light", "time-of-flight"]
 
 
@@ -36,20 +38,23 @@ class SensorConfig:
         mask_shift_px: how far the whole mask is off, standard deviation along each axis in pixels of the image.
     """
 
-    metres_per_unit: float = 0.005
+    metres_per_unit: Positive = 0.005
     model: SensorModel = "structured-light"
-    axial: float = 0.0
-    lateral: float = 0.0
-    quantization: float = 0.0
-    flying: float = 0.0
-    dropout: float = 0.0
-    holes: float = 0.0
-    hole_radius_m: float = 0.01
-    tool: float = 0.0
-    hand: float = 0.0
-    background: float = 0.0
-    mask_offset_px: float = 0.0
-    mask_shift_px: float = 0.0
+    axial: NotNegative = 0.0
+    lateral: NotNegative = 0.0
+    quantization: NotNegative = 0.0
+    flying: Probability = 0.0
+    dropout: Probability = 0.0
+    holes: NotNegative = 0.0
+    hole_radius_m: Positive = 0.01
+    tool: Probability = 0.0
+    hand: Probability = 0.0
+    background: Probability = 0.0
+    mask_offset_px: NotNegative = 0.0
+    mask_shift_px: NotNegative = 0.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "sensor.")
 
     @property
     def on(self) -> bool:
@@ -117,10 +122,17 @@ class SamplingConfig:
     """
 
     sampler: Sampler = "sort-sample"
-    per_segment: int = 256
-    oversample: int = 1
-    box_margin: float = 0.5
-    uniform_fraction: float = 0.15
+    per_segment: Count = 256
+    oversample: Count = 1
+    box_margin: Positive = 0.5
+    uniform_fraction: NotNegative = 0.15
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+        if self.per_segment % 2:
+            raise ValueError(
+                f"per_segment is {self.per_segment}; half the points go inside and half outside: pass an even number"
+            )
 
     def total(self, segments: int) -> int:
         """Number of queries of one example."""
@@ -139,9 +151,12 @@ class GenerateConfig:
         sensor: what else is wrong with the depth image; nothing in the paper.
     """
 
-    image_size: int = 96
-    noise_std: float = 0.1
-    points: int = 1024
+    image_size: ImageSize = 96
+    noise_std: NotNegative = 0.1
+    points: Points = 1024
     # the marker keeps --sampler short on the command line, where --sensor.axial keeps its prefix
     sampling: OmitArgPrefixes[SamplingConfig] = field(default_factory=SamplingConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
+
+    def __post_init__(self) -> None:
+        check_bounds(self)

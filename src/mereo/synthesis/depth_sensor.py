@@ -33,8 +33,6 @@ KINECT_FOCAL_PX = 585.0
 KINECT_DISPARITY_M = 351.3
 """Depth in metres times disparity in steps; 35130 in centimetres (Barron and Malik 2013)."""
 
-PROBABILITIES = ("flying", "dropout", "tool", "hand", "background")
-
 
 @dataclass(frozen=True, eq=False)
 class SimulatedView:
@@ -61,19 +59,6 @@ class SimulatedView:
         return int((self.mask & self.whole.valid & (self.source == OBJECT)).sum())
 
 
-def check_sensor(sensor: SensorConfig) -> None:
-    """Raise ``ValueError`` for sensor settings out of their range, naming the setting, its rule and the cure."""
-    for name in SENSOR_TERMS:
-        value = getattr(sensor, name)
-        if name in PROBABILITIES and not 0 <= value <= 1:
-            raise ValueError(f"sensor.{name} is {value}; it is a probability: pass a number from 0 to 1")
-        if not 0 <= value < np.inf:
-            raise ValueError(f"sensor.{name} is {value}; it must be finite and not negative: pass 0 to switch it off")
-    for name in ("metres_per_unit", "hole_radius_m"):
-        if not 0 < getattr(sensor, name) < np.inf:
-            raise ValueError(f"sensor.{name} is {getattr(sensor, name)}; it is a length: pass a positive number")
-
-
 def observe(
     solids: Solids, camera: Camera, noise_std: float, sensor: SensorConfig, rng: np.random.Generator
 ) -> SimulatedView:
@@ -82,10 +67,7 @@ def observe(
     The Gaussian noise of ``noise_std`` is drawn from ``rng`` itself, every other term from a stream of its own that is
     spawned from it. So whatever is drawn from ``rng`` afterwards is the same with any sensor, and switching one term on
     or off leaves the others as they were.
-
-    Raises ``ValueError`` for settings out of their range.
     """
-    check_sensor(sensor)
     if not sensor.on:
         image = add_depth_noise(render_depth(solids, camera), noise_std, rng)
         return SimulatedView(image, image.valid, np.where(image.valid, OBJECT, NOTHING).astype(np.uint8))

@@ -111,9 +111,8 @@ def sample_queries(shape: Shape, settings: SamplingConfig, rng: np.random.Genera
         ``settings.total(shape.count)`` points.
 
     Raises:
-        ValueError: a setting is out of its range, or a segment cannot be sampled.
+        ValueError: a segment cannot be sampled.
     """
-    check_settings(settings)
     boxes = extended_boxes(shape, settings.box_margin)
     keep, draw = settings.per_segment // 2, settings.per_segment // 2 * settings.oversample
     near = {
@@ -126,22 +125,6 @@ def sample_queries(shape: Shape, settings: SamplingConfig, rng: np.random.Genera
     nested = settings.sampler == "nested-sort-sample"
     labels = owner_labels(shape, spread) if nested else shape.label(spread)
     return Samples(np.concatenate([near.points, spread]), np.concatenate([near.labels, labels]))
-
-
-def check_settings(settings: SamplingConfig) -> None:
-    """Raise ``ValueError`` for sampling settings out of their range, naming the setting, its rule and the cure."""
-    if settings.per_segment < 2 or settings.per_segment % 2:
-        raise ValueError(
-            f"per_segment is {settings.per_segment}; half the points go inside and half outside: pass an even number"
-        )
-    if settings.oversample < 1:
-        raise ValueError(f"oversample is {settings.oversample}; it is n / k and at least 1: pass 1 or 2")
-    if not settings.box_margin > 0:
-        raise ValueError(
-            f"box_margin is {settings.box_margin}; boxes must reach beyond their segments: pass a fraction, as 0.5"
-        )
-    if not settings.uniform_fraction >= 0:
-        raise ValueError(f"uniform_fraction is {settings.uniform_fraction}; it cannot be negative: pass 0 or 0.15")
 
 
 class _Draws:

@@ -38,10 +38,8 @@ from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.scenes.statistical_model_file import load_statistical_model, save_statistical_model
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
 from mereo.synthesis.dataset_files import check_space, dataset_key, read_shard, read_template
-from mereo.synthesis.depth_sensor import check_sensor
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.progress import progress
-from mereo.synthesis.query_sampling import check_settings
 from mereo.synthesis.workers import in_processes
 
 SHARD_SIZE = 64
@@ -104,14 +102,12 @@ def generate(
         test: make a test set, whose seed training refuses.
 
     Raises:
-        ValueError: a number or setting out of its range, a seed of the wrong kind, ``resume`` with other settings.
+        ValueError: a number out of its range, a seed of the wrong kind, ``resume`` with other settings.
         FileExistsError: ``output`` holds something and ``resume`` is not set.
         OSError: the disk is full; complete shards are kept. ``ChildProcessError`` where a worker was killed.
     """
     check_place(output, may_be_link=True)
     _check_request(examples, seed, workers, shard, test)
-    check_settings(settings.sampling)
-    check_sensor(settings.sensor)
     loaded = load_scene(scene) if isinstance(scene, str) else scene
     manifest = make_manifest(loaded, settings, examples, seed)
     check_space(output, examples, manifest["bytes"] // examples, shard[1])

@@ -8,6 +8,17 @@ Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) u
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, get_args
 
+from mereo.io.bounds import (
+    BelowOne,
+    Count,
+    CountOrNone,
+    NotNegative,
+    Positive,
+    Probability,
+    Seed,
+    ShareRange,
+    check_bounds,
+)
 from mereo.models.config import Loss, NetworkConfig, Precision, Supervision
 
 
@@ -23,11 +34,19 @@ class AugmentConfig:
         roll: turn view and queries about the optical axis, where the scene allows any roll.
     """
 
-    keep_points: tuple[float, float] = (1.0, 1.0)
-    hole_probability: float = 0.0
-    hole_radius: float = 0.4
-    jitter_std: float = 0.0
+    keep_points: ShareRange = (1.0, 1.0)
+    hole_probability: Probability = 0.0
+    hole_radius: Positive = 0.4
+    jitter_std: NotNegative = 0.0
     roll: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "augment.")
+        if self.keep_points[0] > self.keep_points[1]:
+            raise ValueError(
+                f"augment.keep_points is {self.keep_points[0]:g} {self.keep_points[1]:g}; the smaller probability "
+                "comes first: give for example 0.5 1"
+            )
 
 
 @dataclass(frozen=True)
@@ -61,23 +80,30 @@ class TrainConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     init: str = ""
     loss: Loss = "ce+l1"
-    l1_weight: float = 100.0
-    batch: int = 40
-    queries: int = 0
-    epochs: float = 300.0
-    learning_rate: float = 5e-4
-    code_rate: float = 1e-3
-    weight_decay: float = 0.0
+    l1_weight: NotNegative = 100.0
+    batch: Count = 40
+    queries: CountOrNone = 0
+    epochs: Positive = 300.0
+    learning_rate: Positive = 5e-4
+    code_rate: Positive = 1e-3
+    weight_decay: NotNegative = 0.0
     schedule: Literal["constant", "cosine"] = "constant"
-    warmup: float = 0.0
-    clip_norm: float = 0.0
-    ema_decay: float = 0.0
+    warmup: BelowOne = 0.0
+    clip_norm: NotNegative = 0.0
+    ema_decay: BelowOne = 0.0
     augment: AugmentConfig = field(default_factory=AugmentConfig)
-    offset_examples: int = 0
-    holdout: int = 128
+    offset_examples: CountOrNone = 0
+    holdout: CountOrNone = 128
     precision: Precision = "auto"
     compile: Literal["auto", "on", "off"] = "auto"
-    seed: int = 0
+    seed: Seed = 0
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+        if self.batch * self.queries == 1:
+            raise ValueError(
+                "batch and queries are both 1; batch normalization needs several values at a time: give more of either"
+            )
 
     @property
     def supervision(self) -> Supervision:

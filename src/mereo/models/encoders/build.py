@@ -1,4 +1,4 @@
-"""The encoder that a network's settings ask for, once they are checked."""
+"""The encoder that a network's settings ask for."""
 
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders.autodecoder import Autodecoder
@@ -7,7 +7,7 @@ from mereo.models.encoders.pointnet2 import PointNet2
 
 
 def make_encoder(config: NetworkConfig) -> PointNet2 | PointTransformer | Autodecoder:
-    """Encoder that the settings name; ``ValueError`` where they do not go together or are out of range."""
+    """Encoder that the settings name; ``ValueError`` where they do not go together."""
     _check(config)
     if config.encoder == "autodecoder":
         return Autodecoder(config.autodecoder, config.latent)
@@ -18,16 +18,7 @@ def make_encoder(config: NetworkConfig) -> PointNet2 | PointTransformer | Autode
 
 def _check(config: NetworkConfig) -> None:
     """Raise ``ValueError`` naming the setting, its rule and the cure."""
-    counts = {
-        "transformer_neighbors": config.transformer.transformer_neighbors,
-        "search_steps": config.autodecoder.search_steps,
-    }
-    for name, count in counts.items():
-        if count < 1:
-            raise ValueError(f"{name} is {count}; it must be at least 1: leave it out for the paper's")
-    dropout, neighbors = config.decoder.dropout, config.additions.local_neighbors
-    if not 0 <= dropout < 1:
-        raise ValueError(f"dropout is {dropout}; it is a share from 0 to below 1: the paper's autodecoder has 0.2")
+    neighbors = config.additions.local_neighbors
     if config.encoder == "autodecoder" and neighbors:
         raise ValueError(
             f"local_neighbors is {neighbors}, but an autodecoder has no features at points to attend to; train with "

@@ -1,0 +1,136 @@
+"""Kinds of numbers that settings may hold, and their rules: checked when settings are made, and shown in the help.
+
+``batch: Count = 40`` says it once, and ``check_bounds`` in ``__post_init__`` holds it. NaN and infinity pass nowhere.
+Light, so that the command line may import it.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, dataclass, fields
+from functools import lru_cache
+from numbers import Integral, Real
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+from tyro.conf import arg
+
+from mereo.geometry.conventions import MIN_POINTS
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Interval of finite numbers; of a tuple, which may not be empty, all must lie in it.
+
+    Attributes:
+        least: smallest number that is allowed, or with ``above`` the largest that is not.
+        most: largest number that is allowed, or with ``below`` the smallest that is not.
+        above: leave out ``least`` itself.
+        below: leave out ``most`` itself.
+    """
+
+    least: float = -math.inf
+    most: float = math.inf
+    above: bool = False
+    below: bool = False
+
+    @property
+    def rule(self) -> str:
+        """Words for the interval: "from 0 to 1", "at least 1", "greater than 0"."""
+        if math.isinf(self.most):
+            return f"greater than {self.least:g}" if self.above else f"at least {self.least:g}"
+        lower = f"above {self.least:g}" if self.above else f"from {self.least:g}"
+        return f"{lower} to below {self.most:g}" if self.below else f"{lower} to {self.most:g}"
+
+    def holds(self, value: float) -> bool:
+        """Whether a number lies in the interval."""
+        inside = self.least <= value <= self.most and abs(value) < math.inf
+        return inside and not (self.above and value == self.least) and not (self.below and value == self.most)
+
+
+def _shown(bounds: Bounds) -> Any:
+    """Option's help with the rule behind the default."""
+    return arg(help_behavior_hint=lambda default: f"(default: {default}; {bounds.rule})")
+
+
+_COUNT, _COUNT_OR_NONE = Bounds(1), Bounds(0)
+_POSITIVE, _NOT_NEGATIVE = Bounds(0, above=True), Bounds(0)
+_PROBABILITY, _BELOW_ONE, _SHARE = Bounds(0, 1), Bounds(0, 1, below=True), Bounds(0, 1, above=True)
+_EXPONENT, _DEPTH, _CELLS, _PORT = Bounds(-30, 30), Bounds(1, 1000), Bounds(4, 4096), Bounds(0, 65535)
+_POINTS, _IMAGE = Bounds(MIN_POINTS), Bounds(8, 8192)
+_SEED = Bounds(0, 2**63, below=True)  # what torch takes
+
+Count = Annotated[int, _COUNT, _shown(_COUNT)]
+CountOrNone = Annotated[int, _COUNT_OR_NONE, _shown(_COUNT_OR_NONE)]
+Points = Annotated[int, _POINTS, _shown(_POINTS)]
+ImageSize = Annotated[int, _IMAGE, _shown(_IMAGE)]
+Counts = Annotated[tuple[int, ...], _COUNT, _shown(_COUNT)]
+Positive = Annotated[float, _POSITIVE, _shown(_POSITIVE)]
+PositiveOrUnknown = Annotated[float | None, _POSITIVE, _shown(_POSITIVE)]
+NotNegative = Annotated[float, _NOT_NEGATIVE, _shown(_NOT_NEGATIVE)]
+Probability = Annotated[float, _PROBABILITY, _shown(_PROBABILITY)]
+BelowOne = Annotated[float, _BELOW_ONE, _shown(_BELOW_ONE)]
+Share = Annotated[float, _SHARE, _shown(_SHARE)]
+ShareRange = Annotated[tuple[float, float], _SHARE, _shown(_SHARE)]
+Exponent = Annotated[int, _EXPONENT, _shown(_EXPONENT)]
+Depth = Annotated[int, _DEPTH, _shown(_DEPTH)]
+Cells = Annotated[int, _CELLS, _shown(_CELLS)]
+Port = Annotated[int, _PORT, _shown(_PORT)]
+Seed = Annotated[int, _SEED, _shown(_SEED)]
+
+
+def check_bounds(settings: Any, prefix: str = "") -> None:
+    """Raise ``ValueError`` for the first field of a dataclass whose value its annotation does not allow.
+
+    Args:
+        settings: the dataclass; fields with ``Bounds``, literals and truth values are checked.
+        prefix: what the options of these fields begin with, for the sentence; ``--`` turns names into options.
+    """
+    check_values(type(settings), {item.name: getattr(settings, item.name) for item in fields(settings)}, prefix)
+
+
+def check_values(settings: type, values: Mapping[str, Any], prefix: str = "") -> None:
+    """Raise ``ValueError`` as ``check_bounds`` does, for values by field of which a dataclass is yet to be made."""
+    kinds = _kinds(settings)
+    for item in fields(settings):
+        rule = _broken_rule(kinds[item.name], values[item.name]) if item.name in values else None
+        if rule is not None:
+            name = prefix + (item.name.replace("_", "-") if prefix == "--" else item.name)
+            raise ValueError(f"{name} is {_text(values[item.name])}; it must be {rule}: {_cure(item)}")
+
+
+@lru_cache(maxsize=64)
+def _kinds(settings: type) -> dict[str, Any]:
+    return get_type_hints(settings, include_extras=True)
+
+
+def _broken_rule(kind: Any, value: Any) -> str | None:
+    """Rule that a value breaks; None where it breaks none, or its kind has none."""
+    if get_origin(kind) is Literal:
+        return None if value in get_args(kind) else f"one of {', '.join(map(str, get_args(kind)))}"
+    if kind is bool:
+        return None if isinstance(value, bool) else "true or false"
+    bounds = next((extra for extra in getattr(kind, "__metadata__", ()) if isinstance(extra, Bounds)), None)
+    if bounds is None:
+        return None
+    plain = get_args(kind)[0]
+    if value is None and NoneType in get_args(plain):
+        return None
+    many = get_origin(plain) is tuple
+    whole = plain is int or int in get_args(plain)
+    values = value if many and isinstance(value, tuple) else (value,) if not many else ()
+    if values and all(_is_number(v, Integral if whole else Real) and bounds.holds(v) for v in values):
+        return None
+    return f"{'whole numbers, each ' if many and whole else 'a whole number, ' if whole else ''}{bounds.rule}"
+
+
+def _is_number(value: object, kind: type) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
+def _text(value: object) -> str:
+    text = " ".join(map(str, value)) if isinstance(value, tuple) else repr(value)
+    return text if len(text) <= 60 else f"{text[:60]}..."
+
+
+def _cure(item: "Field[Any]") -> str:
+    return "correct it" if item.default in (MISSING, None) else f"give for example {_text(item.default)}"

@@ -1,0 +1,107 @@
+"""Files of weights that were damaged or changed: one sentence that names the file and what is wrong, and no output."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from mereo import __main__ as command_line
+from mereo.models.model import Model
+from mereo.models.network import Network
+from mereo.models.weights import SHIPPED, load_model, trained_steps, weights_bytes
+from mereo.training.config import PRESETS
+
+WITH_STATES = SHIPPED / "rope.safetensors"
+
+
+def header_of(content: bytes) -> dict[str, Any]:
+    length = int.from_bytes(content[:8], "little")
+    found: dict[str, Any] = json.loads(json.loads(content[8 : 8 + length])["__metadata__"]["mereo"])
+    return found
+
+
+def changed(folder: Path, change: Callable[[Any, dict[str, torch.Tensor]], Any], with_states: bool = False) -> Path:
+    """Weights after a change to header and tensors, which may return another header."""
+    path = folder / "changed.safetensors"
+    network = Network(PRESETS["tiny"].network, 2).eval()
+    good = weights_bytes(Model(network, ("a", "b"), ((1, 2, 3), (4, 5, 6))))
+    content = WITH_STATES.read_bytes() if with_states else good
+    path.write_bytes(content)
+    header, tensors = header_of(content), load_file(path)
+    other = change(header, tensors)
+    save_file(tensors, path, metadata={"mereo": json.dumps(header if other is None else other)})
+    return path
+
+
+WRONG: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
+    "has weights format None": lambda h, t: [],
+    "a header with a wrong 'names' (Field required)": lambda h, t: h.pop("names") and None,
+    "a header with a wrong 'network'": lambda h, t: h.update(network=[1]),
+    "a header with a wrong 'names'": lambda h, t: h.update(names="ab"),
+    "a header with a wrong 'colors.0.1'": lambda h, t: h.update(colors=[[1, 300, 3], [4, 5, 6]]),
+    "and nested segments disagree": lambda h, t: h.update(nested=[["a", "c"]]),
+    "1 colours": lambda h, t: h.update(colors=[[1, 2, 3]]),
+    "a header with a wrong 'loss'": lambda h, t: h.update(loss="mse"),
+    "a header with a wrong 'domain.0.0'": lambda h, t: h.update(domain=[["x", 0, 0], [1, 1, 1]]),
+    "a header with a wrong 'provenance'": lambda h, t: h.update(provenance=3),
+    "a header with a wrong 'provenance.visible_m": lambda h, t: h.update(provenance={"visible_m": [1]}),
+    "network.width is '64'; it must be a whole number": lambda h, t: h["network"].update(width="64"),
+    "network.depth is 1000000000; it must be": lambda h, t: h["network"].update(depth=10**9),
+    "the network settings differ in 'heads'": lambda h, t: h["network"].update(heads=3),
+    "header says [3, 1000000000]": lambda h, t: h["network"].update(width=10**9),
+    "a header of no possible network": lambda h, t: h["network"].update(width=10**15),
+    "lacks the tensor decoder.head.bias": lambda h, t: t.pop("decoder.head.bias") is None or None,
+    "has a tensor decoder.tail, which": lambda h, t: t.update({"decoder.tail": torch.zeros(1)}),
+    "decoder.head.bias of shape [1], and its header says [7]": lambda h, t: t.update(
+        {"decoder.head.bias": torch.zeros(1)}
+    ),
+    "NaN or infinity in the tensor decoder.head.bias": lambda h, t: t.update({"decoder.head.bias": torch.ones(7) / 0}),
+}
+
+WRONG_STATES: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
+    "nothing is called 'pair_index'": lambda h, t: t.pop("states.pair_index") is None or None,
+    "nothing is called 'residue'": lambda h, t: h["states"].pop("residue") and None,
+    "nothing is called": lambda h, t: h.pop("states") and None,
+    "there is NaN or infinity in states.mean": lambda h, t: t["states.mean"].fill_(float("nan")) is None or None,
+    "a statistical model that cannot be read": lambda h, t: h["states"].update(vertices=5),
+}
+
+
+@pytest.mark.parametrize("text", [*WRONG, *WRONG_STATES])
+def test_what_is_wrong_with_weights_is_one_sentence_at_once(text: str, tmp_path: Path) -> None:
+    path = changed(tmp_path, (WRONG | WRONG_STATES)[text], text in WRONG_STATES)
+    start = time.process_time()
+    with pytest.raises(ValueError) as caught:
+        load_model(path)
+    assert time.process_time() - start < 5
+    assert str(caught.value).startswith(str(path)) and text in str(caught.value)
+    assert "\n" not in str(caught.value) and "again" in str(caught.value)
+    assert trained_steps(path) is None or text in WRONG_STATES
+
+
+def test_the_command_line_says_so_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = changed(tmp_path, WRONG["lacks the tensor decoder.head.bias"])
+    np.save(tmp_path / "cloud.npy", np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))
+    before = sorted(tmp_path.iterdir())
+    out = ["--output", str(tmp_path / "out")]
+    assert command_line.main(["reconstruct", str(tmp_path / "cloud.npy"), "--weights", str(bad), *out]) == 2
+    assert capsys.readouterr().err.startswith(f"mereo: error: {bad} lacks the tensor")
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_names_that_look_like_markup_are_printed_as_they_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = changed(tmp_path, lambda h, t: h.update(names=["[/x]", ":heart:[red]"]))
+    cloud = tmp_path / "[red] [y].npy"
+    np.save(cloud, np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))
+    arguments = ["--weights", str(weights), "--output", str(tmp_path / "out"), "--resolution", "8"]
+    assert command_line.main(["reconstruct", str(cloud), *arguments]) == 0
+    printed = capsys.readouterr().out
+    assert all(text in printed for text in ("[red] [y].npy", "[/x]", ":heart:[red]"))
