@@ -44,7 +44,7 @@ def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None
 
 
 def test_results_say_where_they_were_computed(tmp_path: Path) -> None:
-    reconstruct_file(cloud_file(tmp_path), "bunny", tmp_path / "out", resolution=12, inference=CPU)
+    reconstruct_file(cloud_file(tmp_path), "bunny", tmp_path / "out", resolution=12, inference=CPU, choice="off")
     facts = json.loads((tmp_path / "out/summary.json").read_text())
     assert (facts["device"], facts["precision"]) == ("cpu", "bfloat16")
 

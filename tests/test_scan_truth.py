@@ -154,7 +154,7 @@ def test_two_truths_of_one_name(bar: tuple[Path, Scene, np.ndarray]) -> None:
         ([], "no start is given; one is needed: --start FILE or --weights"),
         (["--start", "start.json", "--weights", "bunny"], "two starts are given; one is needed"),
         (["--start", "start.json"], "scan units per scene unit, but the units of scene and scan give 0.0005"),
-        (["--start", "start.json", "--scene-unit-mm", "-1"], "--scene-unit-mm is -1.0; it must be positive"),
+        (["--start", "start.json", "--scene-unit-mm", "-1"], "--scene-unit-mm is -1.0; it must be greater than 0"),
         (["--weights", "bunny", "--unit", "mm"], "the weights know the segments body, .* the scene has left, right"),
     ],
 )
