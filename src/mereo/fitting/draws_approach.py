@@ -7,7 +7,7 @@ points of a state costs milliseconds; one set of differences serves for several 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from scipy.sparse import csr_array
 
 from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
@@ -31,6 +31,9 @@ ENOUGH = 0.02
 
 HELD = 1e6
 """Precision of draws that move nothing here: they stay."""
+
+STILL = 1e-9
+"""Motion, in scene units for a standard deviation, below which a draw moves nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +127,20 @@ def derivatives(
     return change
 
 
+def unmoving(motion: Float32[np.ndarray, "a 3 d"]) -> Bool[np.ndarray, " d"]:
+    """Which draws move nothing here."""
+    return np.asarray(np.abs(motion).max(axis=(0, 1)) < STILL)
+
+
+def prior_of_draws(
+    z: Float[np.ndarray, " d"], motion: Float32[np.ndarray, "a 3 d"], log_scale: float, scale_std: float
+) -> NormalEquations:
+    """Normal equations of draws that are N(0, 1) each; those that move nothing stay where they are."""
+    still = unmoving(motion)
+    precision = np.diag(np.where(still, HELD, 1.0))
+    return NormalEquations.prior(np.where(still, 0.0, z), np.zeros(len(z)), precision, log_scale, scale_std)
+
+
 def secant(
     motion: Float32[np.ndarray, "a 3 d"], step: Float[np.ndarray, " d"], moved: Float[np.ndarray, "a 3"]
 ) -> Float32[np.ndarray, "a 3 d"]:
@@ -166,10 +183,8 @@ def _step(
 
 def _solved(shape: Shape, here: Near, motion: Float32[np.ndarray, "a 3 d"], damping: float) -> Float[np.ndarray, " d"]:
     """Levenberg and Marquardt's step of the draws, the pose free."""
-    count, still = motion.shape[2], np.abs(motion).max(axis=(0, 1)) < 1e-9
-    precision = np.diag(np.where(still, HELD, 1.0))
-    normal = NormalEquations.prior(np.where(still, 0.0, here.z), np.zeros(count), precision, 0.0, 1e-6)
-    posed = Posed(here.rotation, here.translation, np.zeros(count))
+    normal = prior_of_draws(here.z, motion, 0.0, 1e-6)
+    posed = Posed(here.rotation, here.translation, np.zeros(len(here.z)))
     points = posed.place(shape.at(here.points))
     offset = points - shape.points
     weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * ROBUST * shape.std)

@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.config import MANY_DRAWS, DrawsConfig
 from mereo.fitting.correspondences import Correspondences
+from mereo.fitting.draws_approach import HELD, prior_of_draws, unmoving
 from mereo.fitting.gauss_newton import NormalEquations, Posed, along, geman_mcclure
 from mereo.fitting.playback import Drawn, DrawnStates, as_sparse, material_moved
 from mereo.fitting.problem import Problem
@@ -21,12 +22,6 @@ from mereo.fitting.residuals import MOST_VIOLATIONS, ROBUST, WITNESS_WEIGHT, Net
 from mereo.geometry.mesh import barycentric
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
-
-HELD = 1e6
-"""Precision of draws that move nothing here: they stay."""
-
-STILL = 1e-9
-"""Motion, in scene units for a standard deviation, below which a draw moves nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,9 +142,8 @@ def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
 def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:
     """``NormalEquations.narrowing`` of the draws that move something."""
     assert fit.motion is not None
-    still = int((np.abs(fit.motion).max(axis=(0, 1)) < STILL).sum())
     equations = normal_equations(problem, fit, fit.motion, problem.base.config.cloud_sigma)
-    return equations.narrowing() - still * float(np.log(HELD))
+    return equations.narrowing() - int(unmoving(fit.motion).sum()) * float(np.log(HELD))
 
 
 def normal_equations(
@@ -159,11 +153,7 @@ def normal_equations(
     base, posed, config = problem.base, fit.posed, problem.base.config
     flat, count = motion.reshape(len(motion), -1), len(fit.z)
     spread = problem.states.played.spread
-    still = np.abs(motion).max(axis=(0, 1)) < STILL
-    precision = np.diag(np.where(still, HELD, 1.0))
-    normal = NormalEquations.prior(
-        np.where(still, 0.0, fit.z), np.zeros(count), precision, posed.log_scale, base.scale_std
-    )
+    normal = prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std)
     network = problem.network(fit, (problem.followed @ flat).reshape(-1, 3, count))
     state = replace(posed, z=np.zeros(count))
     normal = network.add_to(normal, state, base.network_sigma, config.network_worth[1], robust=True)

@@ -25,10 +25,11 @@ def pack_tensors(tensors: Tensors, facts: Mapping[str, Any]) -> bytes:
     return save(whole, metadata={HEADER: json.dumps({**facts, CHECKSUM: _digest(whole, facts)})})
 
 
-def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_tensors(path: Path, dataset: str | None = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors of a file, and its facts, none where it has no header entry.
 
-    Raises ``FileNotFoundError``, and ``ValueError`` (its reason only) where the file is damaged.
+    Raises ``FileNotFoundError``, and ``ValueError`` (its reason only) where the file is damaged, or states another
+    dataset than the one of this key.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; it is part of a dataset: check the path")
@@ -41,6 +42,8 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise ValueError(str(error)) from None
     if expected is not None and expected != _digest(tensors, facts):
         raise ValueError("its checksum is another: its bytes have changed")
+    if dataset is not None and facts.get("dataset") not in (None, dataset):
+        raise ValueError("it is of another dataset")
     return tensors, facts
 
 

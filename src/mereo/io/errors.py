@@ -29,6 +29,9 @@ def readable(path: Path, kind: str) -> Iterator[None]:
     except (MemoryError, ImportError, SizeError):
         raise
     except Exception as error:
-        # a library's text may be several sentences: its first line is the reason
-        detail = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
-        raise ValueError(f"{path} cannot be read as a {kind} ({detail}): export or download it again") from error
+        raise ValueError(f"{path} cannot be read as a {kind} ({reason(error)}): export or download it again") from error
+
+
+def reason(error: Exception) -> str:
+    """First line of a library's text, which may be several sentences; the error's type where there is none."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")

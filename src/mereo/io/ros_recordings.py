@@ -20,6 +20,7 @@ from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.io.depth_formats import metres
+from mereo.io.errors import reason
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
 from mereo.io.size_limits import check_count, open_image
 
@@ -138,7 +139,7 @@ def _open(path: Path) -> Any:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     except Exception as error:  # a damaged bag raises whatever its storage format does
-        raise ValueError(f"{path} cannot be read as a ROS bag ({_reason(error)}): record or copy it again") from error
+        raise ValueError(f"{path} cannot be read as a ROS bag ({reason(error)}): record or copy it again") from error
     return reader
 
 
@@ -150,11 +151,7 @@ def _undamaged(path: Path) -> Iterator[None]:
     except (ValueError, ImportError, MemoryError):
         raise
     except Exception as error:
-        raise ValueError(f"{path} cannot be read any farther ({_reason(error)}): record or copy it again") from error
-
-
-def _reason(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
+        raise ValueError(f"{path} cannot be read any farther ({reason(error)}): record or copy it again") from error
 
 
 def _depth_topic(reader: Any, path: Path) -> str:
@@ -212,7 +209,7 @@ def _read(decode: Callable[[Any], Content], message: Callable[[], Any], source: 
     try:
         return decode(message())
     except Exception as error:  # whatever a broken message makes of the parser
-        raise ValueError(f"{source} cannot be read ({_reason(error)}): take another frame") from error
+        raise ValueError(f"{source} cannot be read ({reason(error)}): take another frame") from error
 
 
 def _depth_image(message: Any, camera: Camera, depth_scale: float | None) -> DepthImage:

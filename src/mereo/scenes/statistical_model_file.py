@@ -90,10 +90,7 @@ def save_statistical_model(model: StatisticalModel, path: Path, dataset: str | N
 def load_statistical_model(path: Path, dataset: str | None = None) -> StatisticalModel:
     """Read what ``save_statistical_model`` wrote; ``ValueError`` for another file, or one of another dataset."""
     try:
-        tensors, facts = read_tensors(path)
-        if dataset is not None and facts.get("dataset") not in (None, dataset):
-            raise ValueError("it is of another dataset")
-        return unpack_model(tensors, facts)
+        return unpack_model(*read_tensors(path, dataset))
     except (FileNotFoundError, KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(
             f"{path} is no statistical model of mereo ({error}); delete it and run `mereo generate ... --resume`"

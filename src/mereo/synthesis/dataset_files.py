@@ -52,7 +52,7 @@ def read_shard(path: Path, key: str, first: int | None = None, end: int | None =
 
     Raises ``FileNotFoundError``, and ``ValueError`` (its reason only) where it is damaged or another's.
     """
-    tensors, facts = _read(path, key)
+    tensors, facts = read_tensors(path, key)
     if first is not None and facts.get("first") not in (None, first):
         raise ValueError(f"it begins with example {facts['first']} instead of {first}")
     check_tensors(tensors, SHARD, {} if first is None or end is None else {"e": end - first})
@@ -61,16 +61,9 @@ def read_shard(path: Path, key: str, first: int | None = None, end: int | None =
 
 def read_template(path: Path, key: str, segments: int) -> Float16[np.ndarray, "s n n n"]:
     """Signed distances of a dataset's template for an object of so many segments; raises as ``read_shard`` does."""
-    tensors, _ = _read(path, key)
+    tensors, _ = read_tensors(path, key)
     check_tensors(tensors, {"distance": "s n n n"}, {"s": segments, "n": TEMPLATE_NODES})
     return tensors["distance"]
-
-
-def _read(path: Path, key: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    tensors, facts = read_tensors(path)
-    if facts.get("dataset") not in (None, key):
-        raise ValueError("it is of another dataset")
-    return tensors, facts
 
 
 def check_space(output: Path, examples: int, each: int, machines: int) -> None:
