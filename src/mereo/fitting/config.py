@@ -124,6 +124,7 @@ class DrawsConfig:
     explained: float = 0.125
     hopeless: float = 0.25
     batches: int = 1
+    passes: int = 0
     jumps: int = 2
     places: int = 6
     few: int = 30
@@ -134,7 +135,7 @@ class DrawsConfig:
 MANY_DRAWS = DrawsConfig(
     cloud_worth=3000.0,
     network_worth=10.0,
-    batches=2,
+    passes=1,
     starts=16,
     kept=1,
     sieve=((1, 3), (1, 1)),

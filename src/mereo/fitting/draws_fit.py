@@ -16,6 +16,7 @@ from mereo.fitting.draws_approach import Near, Shape, approach, derivatives, nea
 from mereo.fitting.draws_problem import DrawsFit, DrawsProblem, misfit, normal_equations, played
 from mereo.fitting.gauss_newton import POSE, Posed
 from mereo.fitting.hypotheses import robust_poses
+from mereo.fitting.modes_fit import refine
 from mereo.fitting.playback import Drawn
 from mereo.fitting.residuals import robust_square
 
@@ -33,13 +34,32 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """The best of several starts; None where the scene has too many draws or plays none of them back."""
     if problem.states.z.shape[1] > MOST_DRAWS:
         return None
-    guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
-    found = fitted(problem, modes, shape_of_modes(problem, modes), [guess])
+    found = like_modes(problem, modes, [])
+    for _ in range(problem.config.passes):
+        if explained(problem, found, problem.config.hopeless):
+            break
+        found += second_pass(problem, min(found, key=by_misfit, default=None))
     if problem.config.jumps and not explained(problem, found, problem.config.explained):
         camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
         found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
     best = min(found, key=lambda fit: fit.misfit, default=None)
     return None if best is None else jump(problem, best)
+
+
+def like_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:
+    """States that explain the frame, from starts like a fit of the modes, and from ``others``."""
+    guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
+    return fitted(problem, modes, shape_of_modes(problem, modes), [guess, *others])
+
+
+def second_pass(problem: DrawsProblem, best: DrawsFit | None) -> list[DrawsFit]:
+    """States like the modes' own fit from where the draws ended, which may be in another basin than their first."""
+    if best is None:
+        return []
+    pose, z = problem.model.project(best.placed())
+    scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
+    modes = refine(problem.base, Posed(pose[:3, :3] / scale, pose[:3, 3], z, float(np.log(scale))))
+    return like_modes(problem, modes, [replace(best.drawn, z=best.z)])
 
 
 def explained(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool:
