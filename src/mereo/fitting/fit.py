@@ -66,15 +66,24 @@ class ModesFit:
         model: StatisticalModel,
         scene_unit: float | None = None,
         config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+        doubtful: Float[np.ndarray, "d 3"] | None = None,
     ) -> "ModesFit":
-        """Fit of the modes to a cloud, seen from the origin, with correspondences in its unit."""
+        """Fit of the modes to a cloud, seen from the origin, with correspondences in its unit.
+
+        ``doubtful`` points are none of the cloud: along their lines of sight nothing is known (``Evidence.of``). Where
+        what the fit leaves over shows a noisy frame, it is fitted again as such.
+        """
         started = time.perf_counter()
         unit = estimate_unit(found) if scene_unit is None else scene_unit
         scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD
         found = found.scaled(1 / unit)
         with threadpool_limits(1, "blas"):  # products this small are slower on two threads, 20 times on busy cores
-            problem = Problem.of(model, found, Evidence.of(points / unit), scale_std, config)
+            evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit)
+            problem = Problem.of(model, found, evidence, scale_std, config)
             modes = fit_modes(problem)
+            noisy = problem.as_noisy_as(modes.posed)
+            if noisy is not None:
+                problem, modes = noisy, fit_modes(noisy)
             rest = fit_rest(problem, found, modes.posed)
             at_rest = is_at_rest(problem, modes, rest)
         return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
@@ -145,6 +154,7 @@ def fit_frame(
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
     code: EncodedCloud | None = None,
     stated_unit: float | None = None,
+    doubtful: Float[np.ndarray, "d 3"] | None = None,
 ) -> ModesFit:
     """Fit of the modes to a cloud, from the network's correspondences.
 
@@ -156,6 +166,7 @@ def fit_frame(
         config: constants.
         code: of the cloud, where it is known already.
         stated_unit: what the input says that ``scene_unit`` is, which is believed where the correspondences agree.
+        doubtful: points that were left out of the cloud as strays.
 
     Raises ``ValueError`` for a network without rest coordinates or of other segments, and where it finds too little.
     """
@@ -175,7 +186,7 @@ def fit_frame(
     if scene_unit is None and stated_unit is not None and agree(estimate_unit(found), stated_unit):
         scene_unit = stated_unit
     asked = time.perf_counter() - started
-    fitted = ModesFit.of(cloud.points, found, model, scene_unit, config)
+    fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful)
     return replace(fitted, seconds=fitted.seconds + asked)
 
 

@@ -11,6 +11,7 @@ from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import PARTNERS, Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed
 from mereo.fitting.joints import Joints
+from mereo.fitting.noise import constants_for, noise_of_frame
 from mereo.fitting.priors import PairTerm, Prior
 from mereo.fitting.residuals import (
     ROBUST,
@@ -96,6 +97,14 @@ class Problem:
         """Normal equations of what is known without the frame: prior, scale, kept distances up to ``slack``."""
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
         return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
+
+    def as_noisy_as(self, posed: Posed) -> "Problem | None":
+        """The problem with the constants for the noise that a fit leaves over; None where these are the same."""
+        distance = Surface.of(self.model, posed).nearest(self.evidence.partners)[0]
+        config = constants_for(noise_of_frame(distance, self.evidence), self.config)
+        if config is self.config:
+            return None
+        return replace(self, config=config)
 
     @cached_property
     def samples(self) -> SampledSurface:
