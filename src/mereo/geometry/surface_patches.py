@@ -12,6 +12,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mereo.geometry.downsampling import MAX_POINTS, thin_to_grid
+
 NEIGHBORS = 24
 """Neighbours that are looked at: in an image, the 5 x 5 pixels around one."""
 
@@ -20,6 +22,9 @@ BESIDE, AROUND = 1.6, 3.0
 
 JUMP = 4.0
 """Largest step in range between points beside each other, in widths of a pixel there: a surface seen at 76 degrees."""
+
+NOISE = 2.5
+"""The same in median steps between nearest neighbours, where that is more: closer points differ by noise alone."""
 
 INNER = 20
 """Neighbours of the same patch, of the 24, that make a point an inner one; a strip of three pixels has 14."""
@@ -31,26 +36,40 @@ def surface_points(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     Args:
         points: seen from the origin (camera frame), any unit and density.
     """
-    if len(points) <= NEIGHBORS + 1:
-        return np.ones(len(points), dtype=bool)
-    patch, inner = _patches(points)
-    keep: Bool[np.ndarray, " n"] = np.bincount(patch, inner)[patch] > 0
-    return keep if keep.any() else np.ones(len(points), dtype=bool)
+    return surface_patches(points)[1]
+
+
+def surface_patches(points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Number of each point's patch, and whether that patch is wide enough to be a surface, as in ``surface_points``.
+
+    Of more than ``MAX_POINTS``, points evenly in space are looked at, and the others go with the nearest of these.
+    """
+    rows = thin_to_grid(points, MAX_POINTS)
+    places, place = np.unique(points[rows], axis=0, return_inverse=True)
+    if len(places) <= NEIGHBORS + 1:
+        return np.zeros(len(points), dtype=np.int64), np.ones(len(points), dtype=bool)
+    patch, inner = _patches(places)
+    surface = np.bincount(patch, inner)[patch] > 0
+    if not surface.any():
+        surface[:] = True
+    nearest = place.reshape(-1) if len(rows) == len(points) else cKDTree(places).query(points)[1]
+    return patch[nearest], surface[nearest]
 
 
 def _patches(points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Number of each point's patch, and whether it is an inner point of it."""
+    """Number of the patch of each of many different points, and whether it is an inner point of it."""
     distance = np.linalg.norm(points, axis=1)
     sight = points / np.maximum(distance, np.finfo(float).tiny)[:, None]
     angle, neighbor = cKDTree(sight).query(sight, k=NEIGHBORS + 1)
     angle, neighbor = angle[:, 1:], neighbor[:, 1:]
     pitch = float(np.median(angle[:, 3]))
     step = np.abs(distance[neighbor] - distance[:, None])
-    row, column = np.nonzero((angle <= BESIDE * pitch) & (step <= JUMP * pitch * distance[:, None]))
+    tall = np.maximum(JUMP * pitch * distance, NOISE * float(np.median(step[:, :4])))
+    row, column = np.nonzero((angle <= BESIDE * pitch) & (step <= tall[:, None]))
     edges = (np.ones(len(row), dtype=np.int8), (row, neighbor[row, column]))
     patch = connected_components(coo_matrix(edges, shape=(len(points),) * 2), directed=False)[1]
     same = (angle <= AROUND * pitch) & (patch[neighbor] == patch[:, None])
-    return patch, same.sum(axis=1) >= INNER
+    return patch.astype(np.int64), same.sum(axis=1) >= INNER
 
 
 def longest_side(points: Float[np.ndarray, "n 3"]) -> float:
