@@ -15,6 +15,7 @@ from analytic import AnalyticModel, ball, logits_of, union, untrained
 
 import mereo
 from mereo.cli.reconstruct import reconstruct_file
+from mereo.cli.stream import stream_reconstructions
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.scanner_axes import scanner_to_camera
@@ -183,13 +184,19 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     assert max(summary["visible_size_m"]) == pytest.approx(np.ptp(cloud[:, 1]), rel=1e-6)
 
 
+def with_strays() -> tuple[np.ndarray, np.ndarray, AnalyticModel]:
+    """The two balls with thirty single points far behind, the balls alone, and their model."""
+    own, model = scene("camera")
+    lone = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
+    return np.concatenate([own, lone]), own, model
+
+
 def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Thirty single points far behind; without them the answer is that to the object's own points, bit for bit."""
-    own, model = scene("camera")
-    lone = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
-    np.save(tmp_path / "cloud.npy", np.concatenate([own, lone]))
+    """The answer is that to the object's own points, bit for bit."""
+    cloud, own, model = with_strays()
+    np.save(tmp_path / "cloud.npy", cloud)
     monkeypatch.setattr(
         "mereo.cli.reconstruct.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]})
     )
@@ -209,14 +216,25 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
 
 
 def test_a_reconstruction_says_what_it_was_made_from() -> None:
-    own, model = scene("camera")
-    lone = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
-    found = reconstruct(np.concatenate([own, lone]), model, resolution=16, label_points=True)
+    cloud, own, model = with_strays()
+    found = reconstruct(cloud, model, resolution=16, label_points=True)
     assert found.reading is not None and found.observed is not None and found.reading.dropped == 30
     np.testing.assert_array_equal(found.reading.cloud.points, own)
     np.testing.assert_array_equal(found.observed.points, own)
     alone = reconstruct(own, model, resolution=16)
     assert alone.reading is not None and alone.reading.dropped == 0
+
+
+@pytest.mark.parametrize("keep_all, strays", [(False, 30), (True, 0)])
+def test_a_stream_drops_strays_and_counts_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keep_all: bool, strays: int
+) -> None:
+    cloud, _, model = with_strays()
+    np.save(tmp_path / "cloud.npy", cloud)
+    monkeypatch.setattr("mereo.cli.stream.load_for", lambda *_: model)
+    isolation = IsolationConfig(keep_all=keep_all)
+    stream_reconstructions(str(tmp_path), "any", resolution=16, every_frame=True, isolation=isolation)
+    assert json.loads(capsys.readouterr().out)["strays"] == strays
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
