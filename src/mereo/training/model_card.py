@@ -119,9 +119,11 @@ def _training(provenance: dict[str, object]) -> str:
 def _nearest_preset(recipe: dict[str, Any]) -> str:
     """Name of the preset whose network it is, else of which most settings are."""
     network = NetworkConfig.from_dict(recipe["network"])  # what older recipes do not state is at its default
+    share = recipe.get("augment", {}).get("observations", 0.0)  # which the dataset decides, too
 
     def agreement(preset: str) -> tuple[bool, int]:
-        known = json.loads(json.dumps(PRESETS[preset].to_dict()))
+        compared = replace(PRESETS[preset], augment=replace(PRESETS[preset].augment, observations=share))
+        known = json.loads(json.dumps(compared.to_dict()))
         return PRESETS[preset].network == network, sum(known[key] == recipe.get(key) for key in known)
 
     return max(PRESETS, key=agreement)
