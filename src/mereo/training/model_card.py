@@ -110,10 +110,22 @@ def _training(provenance: dict[str, object]) -> str:
     ]
     if provenance.get("data"):
         lines.append(f"- how they were generated: `{json.dumps(provenance['data'])}`")
+    lines += _observations(provenance)
     lines.append(f"- {steps} steps of {batch} examples{seen}")
     if recipe:
         lines.append(f"- recipe, nearest preset `{_nearest_preset(recipe)}`: `{json.dumps(recipe)}`")
     return "\n".join([*lines, ""])
+
+
+def _observations(provenance: dict[str, Any]) -> list[str]:
+    """Line on the further observations that were trained on; none where there were none."""
+    names = (provenance.get("data") or {}).get("observations")
+    share = (provenance.get("recipe") or {}).get("augment", {}).get("observations")
+    if not names or not share:
+        return []
+    return [
+        f"- observations: in {100 * share:g} % of its turns an example is seen by one of {', '.join(names)} instead"
+    ]
 
 
 def _nearest_preset(recipe: dict[str, Any]) -> str:
