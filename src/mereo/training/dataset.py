@@ -180,7 +180,7 @@ class Dataset:
 
 
 def draw_observations(count: int, further: int, probability: float, rng: torch.Generator) -> Int[Tensor, " b"]:
-    """Number of the observation that is seen of each of ``count`` examples: 0 its own, or one of so many further ones."""
+    """Number of the observation seen of each of ``count`` examples: 0 its own, or one of so many further ones."""
     if further == 0 or probability == 0:  # nothing is drawn, so that runs without observations stay what they were
         return torch.zeros(count, dtype=torch.long)
     chosen = torch.rand(count, generator=rng) < probability
