@@ -161,18 +161,23 @@ def test_one_that_hardly_sees_the_object_is_the_first_cloud(monkeypatch: pytest.
     assert all(np.array_equal(cloud, found.cloud) for cloud in found.observations)
 
 
-def test_strays_are_removed_except_in_some(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cleaned clouds are those of the uncleaned ones without strays."""
-    counts = {}
-    for probability in (0.0, 1.0):
-        monkeypatch.setattr(observations, "UNCLEANED", probability)
-        settings = replace(SMALL, image_size=96, points=4096, observations=("mask",))
+def test_an_observation_keeps_its_strays_or_loses_those_found_or_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = replace(SMALL, image_size=96, points=4096, observations=("mask",))
+
+    def clouds(uncleaned: float, by_rule: float) -> list[np.ndarray]:
+        monkeypatch.setattr(observations, "UNCLEANED", uncleaned)
+        monkeypatch.setattr(observations, "BY_RULE", by_rule)
         found = [example(settings, index) for index in range(4)]
-        counts[probability] = [len(item.observations[0]) for item in found]
-        for item in found if probability == 1.0 else ():
-            keep = without_strays(item.normalizer.invert(item.observations[0]))
-            counts.setdefault(0.5, []).append(int(keep.sum()))
-    assert counts[0.0] == counts[0.5] and sum(counts[0.0]) < sum(counts[1.0])
+        return [item.normalizer.invert(item.observations[0]) for item in found]
+
+    whole, by_rule, right = clouds(1.0, 0.0), clouds(0.0, 1.0), clouds(0.0, 0.0)
+    assert [len(cloud) for cloud in by_rule] == [int(without_strays(cloud).sum()) for cloud in whole]
+    assert sum(map(len, by_rule)) < sum(map(len, whole)) and sum(map(len, right)) < sum(map(len, whole))
+    for cloud, seen in zip(right, whole, strict=True):
+        assert (np.abs(seen[:, None] - cloud).max(axis=2).min(axis=0) < 1e-9).all(), "points of the same cloud"
+    assert (
+        max(np.ptp(cloud, axis=0).max() for cloud in right) < 45 < max(np.ptp(cloud, axis=0).max() for cloud in whole)
+    )
 
 
 def flat(rows: int, columns: int, depth: float, left: int = 0) -> np.ndarray:

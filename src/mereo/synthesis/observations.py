@@ -1,7 +1,9 @@
 """Further observations of an example: the same state and camera, seen by other sensors.
 
-Training sees a random one of them, so a network learns what cameras, tools and masks do to a cloud. In use strays are
-removed before a network sees a cloud, so they are removed here by the same rule, but not always: the rule errs, too.
+Training sees a random one of them, so a network learns what cameras, tools and masks do to a cloud. In use a network
+sees a cloud in up to three ways: with its strays; without those that the rule of ``surface_patches`` finds, which on
+thin objects takes more than strays; and, once a fit knows where the object is, with little but the object's points.
+So each observation is read in one of these ways.
 """
 
 import numpy as np
@@ -17,8 +19,8 @@ from mereo.synthesis.clutter import OBJECT
 from mereo.synthesis.config import OBSERVATIONS, GenerateConfig, SensorConfig
 from mereo.synthesis.depth_sensor import observe
 
-UNCLEANED = 0.1
-"""Probability that the strays of an observation stay in it."""
+UNCLEANED, BY_RULE = 0.1, 0.4
+"""Probabilities that an observation keeps its strays, and that it loses those that the rule finds; else it loses all."""
 
 Clouds = tuple[Float[np.ndarray, "_ 3"], ...]
 
@@ -53,12 +55,14 @@ def _observed_points(
     solids: Solids, first: DepthImage, noise_std: float, sensor: SensorConfig, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"] | None:
     """Points that a sensor sees in place of ``first``, in the camera frame; None where too few show the object."""
-    uncleaned = rng.random() < UNCLEANED
+    way = rng.random()
     seen = observe(solids, first.camera, noise_std, sensor, rng)
     image = seen.image
     points = image.to_points().points
     if seen.object_points < MIN_POINTS:
         return None
-    keep = np.ones(len(points), dtype=bool) if uncleaned else without_strays(points)
     shows_object = (seen.source == OBJECT)[image.valid]
+    if way < UNCLEANED:
+        return points
+    keep = without_strays(points) if way < UNCLEANED + BY_RULE else shows_object
     return points[keep] if (keep & shows_object).sum() >= MIN_POINTS else None
