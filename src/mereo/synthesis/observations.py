@@ -20,7 +20,7 @@ from mereo.synthesis.config import OBSERVATIONS, GenerateConfig, SensorConfig
 from mereo.synthesis.depth_sensor import observe
 
 UNCLEANED, BY_RULE = 0.1, 0.4
-"""Probabilities that an observation keeps its strays, and that it loses those that the rule finds; else it loses all."""
+"""Probabilities that an observation keeps its strays and that it loses those that the rule finds; else it loses all."""
 
 Clouds = tuple[Float[np.ndarray, "_ 3"], ...]
 
