@@ -30,6 +30,9 @@ NOISE = 2.5
 INNER = 20
 """Neighbours of the same patch, of the 24, that make a point an inner one; a strip of three pixels has 14."""
 
+STRETCH = 1.03
+"""How much longer strays make the points' box where they are left out: the box is what a network is normalized by."""
+
 
 def surface_points(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Whether each point belongs to a patch of surface; all do where the cloud is too sparse to tell.
@@ -82,3 +85,15 @@ def _patches(
 def longest_side(points: Float[np.ndarray, "n 3"]) -> float:
     """Longest side of the points' box, parallel to the axes."""
     return float(np.ptp(points, axis=0).max())
+
+
+def without_strays(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Whether each point is left where strays are removed: all are, unless strays make the box ``STRETCH`` longer.
+
+    Args:
+        points: seen from the origin (camera frame), any unit and density.
+    """
+    keep = surface_points(points)
+    if keep.all() or longest_side(points) <= STRETCH * longest_side(points[keep]):
+        return np.ones(len(points), dtype=bool)
+    return keep
