@@ -31,7 +31,9 @@ INNER = 20
 """Neighbours of the same patch, of the 24, that make a point an inner one; a strip of three pixels has 14."""
 
 STRETCH = 1.03
-"""How much longer strays make the points' box where they are left out: the box is what a network is normalized by."""
+"""Times by which points off all surfaces must lengthen the cloud's box to matter: a network is normalized by that box.
+
+They do on 0.81 of views of simulated sensors and on 0.06 of clean ones; on none of four real scans (1.02 at most)."""
 
 
 def surface_points(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
