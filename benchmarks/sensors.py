@@ -5,7 +5,7 @@
 For each sensor: CPU time of a depth image at the paper's size (the least of three rounds over the same views, search
 structures built before), the share of object pixels that are left, the share of the cloud that is not the object, and
 how far depth is off on object pixels (median of the absolute error, scaled to a normal deviation, in millimetres).
-CPU time of whole examples with the paper's sensor is printed for comparison.
+CPU time of whole examples with the paper's sensor is printed for comparison, without and with further observations.
 """
 
 import argparse
@@ -16,6 +16,7 @@ import numpy as np
 
 from mereo.geometry.solids import Solids
 from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.clutter import OBJECT
 from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SensorConfig
@@ -26,6 +27,7 @@ SENSORS_BY_NAME: dict[str, SensorConfig] = {**SENSORS} | {  # type: ignore[dict-
     name: replace(SensorConfig(), **{name: 1.0}) for name in SENSOR_TERMS
 }
 ROUNDS = 3
+OBSERVED = GenerateConfig(observations=("all",))
 
 
 def milliseconds(views: list[tuple[View, Solids]], sensor: SensorConfig) -> float:
@@ -52,14 +54,19 @@ def effect(views: list[tuple[View, Solids]], sensor: SensorConfig) -> tuple[floa
     return float(np.mean(left)), float(np.mean(stray)), float(np.median(np.concatenate(errors)) / 0.6745)
 
 
+def example_milliseconds(scene: Scene, settings: GenerateConfig, count: int) -> float:
+    start = time.process_time()
+    for index in range(count):
+        synthesize(scene, settings, example_rng(1, index))
+    return 1e3 * (time.process_time() - start) / count
+
+
 def measure(name: str, count: int) -> None:
     scene, clean = load_scene(name), GenerateConfig(noise_std=0.0)
     views = [(view, Solids(view.mesh)) for view in (sample_view(scene, clean, example_rng(1, i)) for i in range(count))]
     milliseconds(views, SensorConfig())  # builds the search structures
-    start = time.process_time()
-    for index in range(count):
-        synthesize(scene, GenerateConfig(), example_rng(1, index))
-    print(f"\n{name}: {count} views, {1e3 * (time.process_time() - start) / count:.1f} ms for an example")
+    plain, observed = (example_milliseconds(scene, settings, count) for settings in (GenerateConfig(), OBSERVED))
+    print(f"\n{name}: {count} views, {plain:.1f} ms for an example, {observed:.1f} ms with all further observations")
     print(f"{'sensor':20}{'ms':>8}{'left':>8}{'stray':>8}{'off, mm':>10}")
     for sensor_name, sensor in SENSORS_BY_NAME.items():
         left, stray, error = effect(views, sensor)

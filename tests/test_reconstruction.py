@@ -15,6 +15,7 @@ from analytic import AnalyticModel, ball, logits_of, union, untrained
 
 import mereo
 from mereo.cli.reconstruct import reconstruct_file
+from mereo.cli.stream import stream_reconstructions
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.scanner_axes import scanner_to_camera
@@ -166,14 +167,14 @@ def test_from_file_to_files(
 def test_what_is_read_and_left_out_is_printed_and_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Strays beside the object are pointed out, and left out when asked; the summary says so."""
+    """Something else beside the object is left out when asked; the summary says so."""
     cloud, model = scene("camera")
     np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
     monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
     read = partial(reconstruct_file, tmp_path / "cloud.npy", "any", resolution=16)
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
         read(output=tmp_path / "crowded")
-    assert "33.3% of it lies apart from the largest group; if that is not the object" in capsys.readouterr().out
+    assert "strays:" not in capsys.readouterr().out, "it is a surface: nothing says that it is not the object"
     with pytest.warns(SizeWarning, match="the visible part is 0.1[0-9]* m long"):
         read(output=tmp_path / "alone", isolation=IsolationConfig(largest_cluster=True, cluster_gap=0.02))
     assert "largest cluster: 1200 of 1800 points kept (1 of 2 clusters" in capsys.readouterr().out
@@ -181,6 +182,59 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     assert summary["points"] == 1200 and summary["isolation"][-1]["name"] == "largest cluster"
     np.testing.assert_allclose(summary["depth_m"], np.quantile(cloud[:, 2], [0, 0.5, 1]))
     assert max(summary["visible_size_m"]) == pytest.approx(np.ptp(cloud[:, 1]), rel=1e-6)
+
+
+def with_strays() -> tuple[np.ndarray, np.ndarray, AnalyticModel]:
+    """The two balls with thirty single points far behind, the balls alone, and their model."""
+    own, model = scene("camera")
+    lone = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
+    return np.concatenate([own, lone]), own, model
+
+
+def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer is that to the object's own points, bit for bit."""
+    cloud, own, model = with_strays()
+    np.save(tmp_path / "cloud.npy", cloud)
+    monkeypatch.setattr(
+        "mereo.cli.reconstruct.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]})
+    )
+    read = partial(reconstruct_file, tmp_path / "cloud.npy", "any", resolution=16)
+    result = read(output=tmp_path / "out")
+    said = capsys.readouterr().out
+    assert "strays: 30 of 1230 points dropped, the longest side was" in said and "(--keep-all keeps them)" in said
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert summary["points"] == 1200 and max(summary["visible_size_m"]) < 0.2
+    (step,) = summary["isolation"]
+    assert (step["name"], step["before"], step["kept"]) == ("strays", 1230, 1200)
+    np.testing.assert_array_equal(result.labels.labels, reconstruct(own, model, resolution=16).labels.labels)
+    with pytest.warns(SizeWarning, match="the visible part is 0.[5-9][0-9]* m long"):
+        read(output=tmp_path / "all", isolation=IsolationConfig(keep_all=True))
+    assert "strays:" not in capsys.readouterr().out
+    assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
+
+
+def test_a_reconstruction_says_what_it_was_made_from() -> None:
+    cloud, own, model = with_strays()
+    found = reconstruct(cloud, model, resolution=16, label_points=True)
+    assert found.reading is not None and found.observed is not None and found.reading.dropped == 30
+    np.testing.assert_array_equal(found.reading.cloud.points, own)
+    np.testing.assert_array_equal(found.observed.points, own)
+    alone = reconstruct(own, model, resolution=16)
+    assert alone.reading is not None and alone.reading.dropped == 0
+
+
+@pytest.mark.parametrize("keep_all, strays", [(False, 30), (True, 0)])
+def test_a_stream_drops_strays_and_counts_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keep_all: bool, strays: int
+) -> None:
+    cloud, _, model = with_strays()
+    np.save(tmp_path / "cloud.npy", cloud)
+    monkeypatch.setattr("mereo.cli.stream.load_for", lambda *_: model)
+    isolation = IsolationConfig(keep_all=keep_all)
+    stream_reconstructions(str(tmp_path), "any", resolution=16, every_frame=True, isolation=isolation)
+    assert json.loads(capsys.readouterr().out)["strays"] == strays
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:

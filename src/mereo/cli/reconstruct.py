@@ -22,9 +22,9 @@ from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.isolation import STRAY_SHARE, stray_share
 from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
 from mereo.reconstruction.pipeline import Reconstruction
+from mereo.reconstruction.strays import readings
 from mereo.visualization.result_files import write_files
 
 
@@ -75,9 +75,10 @@ def reconstruct_file(
         frame = read_frame(input, reading)
         seen = find_object(frame, isolation)
         print(seen)
-        apart = 0.0 if isolation.largest_cluster else stray_share(seen.cloud)
-        if apart > STRAY_SHARE:
-            print(f"{apart:.1%} of it lies apart from the largest group; if that is not the object: --largest-cluster")
+        taken = readings(seen.cloud, frame.axes, isolation.keep_all)[0]
+        if taken.dropped:
+            print(taken)
+        seen = seen.read_as(taken)
         model = load_for(weights, inference)
         warning = size_warning(seen, model.provenance)
         if warning is not None:

@@ -46,7 +46,7 @@ def stream_reconstructions(
     frames: Iterable[StreamFrame | None] = (
         watched_frames(source, reading, isolation) if watch else frames_of(source, reading, isolation, rate_hz)
     )
-    answer = partial(reconstruct, model=model, resolution=resolution, frame=reading.frame)
+    answer = partial(reconstruct, model=model, resolution=resolution, frame=reading.frame, keep_all=isolation.keep_all)
     # what is written to standard input or into a watched folder arrives when it does
     pace = not every_frame and not watch and source != STANDARD_INPUT
     outcomes: Iterator[Outcome[Reconstruction]] = stream(frames, answer, recorded_pace=pace, every_frame=every_frame)
@@ -105,4 +105,5 @@ def line(outcome: Outcome[Reconstruction]) -> dict[str, Any]:
         for segment in outcome.result.segments
         if segment.voxels
     }
-    return {**facts, "segments": found}
+    reading = outcome.result.reading
+    return {**facts, "strays": 0 if reading is None else reading.dropped, "segments": found}

@@ -135,6 +135,7 @@ class DrawsConfig:
 MANY_DRAWS = DrawsConfig(
     cloud_worth=3000.0,
     network_worth=10.0,
+    batches=2,
     passes=1,
     starts=16,
     kept=1,

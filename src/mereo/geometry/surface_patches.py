@@ -1,9 +1,10 @@
 """Surface patches of a point cloud: what hangs together as seen from the camera, and what is too thin to be a surface.
 
-Where a mask is wrong by a pixel or two, it lets in a rim of whatever is behind the object, and cameras add points between
-both. They are few, but they lie far off. Such a rim is one to three pixels wide, a surface is wider: so a patch counts
-where some point of it has nearly all of the 24 neighbours that it would have inside an image. Measured in
-docs/design/0006-sensors.md. Notation: n points, k neighbours.
+Where a mask is wrong by a pixel or two, it lets in a rim of whatever is behind the object, and cameras add points
+between both. They are few, but they lie far off. Such a rim is one to three pixels wide, a surface is wider: so a patch
+counts where some point of it has nearly all of the 24 neighbours that it would have inside an image, and what lies
+right at it in space, where it turns away from the camera, is its own. Measured in docs/design/0006-sensors.md.
+Notation: n points, k neighbours.
 """
 
 import numpy as np
@@ -11,6 +12,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+
+from mereo.geometry.downsampling import MAX_POINTS, thin_to_grid
 
 NEIGHBORS = 24
 """Neighbours that are looked at: in an image, the 5 x 5 pixels around one."""
@@ -21,8 +24,16 @@ BESIDE, AROUND = 1.6, 3.0
 JUMP = 4.0
 """Largest step in range between points beside each other, in widths of a pixel there: a surface seen at 76 degrees."""
 
+NOISE = 2.5
+"""The same in median steps between nearest neighbours, where that is more: closer points differ by noise alone."""
+
 INNER = 20
 """Neighbours of the same patch, of the 24, that make a point an inner one; a strip of three pixels has 14."""
+
+STRETCH = 1.03
+"""Times by which points off all surfaces must lengthen the cloud's box to matter: a network is normalized by that box.
+
+They do on 0.81 of views of simulated sensors and on 0.06 of clean ones; on none of four real scans (1.02 at most)."""
 
 
 def surface_points(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -31,28 +42,60 @@ def surface_points(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     Args:
         points: seen from the origin (camera frame), any unit and density.
     """
-    if len(points) <= NEIGHBORS + 1:
-        return np.ones(len(points), dtype=bool)
-    patch, inner = _patches(points)
-    keep: Bool[np.ndarray, " n"] = np.bincount(patch, inner)[patch] > 0
-    return keep if keep.any() else np.ones(len(points), dtype=bool)
+    return surface_patches(points)[1]
 
 
-def _patches(points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Number of each point's patch, and whether it is an inner point of it."""
+def surface_patches(points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Number of each point's patch, and whether it belongs to one that is a surface, as in ``surface_points``.
+
+    Of more than ``MAX_POINTS``, points evenly in space are looked at, and the others go with the nearest of these.
+    """
+    rows = thin_to_grid(points, MAX_POINTS)
+    places, place = np.unique(points[rows], axis=0, return_inverse=True)
+    if len(places) <= NEIGHBORS + 1:
+        return np.zeros(len(points), dtype=np.int64), np.ones(len(points), dtype=bool)
+    patch, inner, tall = _patches(places)
+    surface = np.bincount(patch, inner)[patch] > 0
+    if not surface.any():
+        surface[:] = True
+    elif not surface.all():
+        surface[~surface] = cKDTree(places[surface]).query(places[~surface])[0] <= tall[~surface]
+    nearest = place.reshape(-1) if len(rows) == len(points) else cKDTree(places).query(points)[1]
+    return patch[nearest], surface[nearest]
+
+
+def _patches(
+    points: Float[np.ndarray, "n 3"],
+) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Number of the patch of each of many different points, whether it is an inner one, and its largest step."""
     distance = np.linalg.norm(points, axis=1)
     sight = points / np.maximum(distance, np.finfo(float).tiny)[:, None]
     angle, neighbor = cKDTree(sight).query(sight, k=NEIGHBORS + 1)
     angle, neighbor = angle[:, 1:], neighbor[:, 1:]
-    pitch = float(np.median(angle[:, 3]))
+    fourth = angle[:, 3]
+    # as wide as of most points or as of those around, whichever is more: parts of a cloud may be sparser than others
+    pitch = np.maximum(np.median(fourth), np.median(fourth[neighbor], axis=1))
     step = np.abs(distance[neighbor] - distance[:, None])
-    row, column = np.nonzero((angle <= BESIDE * pitch) & (step <= JUMP * pitch * distance[:, None]))
+    tall = np.maximum(JUMP * pitch * distance, NOISE * float(np.median(step[:, :4])))
+    row, column = np.nonzero((angle <= BESIDE * pitch[:, None]) & (step <= tall[:, None]))
     edges = (np.ones(len(row), dtype=np.int8), (row, neighbor[row, column]))
     patch = connected_components(coo_matrix(edges, shape=(len(points),) * 2), directed=False)[1]
-    same = (angle <= AROUND * pitch) & (patch[neighbor] == patch[:, None])
-    return patch, same.sum(axis=1) >= INNER
+    same = (angle <= AROUND * pitch[:, None]) & (patch[neighbor] == patch[:, None])
+    return patch.astype(np.int64), same.sum(axis=1) >= INNER, tall
 
 
 def longest_side(points: Float[np.ndarray, "n 3"]) -> float:
     """Longest side of the points' box, parallel to the axes."""
     return float(np.ptp(points, axis=0).max())
+
+
+def without_strays(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Whether each point is left where strays are removed: all are, unless strays make the box ``STRETCH`` longer.
+
+    Args:
+        points: seen from the origin (camera frame), any unit and density.
+    """
+    keep = surface_points(points)
+    if keep.all() or longest_side(points) <= STRETCH * longest_side(points[keep]):
+        return np.ones(len(points), dtype=bool)
+    return keep

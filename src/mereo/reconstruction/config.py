@@ -1,14 +1,14 @@
 """Settings of getting the object out of a frame; light, so that the command line may import them."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mereo.io.bounds import NotNegative, check_bounds
 
 
 @dataclass(frozen=True)
 class IsolationConfig:
-    """Parts of a frame to leave out, so that only the object is left. Everything is off by default.
+    """Parts of a frame to leave out, so that only the object is left. Only strays are dropped by default.
 
     Attributes:
         depth_range: nearest and farthest depth (z) in metres that is kept.
@@ -18,6 +18,8 @@ class IsolationConfig:
         largest_cluster: keep only the largest group of points that hang together. A part that something else in front
             cuts off is lost, unless `cluster_gap` reaches it.
         cluster_gap: with `largest_cluster`, also keep groups (of 32 points or more) nearer than this to it, in metres.
+        keep_all: drop no strays, the points off all surfaces (a rim of background, flying pixels) that would stretch
+            the cloud.
     """
 
     depth_range: tuple[float, float] | None = None
@@ -26,6 +28,7 @@ class IsolationConfig:
     remove_outliers: bool = False
     largest_cluster: bool = False
     cluster_gap: NotNegative = 0.0
+    keep_all: bool = False
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -51,8 +54,8 @@ class IsolationConfig:
 
     @property
     def on(self) -> bool:
-        """Whether anything may be left out."""
-        return self != IsolationConfig()
+        """Whether a step was asked for."""
+        return replace(self, keep_all=False) != IsolationConfig()
 
 
 def _numbers(values: tuple[float, ...]) -> str:

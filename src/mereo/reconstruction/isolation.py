@@ -3,7 +3,8 @@
     PointCloud -depth range-> -box-> -plane-> -thin-> -cluster-> -outliers-> PointCloud
 
 Every step is off by default, works on single points (no step moves one), and reports how many points it took away. The
-steps that compare neighbours measure lengths in the cloud's own spacing, so they need no unit and no setting.
+steps that compare neighbours measure lengths in the cloud's own spacing, so they need no unit and no setting. What is
+dropped without being asked for is in ``strays``.
 """
 
 from collections.abc import Callable, Iterator
@@ -38,9 +39,6 @@ CLUSTER_NEIGHBORS, CLUSTER_GAP = 12, 10.0
 
 Nearest neighbours adapt to density: a surface seen edge-on, whose points are far apart, hangs together, while two dense
 sheets at the same distance do not. With a gap of 6, clean views lost up to 2 % of their points."""
-
-STRAY_SHARE = 0.005
-"""Share of the points beside the largest cluster from which on it is worth a word."""
 
 
 @dataclass(frozen=True)
@@ -203,8 +201,3 @@ def _largest_cluster(points: Float[np.ndarray, "n 3"], gap: float) -> Keep:
     others = np.unique(label[~keep])
     left_out = f", the largest left out has {sizes[others].max()}" if len(others) else ""
     return keep, f"{len(sizes) - len(others)} of {len(sizes)} clusters{left_out}"
-
-
-def stray_share(cloud: PointCloud) -> float:
-    """Share of the points, thinned evenly in space, that lies apart from the largest cluster."""
-    return float((clusters(cloud.points[thin_to_grid(cloud.points, MAX_POINTS)]) > 0).mean())

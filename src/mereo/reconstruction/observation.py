@@ -6,7 +6,7 @@ Frames are read by ``mereo.io.sensor_frame``.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.io.sensor_frame import SensorFrame, depths_m
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import IsolationStep, isolate
+from mereo.reconstruction.strays import Reading
 
 SIZE_FACTOR = 2.0
 """Times that a visible part may be smaller or larger than any in training; beyond, it is another object or unit."""
@@ -38,6 +39,11 @@ class Observation:
     cloud: PointCloud
     steps: tuple[IsolationStep, ...] = ()
 
+    def read_as(self, reading: Reading) -> "Observation":
+        """The object as a reading of ``cloud`` has it: what was dropped as strays is a step of its own."""
+        steps = self.steps if reading.step is None else (*self.steps, reading.step)
+        return replace(self, cloud=reading.cloud, steps=steps)
+
     @property
     def depth_m(self) -> tuple[float, float, float]:
         """Nearest, middle and farthest depth of the object, in metres."""
@@ -50,7 +56,7 @@ class Observation:
         return x, y, z
 
     def facts(self) -> dict[str, Any]:
-        """Source, unit, depth, size and steps for a result's summary."""
+        """Source, unit, depth, size and steps, dropped strays among them, for a result's summary."""
         return {
             "source": self.frame.source,
             "unit_m": self.frame.unit_m,

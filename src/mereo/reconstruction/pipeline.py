@@ -1,7 +1,7 @@
 """The inverse path: from what a camera saw of an object to all its segments, hidden side included.
 
-    PointCloud -normalize-> -encode-> EncodedCloud -query-> Field -locate, extract-> SegmentedMesh
-                                           '---------------- ask for more ----------------> Answer
+    PointCloud -drop strays-> -normalize-> -encode-> EncodedCloud -query-> Field -locate, extract-> SegmentedMesh
+                                                         '---------------- ask for more ----------------> Answer
 
 ``reconstruct`` undoes what ``mereo.synthesis.examples.synthesize`` does. Everything that comes out is in the input's
 frame and units.
@@ -26,6 +26,7 @@ from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import Field
 from mereo.reconstruction.isosurfaces import extract_whole, locate
 from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
+from mereo.reconstruction.strays import Reading, readings
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
@@ -45,7 +46,8 @@ class Reconstruction:
         clipped: whether a segment still reached the largest box and was closed there.
         code: what the model made of the cloud; ask it for more with ``Model.query``, in the camera frame.
         T_camera_input: from the input's frame to the camera frame.
-        observed: the segment of each input point, where it was asked for.
+        observed: the segment of each point that is taken for the object's, where it was asked for.
+        reading: these points, and what of the input was dropped as strays; None where no one decided.
     """
 
     surfaces: SegmentedMesh
@@ -57,6 +59,7 @@ class Reconstruction:
     code: EncodedCloud
     T_camera_input: Float[np.ndarray, "4 4"]
     observed: SegmentedCloud | None = None
+    reading: Reading | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +104,7 @@ def reconstruct(
     resolution: int = 128,
     frame: CloudAxes = "camera",
     label_points: bool = False,
+    keep_all: bool = False,
 ) -> Reconstruction:
     """All segments of the object that a cloud shows, hidden side included, as the network alone finds them.
 
@@ -111,10 +115,13 @@ def reconstruct(
         frame: the cloud's axes: "camera" is x right, y down, z forward from the camera at the origin; "scanner" is y
             up, z toward the scanner.
         label_points: also say on which segment each point of the cloud lies (``Reconstruction.observed``).
+        keep_all: drop no strays, see ``readings``; else ``Reconstruction.reading`` says what was dropped.
 
     Raises ``ValueError`` for unusable clouds, and where the model finds no segment at all.
     """
-    return extract(encode_frame(cloud, model, frame), model, resolution, label_points)
+    reading = readings(cloud, frame, keep_all)[0]
+    found = extract(encode_frame(reading.cloud, model, frame), model, resolution, label_points)
+    return replace(found, reading=reading)
 
 
 def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_points: bool = False) -> Reconstruction:

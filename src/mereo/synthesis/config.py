@@ -3,7 +3,7 @@
 Light, so that the command line may import them.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from tyro.conf import OmitArgPrefixes
@@ -98,6 +98,19 @@ SENSORS: dict[Sensor, SensorConfig] = {
     ),
 }
 
+Observation = Literal["paper", "structured-light", "time-of-flight", "tool", "hand", "mask"]
+
+OBSERVATIONS: dict[Observation, SensorConfig] = {
+    "paper": SENSORS["paper"],
+    "structured-light": SENSORS["structured-light"],
+    "time-of-flight": SENSORS["time-of-flight"],
+    # what stands in front hides a part, and a mask that is wrong at its edge lets it in
+    "tool": replace(SENSORS["structured-light"], tool=1.0),
+    "hand": replace(SENSORS["time-of-flight"], hand=1.0),
+    # a segmentation that is wrong by more than a pixel, so that whole strips of the background are strays
+    "mask": replace(SENSORS["structured-light"], mask_offset_px=1.5, mask_shift_px=1.0),
+}
+"""Sensors of further observations by name; each draws from the stream of its place, so new ones go to the end."""
 
 TEMPLATE = "template.safetensors"
 """File of a dataset with the segments at rest (``scenes.rest_pose``)."""
@@ -149,6 +162,8 @@ class GenerateConfig:
         points: the observed cloud is kept in farthest-point order, at most this many points.
         sampling: where queries are drawn.
         sensor: what else is wrong with the depth image; nothing in the paper.
+        observations: further clouds of every example's state and camera, each by another sensor, of which training
+            sees a random one; all are those that differ from the example's own sensor.
     """
 
     image_size: ImageSize = 96
@@ -157,6 +172,19 @@ class GenerateConfig:
     # the marker keeps --sampler short on the command line, where --sensor.axial keeps its prefix
     sampling: OmitArgPrefixes[SamplingConfig] = field(default_factory=SamplingConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    observations: tuple[Observation | Literal["all"], ...] = ()
 
     def __post_init__(self) -> None:
         check_bounds(self)
+        unknown = [name for name in self.observations if name not in (*OBSERVATIONS, "all")]
+        if unknown:
+            raise ValueError(
+                f"observations has {unknown[0]!r}; known are {', '.join(OBSERVATIONS)} and all: name some of these"
+            )
+
+    @property
+    def further(self) -> dict[Observation, SensorConfig]:
+        """Sensors of the further observations by name, in the order in which they are stored."""
+        if "all" in self.observations:
+            return {name: sensor for name, sensor in OBSERVATIONS.items() if sensor != self.sensor}
+        return {name: OBSERVATIONS[name] for name in self.observations if name != "all"}

@@ -34,6 +34,9 @@ SHARD = {
 }
 """Tensors of a shard by their axes: e examples, p stored points, q queries."""
 
+OBSERVED = {"seen": "e k p 3", "seen_count": "e k"}
+"""Tensors that a dataset with k further observations has besides."""
+
 
 def dataset_key(manifest: Mapping[str, Any]) -> str:
     """Digest of what decides a dataset's examples, by which its files know whose they are."""
@@ -55,7 +58,8 @@ def read_shard(path: Path, key: str, first: int | None = None, end: int | None =
     tensors, facts = read_tensors(path, key)
     if first is not None and facts.get("first") not in (None, first):
         raise ValueError(f"it begins with example {facts['first']} instead of {first}")
-    check_tensors(tensors, SHARD, {} if first is None or end is None else {"e": end - first})
+    shapes = SHARD | (OBSERVED if OBSERVED.keys() & tensors.keys() else {})
+    check_tensors(tensors, shapes, {} if first is None or end is None else {"e": end - first})
     return tensors
 
 

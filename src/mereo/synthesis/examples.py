@@ -25,6 +25,7 @@ from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_sensor import observe
+from mereo.synthesis.observations import further_observations
 from mereo.synthesis.query_sampling import Samples, sample_queries
 
 ATTEMPTS = 100
@@ -75,11 +76,13 @@ class Example:
         cloud: observed points, normalized, in farthest-point order.
         normalizer: from the observed cloud alone.
         queries: labelled points in the same normalized frame.
+        observations: further clouds of the same state and camera in that frame (``synthesis.observations``).
     """
 
     cloud: Float[np.ndarray, "p 3"]
     normalizer: Normalizer
     queries: LabelledPoints
+    observations: tuple[Float[np.ndarray, "_ 3"], ...] = ()
 
 
 def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> Example:
@@ -97,6 +100,7 @@ def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator)
         cloud=cloud[farthest_point_order(cloud, settings.points)],
         normalizer=normalizer,
         queries=label_queries(scene, view, solids, samples, normalizer),
+        observations=further_observations(solids, view.depth, normalizer, settings, rng),
     )
 
 

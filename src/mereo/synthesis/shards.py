@@ -6,6 +6,10 @@ again, and ``shard-00000.safetensors`` and so on, whose tensors are (e examples,
     cloud f32 [e, p, 3], cloud_count i32 [e], center f64 [e, 3], scale f64 [e],
     positions f32 [e, q, 3], labels u8 [e, q], distances f32 [e, q], directions f16 [e, q, 3], rest f16 [e, q, 3]
 
+with further observations (``synthesis.observations``), of which each has k,
+
+    seen f16 [e, k, p, 3], seen_count i32 [e, k]
+
 and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``scenes.rest_pose``), and
 ``statistical_model.safetensors``, the modes of the object's random states (``scenes.statistical_model_file``).
 
@@ -39,6 +43,7 @@ from mereo.scenes.statistical_model_file import load_statistical_model, save_sta
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
 from mereo.synthesis.dataset_files import check_space, dataset_key, read_shard, read_template
 from mereo.synthesis.examples import Example, synthesize
+from mereo.synthesis.observations import Clouds
 from mereo.synthesis.progress import progress
 from mereo.synthesis.workers import in_processes
 
@@ -171,7 +176,7 @@ def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: i
         "nested": scene.rest.nested,
         "any_roll": scene.workspace.any_roll,
         "workspace": asdict(scene.workspace),
-        "settings": asdict(settings),
+        "settings": _stated(settings),
         "seed": seed,
         "examples": examples,
         "shard_size": SHARD_SIZE,
@@ -189,7 +194,16 @@ def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: i
 def example_bytes(settings: GenerateConfig, segments: int) -> int:
     """Size of one example in bytes, on disk and in memory."""
     per_point, per_query, once = 12, 12 + 1 + 4 + 6 + 6, 4 + 24 + 8
-    return per_point * settings.points + per_query * settings.sampling.total(segments) + once
+    seen = len(settings.further) * (6 * settings.points + 4)
+    return per_point * settings.points + per_query * settings.sampling.total(segments) + once + seen
+
+
+def _stated(settings: GenerateConfig) -> dict[str, Any]:
+    """Settings as a manifest has them: with the sensors of further observations, and no word of these without any."""
+    stated = asdict(settings)
+    names = stated.pop("observations") and list(settings.further)
+    sensors = {name: asdict(sensor) for name, sensor in settings.further.items()}
+    return stated | ({"observations": names, "sensors": sensors} if names else {})
 
 
 def _claim(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> dict[str, Any]:
@@ -207,8 +221,9 @@ def _claim(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume:
 
 def _check_same(output: Path, before: dict[str, Any], manifest: dict[str, Any]) -> None:
     # a manifest of an older version may not state everything; settings it lacks were as their defaults are
-    before = _flat({"settings": asdict(GenerateConfig())}) | _flat(before)
-    for key, now in _flat(manifest).items():
+    default = _flat({"settings": asdict(GenerateConfig()) | {"observations": []}})
+    before = default | _flat(before)
+    for key, now in (default | _flat(manifest)).items():
         if before.get(key, now) != now:
             raise ValueError(
                 f"{output} was made with {key} = {before[key]!r}, not {now!r}; resuming needs equal settings: "
@@ -266,4 +281,14 @@ def pack(example: Example, points: int) -> dict[str, np.ndarray]:
         "distances": queries.distances.astype(np.float32),
         "directions": queries.directions.astype(np.float16),
         "rest": queries.rest.astype(np.float16),
+        **_pack_observations(example.observations, points),
     }
+
+
+def _pack_observations(clouds: Clouds, points: int) -> dict[str, np.ndarray]:
+    """Rows for further observations, none without any; half precision is off by 0.0003 where a pixel is 0.03 wide."""
+    if not clouds:
+        return {}
+    seen = np.stack([cloud[np.arange(points) % len(cloud)] for cloud in clouds])
+    counts = np.array([len(cloud) for cloud in clouds], dtype=np.int32)
+    return {"seen": seen.astype(np.float16), "seen_count": counts}

@@ -24,7 +24,7 @@ from mereo.models.config import Loss, NetworkConfig, Precision, Supervision
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """Settings of the changes made to each training cloud as it is read; all off in the paper's recipe.
+    """Settings of the changes made to each training cloud as it is read; the paper's recipe makes none.
 
     Attributes:
         keep_points: each point survives with a probability drawn from this range.
@@ -32,6 +32,8 @@ class AugmentConfig:
         hole_radius: largest radius of that ball, in normalized units.
         jitter_std: extra depth noise, up to this standard deviation in normalized units.
         roll: turn view and queries about the optical axis, where the scene allows any roll.
+        observations: probability that a random further observation of the example is read in place of its own cloud,
+            where the dataset has further ones (mereo generate --observations).
     """
 
     keep_points: ShareRange = (1.0, 1.0)
@@ -39,6 +41,7 @@ class AugmentConfig:
     hole_radius: Positive = 0.4
     jitter_std: NotNegative = 0.0
     roll: bool = False
+    observations: Probability = 0.5
 
     def __post_init__(self) -> None:
         check_bounds(self, "augment.")
@@ -111,8 +114,11 @@ class TrainConfig:
         return Supervision.of(self.loss)
 
     def to_dict(self) -> dict[str, Any]:
-        """All settings as files hold them: the network's side by side, without its parts."""
-        return asdict(self) | {"network": self.network.to_dict()}
+        """All settings as files hold them: the network's side by side, and of observations only where they are seen."""
+        augment = asdict(self.augment)
+        if not self.augment.observations:
+            del augment["observations"]
+        return asdict(self) | {"network": self.network.to_dict(), "augment": augment}
 
 
 PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]

@@ -1,6 +1,6 @@
 """Generated examples in memory, and the training batches drawn from them.
 
-Notation: e examples, b of them in a batch, p stored points, n points that the network sees, q queries.
+Notation: e examples, b of them in a batch, p stored points, n points that the network sees, q queries, k observations.
 """
 
 import json
@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Float16, Int, UInt8
 from torch import Tensor
 
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.scenes.statistical_model_file import load_statistical_model
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE
-from mereo.synthesis.dataset_files import dataset_key, read_shard, read_template
+from mereo.synthesis.dataset_files import OBSERVED, dataset_key, read_shard, read_template
 from mereo.training.config import AugmentConfig
 
 
@@ -51,6 +51,8 @@ class Dataset:
         template: signed distances to the segments at rest (``scenes.rest_pose``); None in older datasets.
         statistical_model: of the object's states, which goes into the weights; None in older datasets.
         visible_m: least and greatest longest side of the visible part's box in metres; None where the unit is unknown.
+        seen: further observations of the same states by other sensors, normalized as ``cloud``; None without any.
+        seen_count: how many points of each are real.
     """
 
     cloud: Float[Tensor, "e p 3"]
@@ -65,6 +67,8 @@ class Dataset:
     template: Float[Tensor, "s n n n"] | None = None
     visible_m: tuple[float, float] | None = None
     statistical_model: StatisticalModel | None = None
+    seen: Float16[Tensor, "e k p 3"] | None = None
+    seen_count: Int[Tensor, "e k"] | None = None
 
     def __len__(self) -> int:
         return len(self.cloud)
@@ -83,8 +87,9 @@ class Dataset:
                 "finish it with mereo generate ... --resume"
             )
         queries = ("positions", "labels", "distances", "directions", "rest")
+        observed = OBSERVED if all(OBSERVED.keys() <= part.keys() for part in parts) else ()
         joined = {}
-        for name in ("cloud", "cloud_count", "center", "scale", *queries):
+        for name in ("cloud", "cloud_count", "center", "scale", *queries, *observed):
             joined[name] = torch.cat([part.pop(name) for part in parts]).to(device)
         viewpoint = (-joined["center"] * joined["scale"][:, None]).float()
         return cls(
@@ -96,7 +101,14 @@ class Dataset:
             template=_read_template(directory / TEMPLATE, key, len(manifest["segments"])),
             visible_m=_visible_m(joined["scale"], manifest.get("unit_m")),
             statistical_model=_read_statistical_model(directory / STATISTICAL_MODEL, key),
+            seen=joined.get("seen"),
+            seen_count=joined["seen_count"].long() if observed else None,
         )
+
+    @property
+    def further(self) -> int:
+        """Number of further observations."""
+        return 0 if self.seen is None else self.seen.shape[1]
 
     @property
     def uniform_queries(self) -> int:
@@ -122,10 +134,12 @@ class Dataset:
         queries: int,
         augment: AugmentConfig,
         rng: torch.Generator,
+        observation: Int[Tensor, " b"] | None = None,
     ) -> Batch:
         """Batch of the examples ``index``: ``points`` cloud points, a random ``queries`` of their queries (0: all).
 
-        The random numbers come from ``rng`` (on the CPU), so a batch depends on nothing else.
+        The random numbers come from ``rng`` (on the CPU), so a batch depends on nothing else. ``observation`` says
+        which one of each example is seen, 0 its own cloud; by default it is drawn.
         """
         device = self.cloud.device
         index = index.to(device)
@@ -137,7 +151,10 @@ class Dataset:
             chosen = order.to(device)
         else:
             rows = index
-        cloud = choose_points(self.cloud[index], self.count[index], points, augment, rng)
+        if observation is None:
+            observation = draw_observations(len(index), self.further, augment.observations, rng)
+        cloud, count = self._observed(index, observation.to(device))
+        cloud = choose_points(cloud, count, points, augment, rng)
         batch = Batch(
             index=index,
             cloud=cloud,
@@ -149,6 +166,25 @@ class Dataset:
             rest=self.rest[rows, chosen].float(),
         )
         return augment_batch(batch, augment, rng)
+
+    def _observed(
+        self, index: Int[Tensor, " b"], observation: Int[Tensor, " b"]
+    ) -> tuple[Float[Tensor, "b p 3"], Int[Tensor, " b"]]:
+        """Chosen cloud of each example, and its count."""
+        cloud, count = self.cloud[index], self.count[index]
+        if self.seen is None or self.seen_count is None:
+            return cloud, count
+        further, number = observation > 0, (observation - 1).clamp(min=0)
+        cloud = torch.where(further[:, None, None], self.seen[index, number].float(), cloud)
+        return cloud, torch.where(further, self.seen_count[index, number], count)
+
+
+def draw_observations(count: int, further: int, probability: float, rng: torch.Generator) -> Int[Tensor, " b"]:
+    """Number of the observation seen of each of ``count`` examples: 0 its own, or one of so many further ones."""
+    if further == 0 or probability == 0:  # nothing is drawn, so that runs without observations stay what they were
+        return torch.zeros(count, dtype=torch.long)
+    chosen = torch.rand(count, generator=rng) < probability
+    return chosen * torch.randint(1, further + 1, (count,), generator=rng)
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

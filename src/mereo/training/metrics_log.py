@@ -4,11 +4,14 @@ import csv
 import io
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mereo.io.atomic_files import atomic_file
 
 FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "code", "val_iou", "val_miou")
+SENSOR_FIELDS = ("sensor_iou", "sensor_miou")
+"""Scores that runs on datasets with further observations have besides: of these."""
+
 TABLE, CURVES = "metrics.csv", "curves.png"
 Row = dict[str, float]
 
@@ -19,8 +22,9 @@ class MetricsLog:
     Rows up to the checkpoint are read back when a run continues, so the file equals that of an uninterrupted run.
     """
 
-    def __init__(self, run_dir: Path) -> None:
+    def __init__(self, run_dir: Path, sensors: bool = False) -> None:
         self.run_dir = run_dir
+        self.fields = FIELDS + (SENSOR_FIELDS if sensors else ())
         self.rows: list[Row] = []
         self.board = _tensorboard(run_dir)
 
@@ -28,9 +32,10 @@ class MetricsLog:
         """Add the row of a step; ``losses`` are the total under "loss" and its terms."""
         self._add({"step": step, "rate": rate, **losses})
 
-    def add_validation(self, step: int, iou: float, miou: float) -> None:
+    def add_validation(self, step: int, iou: float, miou: float, of: Literal["val", "sensor"] = "val") -> None:
         """Add scores of the state after ``step`` to the row of that step; an undefined mIoU (NaN) is left out."""
-        scores = {name: value for name, value in (("val_iou", iou), ("val_miou", miou)) if not math.isnan(value)}
+        both = ((f"{of}_iou", iou), (f"{of}_miou", miou))
+        scores = {name: value for name, value in both if not math.isnan(value)}
         if not self.rows or self.rows[-1]["step"] != step:  # the file with the row of that step was lost
             self.rows.append({"step": step})
         self.rows[-1] |= scores
@@ -54,7 +59,7 @@ class MetricsLog:
     def write(self) -> None:
         """Write metrics.csv and curves.png, each atomically."""
         text = io.StringIO()
-        writer = csv.DictWriter(text, FIELDS, restval="", lineterminator="\n")
+        writer = csv.DictWriter(text, self.fields, restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows({k: _exact(k, v) for k, v in row.items()} for row in self.rows)
         with atomic_file(self.run_dir / TABLE) as temporary:
@@ -110,7 +115,8 @@ def draw_curves(rows: list[Row], path: Path) -> None:
     left.set(yscale="log", xlabel="step", title="training loss (running median)")
     if left.lines:
         left.legend()
-    for name, label in (("val_iou", "IoU"), ("val_miou", "mIoU")):
+    scores = {"val_iou": "IoU", "val_miou": "mIoU", "sensor_iou": "IoU, sensors", "sensor_miou": "mIoU, sensors"}
+    for name, label in scores.items():
         points = [(row["step"], row[name]) for row in rows if name in row]
         if points:
             right.plot(*zip(*points, strict=True), marker=".", label=label)

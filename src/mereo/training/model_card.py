@@ -110,18 +110,32 @@ def _training(provenance: dict[str, object]) -> str:
     ]
     if provenance.get("data"):
         lines.append(f"- how they were generated: `{json.dumps(provenance['data'])}`")
+    lines += _observations(provenance)
     lines.append(f"- {steps} steps of {batch} examples{seen}")
     if recipe:
         lines.append(f"- recipe, nearest preset `{_nearest_preset(recipe)}`: `{json.dumps(recipe)}`")
     return "\n".join([*lines, ""])
 
 
+def _observations(provenance: dict[str, Any]) -> list[str]:
+    """Line on the further observations that were trained on; none where there were none."""
+    names = (provenance.get("data") or {}).get("observations")
+    share = (provenance.get("recipe") or {}).get("augment", {}).get("observations")
+    if not names or not share:
+        return []
+    return [
+        f"- observations: in {100 * share:g} % of its turns an example is seen by one of {', '.join(names)} instead"
+    ]
+
+
 def _nearest_preset(recipe: dict[str, Any]) -> str:
     """Name of the preset whose network it is, else of which most settings are."""
     network = NetworkConfig.from_dict(recipe["network"])  # what older recipes do not state is at its default
+    share = recipe.get("augment", {}).get("observations", 0.0)  # which the dataset decides, too
 
     def agreement(preset: str) -> tuple[bool, int]:
-        known = json.loads(json.dumps(PRESETS[preset].to_dict()))
+        compared = replace(PRESETS[preset], augment=replace(PRESETS[preset].augment, observations=share))
+        known = json.loads(json.dumps(compared.to_dict()))
         return PRESETS[preset].network == network, sum(known[key] == recipe.get(key) for key in known)
 
     return max(PRESETS, key=agreement)

@@ -37,14 +37,20 @@ class Process:
 
 
 def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
-    """Recipe with what the dataset decides: how much can be held out, whether a roll keeps a view plausible.
+    """Recipe with what the dataset decides: what can be held out, whether a roll is plausible, what else is observed.
 
     Raises ``ValueError`` for settings with which an autodecoder cannot be trained.
     """
     if config.network.encoder == "autodecoder":
         _check_autodecoder(config)
     holdout = min(config.holdout, len(data) // 10)
-    augment = replace(config.augment, roll=config.augment.roll and bool(data.manifest["any_roll"]))
+    # an autodecoder's codes are of examples, so it sees each as it is
+    observed = data.further and config.network.encoder != "autodecoder"
+    augment = replace(
+        config.augment,
+        roll=config.augment.roll and bool(data.manifest["any_roll"]),
+        observations=config.augment.observations if observed else 0.0,
+    )
     return replace(config, holdout=holdout, augment=augment)
 
 

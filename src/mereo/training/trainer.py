@@ -96,7 +96,7 @@ class Trainer:
         self.orders: dict[int, Tensor] = {}
         self.total = max(1, math.ceil(config.epochs * self.examples / config.batch))
         self.step = self.saved_step = 0
-        self.log = MetricsLog(run_dir) if process.is_main else None
+        self.log = MetricsLog(run_dir, bool(data.further)) if process.is_main else None
         self.unread: list[tuple[int, float, dict[str, Tensor]]] = []
         self.autocast = pick_precision(config.precision, device)
         self.module: nn.Module = self.network
@@ -225,6 +225,9 @@ class Trainer:
             self._update_codes()
             scores = validate(self.average, self.data, self.config)
             self.log.add_validation(self.step, scores.iou, scores.miou)
+            if self.data.further:
+                scores = validate(self.average, self.data, self.config, further=True)
+                self.log.add_validation(self.step, scores.iou, scores.miou, "sensor")
             self.say(f"held-out examples at step {self.step}: {self.log.summary()}")
         self._wait()
 

@@ -27,12 +27,15 @@ def held_out(data: Dataset, config: TrainConfig) -> range:
 
 
 @torch.no_grad()
-def validate(network: Network, data: Dataset, config: TrainConfig) -> Scores:
-    """IoU and mIoU on the held-out examples' queries (not the paper's grid metric)."""
+def validate(network: Network, data: Dataset, config: TrainConfig, further: bool = False) -> Scores:
+    """IoU and mIoU on the held-out examples' queries (not the paper's grid metric).
+
+    With ``further``, of the examples' further observations: example i is seen as its (i mod k)-th of k.
+    """
     segmented = config.supervision.labels
     classes = network.segments + 1 if segmented else 2
     total = torch.zeros(classes, classes, dtype=torch.long)
-    for batch, logits, distance in _answers(network, data, config, held_out(data, config)):
+    for batch, logits, distance in _answers(network, data, config, held_out(data, config), further):
         guess = logits.argmax(-1) if segmented else (distance < 0).long()
         truth = batch.labels if segmented else (batch.labels > 0).long()
         total += torch.from_numpy(confusion_matrix(truth.cpu().numpy(), guess.cpu().numpy(), classes))
@@ -51,12 +54,14 @@ def choose_offsets(network: Network, data: Dataset, config: TrainConfig) -> Floa
 
 
 def _answers(
-    network: Network, data: Dataset, config: TrainConfig, examples: range
+    network: Network, data: Dataset, config: TrainConfig, examples: range, further: bool = False
 ) -> Iterator[tuple[Batch, Float[Tensor, "b q c"], Float[Tensor, "b q"]]]:
     """Logits and distances at all queries of stored examples, encoded as in use, batch by batch."""
     network.eval()
     for start in examples[:: config.batch]:
         index = torch.arange(start, min(start + config.batch, examples.stop))
-        batch = data.batch(index, config.network.points, 0, AugmentConfig(), torch.Generator().manual_seed(0))
+        observation = 1 + index % data.further if further else torch.zeros_like(index)
+        rng = torch.Generator().manual_seed(0)
+        batch = data.batch(index, config.network.points, 0, AugmentConfig(), rng, observation)
         prediction = network.query(network.encode(batch.cloud, batch.viewpoint), batch.positions)
         yield batch, prediction.logits, prediction.distance

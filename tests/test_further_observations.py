@@ -1,0 +1,194 @@
+"""Further observations: the same example seen by other sensors, with its own cloud and queries untouched."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+from toy_scene import toy_scene
+
+import mereo.__main__ as command_line
+from mereo.cli import commands
+from mereo.geometry.surface_patches import without_strays
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis import observations, shards
+from mereo.synthesis.config import OBSERVATIONS, SENSORS, GenerateConfig, SamplingConfig
+from mereo.synthesis.depth_sensor import SimulatedView, observe
+from mereo.synthesis.examples import Example, _sample_view, synthesize
+from mereo.synthesis.shards import example_bytes, generate, pack
+
+SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
+SEEN = replace(SMALL, observations=("all",))
+TOY = toy_scene()
+SEED, EXAMPLES = 3, 5
+
+
+@pytest.fixture(autouse=True)
+def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shards, "SHARD_SIZE", 2)
+    monkeypatch.setattr(shards, "states_for", lambda _: 12)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The same examples without and with further observations."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "SHARD_SIZE", 2)
+        patch.setattr(shards, "states_for", lambda _: 12)
+        folder = tmp_path_factory.mktemp("observed")
+        for name, settings in (("plain", SMALL), ("seen", SEEN)):
+            generate(TOY, folder / name, settings, examples=EXAMPLES, seed=SEED)
+    return folder / "plain", folder / "seen"
+
+
+def shards_of(directory: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(directory.glob("shard-*"))}
+
+
+def example(settings: GenerateConfig, index: int = 0) -> Example:
+    return synthesize(TOY, settings, example_rng(SEED, index))
+
+
+# --- which ------------------------------------------------------------------------------------------------------------
+
+
+def test_all_are_those_that_differ_from_the_examples_own_sensor() -> None:
+    assert not SMALL.further
+    assert SEEN.further == {name: sensor for name, sensor in OBSERVATIONS.items() if name != "paper"}
+    other = replace(SEEN, sensor=SENSORS["structured-light"]).further
+    assert set(other) == set(OBSERVATIONS) - {"structured-light"}
+    assert list(replace(SMALL, observations=("tool", "paper", "tool")).further) == ["tool", "paper"]
+
+
+def test_one_option_adds_them() -> None:
+    command = command_line.parse(["generate", "rope", "--examples", "2", "--output", "out", "--observations", "all"])
+    assert isinstance(command, commands.Generate) and command.settings == GenerateConfig(observations=("all",))
+
+
+def test_an_unknown_one_is_answered_with_the_known_ones() -> None:
+    settings = GenerateConfig()
+    object.__setattr__(settings, "observations", ("tool", "lidar"))  # which the type checker of the tests would refuse
+    with pytest.raises(ValueError, match="observations has 'lidar'; known are paper, .*mask and all: name some"):
+        settings.__post_init__()
+
+
+# --- the same bits ----------------------------------------------------------------------------------------------------
+
+
+def test_state_first_cloud_and_queries_are_those_without(data: tuple[Path, Path]) -> None:
+    for name in shards_of(data[0]):
+        plain, seen = (load_file(directory / name) for directory in data)
+        assert seen.keys() - plain.keys() == {"seen", "seen_count"}
+        assert all(seen[key].tobytes() == value.tobytes() for key, value in plain.items())
+
+
+def test_a_shard_is_remade_alone(data: tuple[Path, Path], tmp_path: Path) -> None:
+    generate(TOY, tmp_path / "data", SEEN, examples=EXAMPLES, seed=SEED, shard=(1, 3))
+    assert (tmp_path / "data" / "shard-00001.safetensors").read_bytes() == shards_of(data[1])["shard-00001.safetensors"]
+    row, stored = pack(example(SEEN, 3), 128), load_file(data[1] / "shard-00001.safetensors")
+    assert all(np.array_equal(row[name], stored[name][1], equal_nan=True) for name in row)
+
+
+def test_an_observation_is_the_same_whichever_others_there_are() -> None:
+    every, alone = example(SEEN).observations, example(replace(SMALL, observations=("tool",))).observations
+    assert np.array_equal(every[list(SEEN.further).index("tool")], alone[0])
+
+
+def test_their_size_on_disk_is_known_beforehand() -> None:
+    for settings in (SMALL, SEEN):
+        size = sum(value.nbytes for value in pack(example(settings), settings.points).values())
+        assert size == example_bytes(settings, len(TOY.rest.segments))
+
+
+# --- datasets ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_manifest_states_their_sensors_and_nothing_where_there_are_none(data: tuple[Path, Path]) -> None:
+    plain, seen = (json.loads((directory / "manifest.json").read_text())["settings"] for directory in data)
+    assert not plain.keys() & {"observations", "sensors"}
+    assert seen["observations"] == list(SEEN.further)
+    assert seen["sensors"] == {name: asdict(sensor) for name, sensor in SEEN.further.items()}
+
+
+def test_resuming_needs_the_same_observations(data: tuple[Path, Path]) -> None:
+    before = [shards_of(directory) for directory in data]
+    for directory, right, wrong in zip(data, (SMALL, SEEN), (SEEN, SMALL), strict=True):
+        generate(TOY, directory, right, examples=EXAMPLES, seed=SEED, resume=True)
+        with pytest.raises(ValueError, match=r"was made with settings\.observations = \[.*resuming needs equal"):
+            generate(TOY, directory, wrong, examples=EXAMPLES, seed=SEED, resume=True)
+    assert [shards_of(directory) for directory in data] == before
+
+
+def test_resuming_needs_the_same_sensors_of_these_names(
+    data: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(OBSERVATIONS, "tool", replace(OBSERVATIONS["tool"], axial=2.0))
+    with pytest.raises(ValueError, match=r"settings\.sensors\.tool\.axial = 1\.0, not 2\.0"):
+        generate(TOY, data[1], SEEN, examples=EXAMPLES, seed=SEED, resume=True)
+
+
+# --- what they show ---------------------------------------------------------------------------------------------------
+
+
+def test_all_clouds_lie_on_the_object_in_one_frame() -> None:
+    """In scene units: sensors err by 0.2 to 0.5, strays of a wrong mask and of a hand are fewer than the object."""
+    for index in range(3):
+        found, (_, solids) = example(SEEN, index), _sample_view(TOY, SEEN, example_rng(SEED, index))
+        for name, cloud in zip(SEEN.further, found.observations, strict=True):
+            off = solids.nearest(found.normalizer.invert(cloud)).distance
+            assert np.median(off) < 1.0, (index, name)
+
+
+def test_half_precision_moves_no_point_by_more_than_its_noise(data: tuple[Path, Path]) -> None:
+    found = example(SEEN, 0)
+    stored = load_file(data[1] / "shard-00000.safetensors")
+    for number, cloud in enumerate(found.observations):
+        assert stored["seen_count"][0, number] == len(cloud)
+        off = stored["seen"][0, number, : len(cloud)].astype(float) - cloud
+        near = np.abs(cloud).max(axis=1) < 2
+        assert near.mean() > 0.8 and np.abs(off[near]).max() / found.normalizer.scale < 0.2 * SMALL.noise_std
+
+
+def test_one_that_hardly_sees_the_object_is_the_first_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
+    def blind(*arguments: object) -> SimulatedView:
+        view = observe(*arguments)  # type: ignore[arg-type]
+        return replace(view, mask=view.mask & (view.mask.cumsum().reshape(view.mask.shape) < 20))
+
+    monkeypatch.setattr(observations, "observe", blind)
+    found = example(SEEN)
+    assert all(np.array_equal(cloud, found.cloud) for cloud in found.observations)
+
+
+def test_an_observation_keeps_its_strays_or_loses_those_found_or_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = replace(SMALL, image_size=96, points=4096, observations=("mask",))
+
+    def clouds(uncleaned: float, by_rule: float) -> list[np.ndarray]:
+        monkeypatch.setattr(observations, "UNCLEANED", uncleaned)
+        monkeypatch.setattr(observations, "BY_RULE", by_rule)
+        found = [example(settings, index) for index in range(4)]
+        return [item.normalizer.invert(item.observations[0]) for item in found]
+
+    whole, by_rule, right = clouds(1.0, 0.0), clouds(0.0, 1.0), clouds(0.0, 0.0)
+    assert [len(cloud) for cloud in by_rule] == [int(without_strays(cloud).sum()) for cloud in whole]
+    assert sum(map(len, by_rule)) < sum(map(len, whole)) and sum(map(len, right)) < sum(map(len, whole))
+    for cloud, seen in zip(right, whole, strict=True):
+        assert (np.abs(seen[:, None] - cloud).max(axis=2).min(axis=0) < 1e-9).all(), "points of the same cloud"
+    sides = [max(np.ptp(cloud, axis=0).max() for cloud in clouds) for clouds in (right, whole)]
+    assert sides[0] < sides[1], "the background is far behind"
+
+
+def flat(rows: int, columns: int, depth: float, left: int = 0) -> np.ndarray:
+    """Points of a plane facing the camera, a pixel apart."""
+    v, u = np.mgrid[:rows, left : left + columns]
+    return np.stack([u.ravel() * 0.01, v.ravel() * 0.01, np.ones(u.size)], axis=1) * depth
+
+
+def test_strays_are_left_where_the_box_is_hardly_longer_for_them() -> None:
+    surface, rim = flat(20, 20, 1.0), flat(20, 1, 1.5, left=20)
+    inside = flat(20, 1, 1.02, left=7) / 1.02 * 1.002
+    assert without_strays(surface).all()
+    keep = without_strays(np.concatenate([surface, rim]))
+    assert keep[:400].all() and not keep[400:].any()
+    assert without_strays(np.concatenate([surface, inside])).all()

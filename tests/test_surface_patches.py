@@ -1,0 +1,107 @@
+"""What is a patch of surface is kept, a rim of another one is not, whatever the unit, the turn and the density."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mereo.geometry.camera import Camera
+from mereo.geometry.downsampling import MAX_POINTS
+from mereo.geometry.surface_patches import longest_side, surface_patches, surface_points
+
+
+def rays(size: int = 96) -> np.ndarray:
+    """Lines of sight through the pixels of an image, scaled to z = 1."""
+    return Camera.from_fov(size, size, 0.5).directions()
+
+
+def plate(size: int = 96, half: float = 0.5, rim: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Slanted round plate, half of the image wide, and a rim of the wall behind it; whether each is of the plate."""
+    line = (np.arange(size) - (size - 1) / 2) / (size / 2)
+    radius = np.hypot(*np.meshgrid(line, line))
+    inside, wide = radius < half, radius < half + 2 * rim / size
+    depth = np.where(inside, 5 + rays(size)[..., 0], 8.0)
+    noise = np.random.default_rng(0).normal(0, 0.002, depth.shape)
+    return (rays(size) * (depth + noise)[..., None])[wide], inside[wide]
+
+
+def ball(size: int = 96) -> np.ndarray:
+    """What a camera sees of a ball of radius 1, 6 away."""
+    sight = rays(size).reshape(-1, 3)
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    along = 6 * sight[:, 2]
+    root = along**2 - 35
+    return sight[root > 0] * (along[root > 0] - np.sqrt(root[root > 0]))[:, None]
+
+
+POINTS, PLATE = plate()
+
+
+@pytest.mark.parametrize("rim", [1, 2, 3])
+def test_a_rim_of_background_is_no_surface(rim: int) -> None:
+    points, genuine = plate(rim=rim)
+    np.testing.assert_array_equal(surface_points(points), genuine)
+    assert longest_side(points) > 1.5 * longest_side(points[genuine])
+
+
+def test_what_is_wide_is_a_surface_wherever_it_lies() -> None:
+    """Six pixels of the wall are as good as the plate: nothing says which of them is the object."""
+    points, genuine = plate(rim=6)
+    patch, surface = surface_patches(points)
+    assert surface.all() and len(np.unique(patch[genuine])) == len(np.unique(patch[~genuine])) == 1
+    assert patch[genuine][0] != patch[~genuine][0]
+
+
+def test_a_ball_loses_slivers_of_its_outline_at_most() -> None:
+    """Its outermost rows of pixels are four of their widths behind the next ones."""
+    points = ball()
+    keep = surface_points(points)
+    assert keep.mean() > 0.985 and longest_side(points) < 1.04 * longest_side(points[keep])
+
+
+def test_parts_of_different_density_lose_nothing() -> None:
+    """A ball of 3,000 points beside a plate of 600, which are five times as far apart."""
+    plate = np.random.default_rng(4).uniform((2, -1, 6), (4, 1, 6), (600, 3))
+    assert surface_points(np.concatenate([ball(), plate])).mean() > 0.99
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e4])
+def test_neither_unit_nor_turn_nor_order_matters(factor: float) -> None:
+    order = np.random.default_rng(1).permutation(len(POINTS))
+    turned = factor * POINTS[order] @ Rotation.from_rotvec([1.0, 0.5, -0.3]).as_matrix().T
+    np.testing.assert_array_equal(surface_points(turned), PLATE[order])
+
+
+@pytest.mark.parametrize("times", [2, 5, 30])
+def test_points_given_more_than_once_change_nothing(times: int) -> None:
+    np.testing.assert_array_equal(surface_points(np.repeat(POINTS, times, axis=0)), np.repeat(PLATE, times))
+
+
+def test_too_few_points_to_tell_are_all_kept() -> None:
+    rng = np.random.default_rng(2)
+    for count in (0, 1, 2, 25):
+        assert surface_points(rng.normal((0, 0, 9), 1, (count, 3))).all()
+    for place in ([0.0, 0, 0], [0, 0, 3.0]):
+        assert surface_points(np.tile(place, (100, 1))).all()
+
+
+def test_a_thin_line_alone_is_kept() -> None:
+    """Nothing is a surface: then nothing is a stray."""
+    assert surface_points(np.column_stack([np.linspace(-1, 1, 200), np.zeros(200), np.full(200, 4.0)])).all()
+
+
+def test_points_closer_than_their_noise_are_a_surface() -> None:
+    """A hundred frames of one plate fused: neighbours' ranges differ by many times their distance."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1, 1, (20_000, 3)) * [1, 1, 0] + [0, 0, 5]
+    assert surface_points(points * (1 + rng.normal(0, 0.05, (len(points), 1)))).mean() > 0.99
+
+
+def test_many_points_are_decided_by_some_of_them() -> None:
+    points, genuine = plate(size=1050)
+    assert len(points) > 4 * MAX_POINTS
+    start = time.process_time()
+    keep = surface_points(points)
+    assert time.process_time() - start < 5, "half a second; a frame is answered in a few seconds"
+    assert (keep == genuine).mean() > 0.999
