@@ -21,7 +21,8 @@ from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import bunny_posed
 from mereo.evaluation.scoring import predict_grid
-from mereo.fitting.answer import Answer, answer_frame
+from mereo.fitting.answer import Answer, answer_fitted
+from mereo.fitting.readings import fitted_frame
 from mereo.fitting.register import Registrar, registrar_for
 from mereo.fitting.registration_state import write_state
 from mereo.geometry.camera import PointCloud
@@ -32,7 +33,7 @@ from mereo.io.output_folders import check_new_directory, new_directory
 from mereo.io.scratch_folders import check_place
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo.reconstruction.pipeline import Reconstruction, encode_frame, extract, segment_names
+from mereo.reconstruction.pipeline import Reconstruction, extract, segment_names
 from mereo.scenes.assets import AssetUnavailable
 from mereo.visualization.result_files import write_files
 
@@ -124,14 +125,19 @@ def _frame_case(name: str) -> Case:
 
 def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
     """Reconstruct a case, print network and fit beside the truth, and write the folder of the default answer."""
-    seen = encode_frame(case.cloud, model, case.frame)
-    network, registrar = extract(seen, model, RESOLUTION), registrar_for(model, "auto")
-    columns = {"network": Column(_scores(case, model, predict_grid(model, seen.code, case.truth)), seconds_of(network))}
-    found, started = Answer(network), time.perf_counter()
+    registrar = registrar_for(model, "auto")
+    stated = None if case.unit_m is None or registrar is None else registrar.stated_unit(case.unit_m)
+    started = time.perf_counter()
+    fitted = fitted_frame(case.cloud, model, registrar, case.frame, stated_unit=stated)
+    spent = time.perf_counter() - started
+    network = extract(fitted.unaided, model, RESOLUTION)
+    labels = predict_grid(model, network.code, case.truth)
+    columns = {"network": Column(_scores(case, model, labels), seconds_of(network))}
+    found = Answer(network)
     if registrar is not None:
-        stated = None if case.unit_m is None else registrar.stated_unit(case.unit_m)
-        found = answer_frame(seen, model, registrar, RESOLUTION, stated_unit=stated)
-        seconds = sum(seen.timings_s.values()) + time.perf_counter() - started
+        started = time.perf_counter()
+        found = answer_fitted(fitted, model, registrar, RESOLUTION)
+        seconds = spent + time.perf_counter() - started
         if found.registration is not None:
             labels = label_grid(found.registration.mesh, *case.truth.grid.axes())
             columns["fit"] = Column(_scores(case, model, labels), seconds)

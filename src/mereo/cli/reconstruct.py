@@ -24,7 +24,6 @@ from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
 from mereo.reconstruction.pipeline import Reconstruction
-from mereo.reconstruction.strays import readings
 from mereo.visualization.result_files import write_files
 
 
@@ -75,14 +74,7 @@ def reconstruct_file(
         frame = read_frame(input, reading)
         seen = find_object(frame, isolation)
         print(seen)
-        taken = readings(seen.cloud, frame.axes, isolation.keep_all)[0]
-        if taken.dropped:
-            print(taken)
-        seen = seen.read_as(taken)
         model = load_for(weights, inference)
-        warning = size_warning(seen, model.provenance)
-        if warning is not None:
-            warnings.warn(warning, SizeWarning, stacklevel=2)
         registrar = Registrar.of(model, choice, scene) if attachments else registrar_for(model, choice, scene)
         placed = place(attachments, registrar, carry_frame) if registrar is not None else ()
         found = answer(
@@ -93,8 +85,15 @@ def reconstruct_file(
             frame.axes,
             label_points="points" in formats,
             stated_unit=None if registrar is None else registrar.stated_unit(frame.unit_m),
+            keep_all=isolation.keep_all,
         )
         result = found.reconstruction
+        seen = seen.read_as(result.reading)
+        if result.reading.dropped:
+            print(result.reading)
+        warning = size_warning(seen, model.provenance)
+        if warning is not None:
+            warnings.warn(warning, SizeWarning, stacklevel=2)
         facts: dict[str, object] = {
             "title": frame.source,
             "weights": str(weights),

@@ -105,5 +105,4 @@ def line(outcome: Outcome[Reconstruction]) -> dict[str, Any]:
         for segment in outcome.result.segments
         if segment.voxels
     }
-    reading = outcome.result.reading
-    return {**facts, "strays": 0 if reading is None else reading.dropped, "segments": found}
+    return {**facts, "strays": outcome.result.reading.dropped, "segments": found}

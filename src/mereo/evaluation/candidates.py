@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.fitting.readings import fitted_frame
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
@@ -84,22 +85,20 @@ def find_candidates(
     model: Model, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
 ) -> Candidates:
     """Answers to a frame; ``registrar`` None asks the network alone, "modes" leaves the draws out."""
+    frame = fitted_frame(cloud, model, registrar, scene_unit=scene_unit)
     started = time.perf_counter()
-    code = model.encode(cloud)
-    encoding = time.perf_counter() - started
+    code, encoding = frame.unaided.code, frame.unaided.timings_s["encode"]
     labels = network_labels(model, code, grid)
-    each: dict[AnswerName, Candidate] = {"network": Candidate(labels, time.perf_counter() - started)}
+    each: dict[AnswerName, Candidate] = {"network": Candidate(labels, encoding + time.perf_counter() - started)}
     if registrar is None:
         return Candidates(code, each, "network")
-    try:
-        fitted = registrar.fit_modes(cloud, code, scene_unit)
-    except ValueError:  # too little is found; then the network's answer is what a user gets, whoever is asked
+    if frame.modes is None:  # too little is found; then the network's answer is what a user gets, whoever is asked
         return Candidates(code, dict.fromkeys(names_for(registrar), each["network"]), "network")
-    each["modes"] = _registered(fitted.registration(), grid, encoding)
+    each["modes"] = _registered(frame.modes.registration(), grid, encoding)
     default: AnswerName = "modes"
     if "full" in names_for(registrar):
         assert registrar.at_hand is not None
-        each["full"] = _registered(fitted.with_draws(registrar.at_hand), grid, encoding)
+        each["full"] = _registered(frame.modes.with_draws(registrar.at_hand), grid, encoding)
         default = "full"
     found = each[default].registration
     if registrar.choice == "auto" and found is not None and not found.accepted:

@@ -1,6 +1,6 @@
 """Answer to one frame: the registered model itself where it explains the frame, else the network's surfaces.
 
-EncodedFrame -register-> Registration -segments, labels-> Reconstruction
+cloud -fitted_frame-> FittedFrame -finish-> Registration -segments, labels-> Reconstruction
 """
 
 from dataclasses import dataclass, replace
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.fitting.config import FitChoice
+from mereo.fitting.readings import FittedFrame, fitted_frame
 from mereo.fitting.register import Registrar, registrar_for
 from mereo.fitting.registration import Registration, nearest_labels
 from mereo.geometry.camera import PointCloud
@@ -18,7 +19,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
 from mereo.models.model import Model
 from mereo.reconstruction.isosurfaces import Extraction
-from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, encode_frame, extract, timed, turned_back
+from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, extract, timed, turned_back
 from mereo.reconstruction.segment_statistics import measure, segment_points
 
 
@@ -49,55 +50,48 @@ def answer(
     label_points: bool = False,
     scene_unit: float | None = None,
     stated_unit: float | None = None,
+    keep_all: bool = False,
 ) -> Answer:
     """Answer to the frame that a cloud shows.
 
     Args:
-        cloud: points on the object, any unit and density.
+        cloud: points on the object, any unit and density; strays among them are told by what a fit explains.
         model: the weights.
         registrar: of the same object, to be set up once for many frames, or the choice of one that is set up here; None
             asks the network alone. With "auto" a registration that does not explain the cloud leaves the answer to the
             network, with other choices it is taken all the same.
         resolution: cells along the longest side of the object's box.
         frame: the cloud's axes, as in ``mereo.reconstruct``.
-        label_points: also say on which segment each point of the cloud lies.
+        label_points: also say on which segment each point of the object lies.
         scene_unit: length of a scene unit in the cloud's unit, where it is known.
         stated_unit: the same as the input states it (``Registrar.stated_unit``), believed only where the network's own
             estimate agrees.
+        keep_all: drop no strays.
 
     Raises ``ValueError`` as ``mereo.reconstruct`` does, and for other choices than "auto" as ``fit_frame`` does.
     """
     if isinstance(registrar, str):
         registrar = registrar_for(model, registrar)
-    seen = encode_frame(cloud, model, frame)
-    return answer_frame(seen, model, registrar, resolution, label_points, scene_unit, stated_unit)
+    found = fitted_frame(cloud, model, registrar, frame, scene_unit, stated_unit, keep_all)
+    return answer_fitted(found, model, registrar, resolution, label_points)
 
 
-def answer_frame(
-    seen: EncodedFrame,
+def answer_fitted(
+    found: FittedFrame,
     model: Model,
     registrar: Registrar | None,
     resolution: int = 128,
     label_points: bool = False,
-    scene_unit: float | None = None,
-    stated_unit: float | None = None,
 ) -> Answer:
-    """``answer`` to a frame that the model has understood already, with its arguments."""
-    if registrar is None:
-        return Answer(extract(seen, model, resolution, label_points))
-    auto = registrar.choice == "auto"
-    try:
-        registration = registrar.register(seen.seen, seen.code, scene_unit, stated_unit)
-    except ValueError as error:
-        if not auto:
-            raise
-        return Answer(extract(seen, model, resolution, label_points), refusal=str(error))
-    taken = registration.accepted or not auto
-    if taken:
-        result = registered(seen, registration, model, resolution, label_points)
-    else:
-        result = extract(seen, model, resolution, label_points)
-    return Answer(result, registration, taken)
+    """``answer`` to a frame that ``registrar`` has been fitted to already, with its arguments."""
+    auto = registrar is None or registrar.choice == "auto"
+    if found.error is not None and not auto:
+        raise found.error
+    registration = None if registrar is None or found.modes is None else registrar.finish(found.modes)
+    if registration is not None and (registration.accepted or not auto):
+        return Answer(registered(found.seen, registration, model, resolution, label_points), registration, taken=True)
+    result = extract(found.unaided, model, resolution, label_points)
+    return Answer(result, registration, refusal=None if found.error is None else str(found.error))
 
 
 def registered(
@@ -127,6 +121,7 @@ def registered(
         clipped=False,
         code=seen.code,
         T_camera_input=seen.T_camera_input,
+        reading=seen.reading,
         observed=observed,
     )
     return result if seen.axes == "camera" else turned_back(result)

@@ -88,6 +88,16 @@ class ModesFit:
             at_rest = is_at_rest(problem, modes, rest)
         return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
 
+    @property
+    def tolerance(self) -> float:
+        """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
+        return self.problem.config.tolerance
+
+    def off_surface(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Distances, in scene units, of points of the camera frame in the cloud's unit from the facing surface."""
+        material = self.registration().material / self.unit
+        return Surface.through(self.problem.model, material).nearest(points / self.unit)[0]
+
     def registration(self) -> Registration:
         """The answer of the modes, or the rest model where the frame speaks for that."""
         model = self.problem.model

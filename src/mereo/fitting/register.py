@@ -6,6 +6,9 @@ EncodedFrame -Registrar-> Registration
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+from jaxtyping import Float
+
 from mereo.fitting.config import FitChoice
 from mereo.fitting.fit import ModesFit, fit_frame
 from mereo.fitting.playback import DrawnStates
@@ -92,9 +95,11 @@ class Registrar:
         code: EncodedCloud | None = None,
         scene_unit: float | None = None,
         stated_unit: float | None = None,
+        doubtful: Float[np.ndarray, "d 3"] | None = None,
     ) -> ModesFit:
-        """Fit of the modes; raises ``ValueError`` as ``fit_frame`` does."""
-        return fit_frame(seen, self.network, self.model, scene_unit, code=code, stated_unit=stated_unit)
+        """Fit of the modes, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
+        network, model = self.network, self.model
+        return fit_frame(seen, network, model, scene_unit, code=code, stated_unit=stated_unit, doubtful=doubtful)
 
     def register(
         self,

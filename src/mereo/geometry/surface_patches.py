@@ -73,14 +73,16 @@ def _patches(
     angle, neighbor = cKDTree(sight).query(sight, k=NEIGHBORS + 1)
     angle, neighbor = angle[:, 1:], neighbor[:, 1:]
     fourth = angle[:, 3]
-    # as wide as of most points or as of those around, whichever is more: parts of a cloud may be sparser than others
-    pitch = np.maximum(np.median(fourth), np.median(fourth[neighbor], axis=1))
+    pitch = float(np.median(fourth))
+    # as wide as of most points or as of those around, whichever is more: parts of a cloud may be sparser than others;
+    # what is beside each other is not told by it, as the few points that cameras add before edges would join to patches
+    around = AROUND * np.maximum(pitch, np.median(fourth[neighbor], axis=1))
     step = np.abs(distance[neighbor] - distance[:, None])
     tall = np.maximum(JUMP * pitch * distance, NOISE * float(np.median(step[:, :4])))
-    row, column = np.nonzero((angle <= BESIDE * pitch[:, None]) & (step <= tall[:, None]))
+    row, column = np.nonzero((angle <= BESIDE * pitch) & (step <= tall[:, None]))
     edges = (np.ones(len(row), dtype=np.int8), (row, neighbor[row, column]))
     patch = connected_components(coo_matrix(edges, shape=(len(points),) * 2), directed=False)[1]
-    same = (angle <= AROUND * pitch[:, None]) & (patch[neighbor] == patch[:, None])
+    same = (angle <= around[:, None]) & (patch[neighbor] == patch[:, None])
     return patch.astype(np.int64), same.sum(axis=1) >= INNER, tall
 
 

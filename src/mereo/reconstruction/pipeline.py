@@ -26,7 +26,7 @@ from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import Field
 from mereo.reconstruction.isosurfaces import extract_whole, locate
 from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
-from mereo.reconstruction.strays import Reading, readings
+from mereo.reconstruction.strays import Reading, as_cloud, readings
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
@@ -46,8 +46,8 @@ class Reconstruction:
         clipped: whether a segment still reached the largest box and was closed there.
         code: what the model made of the cloud; ask it for more with ``Model.query``, in the camera frame.
         T_camera_input: from the input's frame to the camera frame.
-        observed: the segment of each point that is taken for the object's, where it was asked for.
-        reading: these points, and what of the input was dropped as strays; None where no one decided.
+        reading: which of the input's points are taken for the object's; the others were dropped as strays.
+        observed: the segment of each of these points, where it was asked for.
     """
 
     surfaces: SegmentedMesh
@@ -58,8 +58,8 @@ class Reconstruction:
     clipped: bool
     code: EncodedCloud
     T_camera_input: Float[np.ndarray, "4 4"]
+    reading: Reading
     observed: SegmentedCloud | None = None
-    reading: Reading | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,35 +67,44 @@ class EncodedFrame:
     """Cloud as a model has understood it: what both the network's surfaces and a registration start from.
 
     Attributes:
-        points: the cloud, in the input's frame and unit.
+        reading: the cloud, in the input's frame and unit, and which of its points were understood.
         axes: of that frame.
         T_camera_input: into the camera frame.
         code: what the model made of the cloud.
         timings_s: seconds of each stage so far.
     """
 
-    points: Float[np.ndarray, "n 3"]
+    reading: Reading
     axes: CloudAxes
     T_camera_input: Float[np.ndarray, "4 4"]
     code: EncodedCloud
     timings_s: dict[str, float]
 
+    @property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """The object's points, in the input's frame and unit."""
+        return self.reading.cloud.points
+
     @cached_property
     def seen(self) -> PointCloud:
-        """The cloud in the camera frame."""
+        """The object's points in the camera frame."""
         return PointCloud(transform_points(self.T_camera_input, self.points))
 
 
 def encode_frame(
-    cloud: PointCloud | Float[np.ndarray, "n 3"], model: Model, axes: CloudAxes = "camera"
+    cloud: PointCloud | Float[np.ndarray, "n 3"] | Reading, model: Model, axes: CloudAxes = "camera"
 ) -> EncodedFrame:
-    """The first step of ``reconstruct``, with its arguments; raises ``ValueError`` for unusable clouds."""
-    points = np.asarray(cloud.points if isinstance(cloud, PointCloud) else cloud, dtype=np.float64)
+    """The first step of ``reconstruct``: a cloud, or a reading of it, as a model understands it.
+
+    Raises ``ValueError`` for unusable clouds.
+    """
+    reading = cloud if isinstance(cloud, Reading) else Reading.of_all(as_cloud(cloud))
+    points = reading.cloud.points
     T_camera_input = into_camera(points, axes)
     seconds: dict[str, float] = {}
     with timed(seconds, "encode"):
         code = model.encode(PointCloud(transform_points(T_camera_input, points)))
-    return EncodedFrame(points, axes, T_camera_input, code, seconds)
+    return EncodedFrame(reading, axes, T_camera_input, code, seconds)
 
 
 def reconstruct(
@@ -115,13 +124,12 @@ def reconstruct(
         frame: the cloud's axes: "camera" is x right, y down, z forward from the camera at the origin; "scanner" is y
             up, z toward the scanner.
         label_points: also say on which segment each point of the cloud lies (``Reconstruction.observed``).
-        keep_all: drop no strays, see ``readings``; else ``Reconstruction.reading`` says what was dropped.
+        keep_all: drop no strays, see ``readings``; else ``Reconstruction.reading`` says which.
 
     Raises ``ValueError`` for unusable clouds, and where the model finds no segment at all.
     """
-    reading = readings(cloud, frame, keep_all)[0]
-    found = extract(encode_frame(reading.cloud, model, frame), model, resolution, label_points)
-    return replace(found, reading=reading)
+    seen = encode_frame(readings(cloud, frame, keep_all)[0], model, frame)
+    return extract(seen, model, resolution, label_points)
 
 
 def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_points: bool = False) -> Reconstruction:
@@ -148,6 +156,7 @@ def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_point
         clipped=bool(found.grid.touched_sides().any()),
         code=code,
         T_camera_input=seen.T_camera_input,
+        reading=seen.reading,
         observed=observed,
     )
     return result if seen.axes == "camera" else turned_back(result)

@@ -9,9 +9,10 @@ of the object may choose. Measured in docs/design/0006-sensors.md.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
@@ -35,19 +36,32 @@ class Reading:
     """Reading of a cloud: the points that are taken for the object's, and what the others did.
 
     Attributes:
-        cloud: the object's points, in the input's frame and unit; the cloud itself where nothing is dropped.
-        before: points before strays were dropped.
-        stretch: times that the longest side of the box was as long with the strays, from 1 up (camera axes).
+        whole: every point, in the input's frame and unit.
+        keep: which of them are the object's.
     """
 
-    cloud: PointCloud
-    before: int
-    stretch: float = 1.0
+    whole: PointCloud
+    keep: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of_all(cls, whole: PointCloud) -> "Reading":
+        """The reading with every point."""
+        return cls(whole, np.ones(len(whole), dtype=bool))
+
+    @cached_property
+    def cloud(self) -> PointCloud:
+        """The object's points; the whole cloud itself where nothing is dropped."""
+        return self.whole if self.keep.all() else PointCloud(self.whole.points[self.keep])
 
     @property
     def dropped(self) -> int:
         """Number of strays."""
-        return self.before - len(self.cloud)
+        return len(self.whole) - len(self.cloud)
+
+    @property
+    def stretch(self) -> float:
+        """Times that the longest side of the box is as long with the strays, from 1 up."""
+        return longest_side(self.whole.points) / max(longest_side(self.cloud.points), np.finfo(float).tiny)
 
     @property
     def step(self) -> IsolationStep | None:
@@ -55,16 +69,21 @@ class Reading:
         if not self.dropped:
             return None
         detail = f"the longest side was {self.stretch:.3g} times as long with the others"
-        return IsolationStep("strays", self.before, len(self.cloud), detail)
+        return IsolationStep("strays", len(self.whole), len(self.cloud), detail)
 
     def __str__(self) -> str:
         """One line for people; empty where nothing was dropped."""
         if not self.dropped:
             return ""
         return (
-            f"strays: {self.dropped} of {self.before} points dropped, the longest side was {self.stretch:.3g} times as "
-            "long with them (--keep-all keeps them)"
+            f"strays: {self.dropped} of {len(self.whole)} points dropped, the longest side was {self.stretch:.3g} times "
+            "as long with them (--keep-all keeps them)"
         )
+
+
+def as_cloud(points: PointCloud | Float[np.ndarray, "n 3"]) -> PointCloud:
+    """Cloud of points; raises ``ValueError`` where they are not finite."""
+    return points if isinstance(points, PointCloud) else PointCloud(np.asarray(points, dtype=np.float64))
 
 
 def readings(
@@ -83,15 +102,14 @@ def readings(
 
     Raises ``ValueError`` for points that are not finite.
     """
-    seen = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
-    everything = Reading(seen, len(seen))
+    seen = as_cloud(cloud)
+    everything = Reading.of_all(seen)
     if keep_all or len(seen) < MIN_POINTS:
         return (everything,)
     points = transform_points(into_camera(seen.points, axes), seen.points)
     patch, keep = surface_patches(points)
-    stretch = longest_side(points) / max(longest_side(points[keep]), np.finfo(float).tiny)
-    if stretch <= STRETCH or keep.sum() < max(MIN_POINTS, (1 - MOST) * len(points)):
+    surfaces = Reading(seen, keep)
+    if keep.sum() < max(MIN_POINTS, (1 - MOST) * len(points)) or surfaces.stretch <= STRETCH:
         return (everything,)
-    surfaces = Reading(PointCloud(seen.points[keep]), len(seen), stretch)
     scattered = len(np.unique(patch[~keep])) >= SCATTERED
     return (surfaces, everything) if scattered else (everything, surfaces)

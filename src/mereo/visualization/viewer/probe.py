@@ -45,7 +45,7 @@ class Inspection:
         T_camera_input: from the input's frame to the camera frame.
         model: the weights.
         source: where the answer comes from, in a phrase.
-        cloud: what was seen, in the input's frame; None for a state without its frame.
+        cloud: the object's points, in the input's frame; None for a state without its frame.
         code: what the weights made of the cloud, camera frame.
         registration: of the object's own model, camera frame, where the surfaces are that model.
     """
@@ -67,17 +67,18 @@ class Inspection:
         frame: CloudAxes = "camera",
         registrar: Registrar | None = None,
         unit_m: float | None = None,
+        keep_all: bool = False,
     ) -> "Inspection":
         """Default answer to a cloud of a unit of ``unit_m`` metres; raises as ``fitting.answer.answer`` does."""
         stated = None if registrar is None or unit_m is None else registrar.stated_unit(unit_m)
-        found = answer(cloud, model, registrar, resolution, frame, stated_unit=stated)
+        found = answer(cloud, model, registrar, resolution, frame, stated_unit=stated, keep_all=keep_all)
         result = found.reconstruction
         return cls(
             surfaces=result.surfaces,
             T_camera_input=result.T_camera_input,
             model=model,
             source=source_of(found, registrar),
-            cloud=cloud,
+            cloud=result.reading.cloud,
             code=result.code,
             registration=found.registration if found.taken else None,
         )

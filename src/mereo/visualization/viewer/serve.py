@@ -83,7 +83,8 @@ def view_frame(
         frame = Frame.read(input, reading, isolation)
     model = load_for(weights, inference or InferenceConfig())
     registrar = registrar_for(model, "auto")
-    inspection = Inspection.of(frame.cloud, model, resolution, frame.axes, registrar, frame.unit_m)
+    keep_all = isolation is not None and isolation.keep_all
+    inspection = Inspection.of(frame.cloud, model, resolution, frame.axes, registrar, frame.unit_m, keep_all)
     server = start_server(port, "mereo")
     FramePage(server, inspection, frame.title, f"{len(frame.cloud):,} points · weights {weights}", frame.unit)
     _serve(server)
