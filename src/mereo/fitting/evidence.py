@@ -7,7 +7,7 @@ unit.
 The camera is at the origin.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +21,9 @@ MOST_POINTS = 6000
 
 PARTNERS = 500
 """Observed points, evenly spread, that are compared with the model's surface."""
+
+MORE_PARTNERS = 1500
+"""The same of a noisy frame, whose noise averages out over more of them."""
 
 SILHOUETTE_PITCHES = 1.2
 """Beside the nearest line of sight by more than this many pixels is outside."""
@@ -43,9 +46,9 @@ class Evidence:
     Attributes:
         points: observed, camera frame.
         partners: some of them, evenly spread.
-        sight: search tree over the unit vectors towards ``points``.
+        sight: search tree over the unit vectors towards ``points`` and doubtful points.
         ranges: distance of each point from the camera.
-        front: nearest of these among each line of sight and those around it.
+        front: nearest of these among each line of sight and those around it; 0 along those of doubtful points.
         pitch: angle between neighbouring lines of sight.
         roughness: how far points lie off the planes through those around them, where the cloud is smoothest.
     """
@@ -54,7 +57,7 @@ class Evidence:
     partners: Float[np.ndarray, "p 3"]
     sight: cKDTree
     ranges: Float[np.ndarray, " n"]
-    front: Float[np.ndarray, " n"]
+    front: Float[np.ndarray, " s"]
     pitch: float
     roughness: float
 
@@ -78,6 +81,11 @@ class Evidence:
             sight = cKDTree(np.concatenate([sight.data, toward]))
             front = np.concatenate([front, np.zeros(len(doubtful))])
         return cls(points, points[spread(points, PARTNERS)], sight, ranges, front, pitch, roughness)
+
+    @property
+    def with_more_partners(self) -> "Evidence":
+        """The same with as many partners as a noisy frame needs."""
+        return replace(self, partners=self.points[spread(self.points, MORE_PARTNERS)])
 
     def violations(
         self, vertices: Float[np.ndarray, "n 3"], slack: float

@@ -99,12 +99,12 @@ class Problem:
         return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
 
     def as_noisy_as(self, posed: Posed) -> "Problem | None":
-        """The problem with the constants for the noise that a fit leaves over; None where these are the same."""
+        """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that."""
         distance = Surface.of(self.model, posed).nearest(self.evidence.partners)[0]
         config = constants_for(noise_of_frame(distance, self.evidence), self.config)
-        if config is self.config:
-            return None
-        return replace(self, config=config)
+        return (
+            None if config is self.config else replace(self, config=config, evidence=self.evidence.with_more_partners)
+        )
 
     @cached_property
     def samples(self) -> SampledSurface:

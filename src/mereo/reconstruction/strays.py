@@ -75,10 +75,8 @@ class Reading:
         """One line for people; empty where nothing was dropped."""
         if not self.dropped:
             return ""
-        return (
-            f"strays: {self.dropped} of {len(self.whole)} points dropped, the longest side was {self.stretch:.3g} times "
-            "as long with them (--keep-all keeps them)"
-        )
+        dropped = f"strays: {self.dropped} of {len(self.whole)} points dropped, the longest side was {self.stretch:.3g}"
+        return f"{dropped} times as long with them (--keep-all keeps them)"
 
 
 def as_cloud(points: PointCloud | Float[np.ndarray, "n 3"]) -> PointCloud:

@@ -1,0 +1,149 @@
+"""What belongs to the object is told by what a fit explains, and how noisy a frame is by what a fit leaves over."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mereo.evaluation.sample_views import load_view
+from mereo.fitting.answer import answer
+from mereo.fitting.config import FitConfig
+from mereo.fitting.evidence import Evidence
+from mereo.fitting.noise import CLEAN, LARGEST, constants_for, noise_of_frame
+from mereo.fitting.readings import FittedFrame, fitted_frame
+from mereo.fitting.register import Registrar
+from mereo.geometry.camera import PointCloud
+from mereo.models.model import Model
+from mereo.models.weights import load_model
+from mereo.reconstruction.strays import Reading, readings
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return load_model("liver")
+
+
+@pytest.fixture(scope="module")
+def registrar(model: Model) -> Registrar:
+    return Registrar.of(model, "modes")
+
+
+@pytest.fixture(scope="module")
+def points() -> np.ndarray:
+    return load_view("liver").depth.to_points().points
+
+
+def with_rim(points: np.ndarray) -> np.ndarray:
+    """The points and pieces of a wall behind, as a mask lets them in that is two pixels too wide in six places."""
+    slopes = points[:, :2] / points[:, 2:]
+    pitch = np.sqrt(np.ptp(slopes, axis=0).prod() / len(slopes))
+    middle = slopes.mean(axis=0)
+    far = slopes[np.argsort(-np.linalg.norm(slopes - middle, axis=1))[:: len(slopes) // 6][:6]]
+    pieces = [
+        far + (far - middle) / np.linalg.norm(far - middle, axis=1)[:, None] * pitch * step for step in (1.5, 2.5)
+    ]
+    rim = np.concatenate(pieces)
+    return np.concatenate([points, np.column_stack([rim, np.ones(len(rim))]) * (1.4 * points[:, 2].max())])
+
+
+def frame(model: Model, registrar: Registrar, points: np.ndarray, **options: bool) -> FittedFrame:
+    return fitted_frame(PointCloud(points), model, registrar, scene_unit=1.0, **options)
+
+
+def test_strays_are_left_out_and_all_else_is_kept(model: Model, registrar: Registrar, points: np.ndarray) -> None:
+    clean, found = frame(model, registrar, points), frame(model, registrar, with_rim(points))
+    assert clean.reading.dropped == 0 and clean.seen is clean.unaided
+    assert not found.reading.keep[len(points) :].any() and found.reading.keep[: len(points)].mean() > 0.99
+    assert found.modes is not None and clean.modes is not None
+    moved = np.linalg.norm(found.modes.registration().material - clean.modes.registration().material, axis=1)
+    assert np.median(moved) < 0.2
+    asked = frame(model, registrar, with_rim(points), keep_all=True)
+    assert asked.reading.dropped == 0
+
+
+def test_a_part_that_looks_like_strays_is_given_back(
+    model: Model, registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A geometric rule that takes a tenth of the object for strays: the fit explains these points, so all are kept."""
+
+    def wrong(cloud: PointCloud, axes: str, keep_all: bool) -> tuple[Reading, Reading]:
+        keep = cloud.points[:, 0] < np.quantile(cloud.points[:, 0], 0.9)
+        return Reading(cloud, keep), Reading.of_all(cloud)
+
+    monkeypatch.setattr("mereo.fitting.readings.readings", wrong)
+    found = frame(model, registrar, points)
+    assert found.reading.dropped == 0 and found.unaided.reading.dropped > 0
+
+
+def test_points_that_a_fit_explains_are_given_back_beside_strays(
+    model: Model, registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contaminated = with_rim(points)
+    lost = np.random.default_rng(0).choice(len(points), 10, replace=False)
+
+    def hasty(cloud: PointCloud, axes: str, keep_all: bool) -> tuple[Reading, Reading]:
+        keep = np.arange(len(cloud)) < len(points)
+        keep[lost] = False
+        return Reading(cloud, keep), Reading.of_all(cloud)
+
+    monkeypatch.setattr("mereo.fitting.readings.readings", hasty)
+    keep = frame(model, registrar, contaminated).reading.keep
+    assert keep[lost].all() and not keep[len(points) :].any()
+
+
+def test_without_a_fit_the_likely_reading_is_taken(model: Model, points: np.ndarray) -> None:
+    contaminated = PointCloud(with_rim(points))
+    found = fitted_frame(contaminated, model, None)
+    assert found.modes is None and found.reading.dropped == readings(contaminated)[0].dropped
+
+
+def test_an_answer_says_which_points_it_is_of(model: Model, registrar: Registrar, points: np.ndarray) -> None:
+    found = answer(with_rim(points), model, registrar, 24, label_points=True, scene_unit=1.0)
+    assert found.taken and found.reconstruction.observed is not None
+    assert len(found.reconstruction.observed.labels) == len(found.reconstruction.reading.cloud) < len(with_rim(points))
+
+
+def noisy(points: np.ndarray, std: float) -> np.ndarray:
+    """Points with noise along their rays."""
+    noise = np.random.default_rng(0).normal(scale=std, size=(len(points), 1))
+    return points + noise * points / np.linalg.norm(points, axis=1)[:, None]
+
+
+def test_a_noisy_frame_is_fitted_by_its_own_noise(model: Model, registrar: Registrar, points: np.ndarray) -> None:
+    """Seen in the constants, in what is believed, and in any unit."""
+    clean, found = frame(model, registrar, points).modes, frame(model, registrar, noisy(points, 0.4)).modes
+    assert clean is not None and found is not None
+    assert clean.problem.config == FitConfig()
+    config = found.problem.config
+    assert 0.6 < config.cloud_sigma <= LARGEST and config.tolerance == pytest.approx(2.25 * config.cloud_sigma)
+    assert len(found.problem.evidence.partners) > len(clean.problem.evidence.partners)
+    assert found.registration().accepted
+    metres = fitted_frame(PointCloud(noisy(points, 0.4) * 0.005), model, registrar, scene_unit=0.005).modes
+    assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=1e-6)
+
+
+def test_a_wrong_fit_is_no_noise(points: np.ndarray) -> None:
+    """All points a unit off the model: a smooth cloud shows that no camera did that."""
+    evidence = Evidence.of(points)
+    assert noise_of_frame(np.full(500, 1.0), evidence) < 1.5 * CLEAN
+    rough = Evidence.of(noisy(points, 0.4))
+    assert rough.roughness > 3 * evidence.roughness
+    assert noise_of_frame(np.full(500, 0.25), rough) == pytest.approx(0.25 * 1.4826)
+
+
+def test_constants_follow_the_noise_and_end() -> None:
+    config = FitConfig()
+    assert constants_for(CLEAN, config) is config
+    found = constants_for(0.2, config)
+    assert (found.cloud_sigma, found.tolerance) == pytest.approx((0.6, 1.35))
+    assert replace(found, cloud_sigma=config.cloud_sigma, tolerance=config.tolerance) == config
+    assert constants_for(9.0, config).cloud_sigma == LARGEST
+
+
+def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:
+    """A vertex along the line of sight of a dropped point is neither outside the silhouette nor in free space."""
+    slopes = points[:, :2] / points[:, 2:]
+    corner = np.append(slopes.max(axis=0) + 0.2, 1.0)
+    vertices = np.array([corner * 50.0, corner * 150.0])
+    assert (Evidence.of(points).violations(vertices, 0.5)[1] > 0).all()
+    assert (Evidence.of(points, corner[None] * 300.0).violations(vertices, 0.5)[1] == 0).all()
