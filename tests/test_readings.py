@@ -119,7 +119,7 @@ def test_a_noisy_frame_is_fitted_by_its_own_noise(model: Model, registrar: Regis
     assert len(found.problem.evidence.partners) > len(clean.problem.evidence.partners)
     assert found.registration().accepted
     metres = fitted_frame(PointCloud(noisy(points, 0.4) * 0.005), model, registrar, scene_unit=0.005).modes
-    assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=1e-6)
+    assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=0.02)
 
 
 def test_a_wrong_fit_is_no_noise(points: np.ndarray) -> None:

@@ -24,8 +24,8 @@ SIGMAS = 3.0
 """Standard deviation that the cloud gets, in noises: as on clean frames."""
 
 MOST_ROUGH = 2.0
-"""Noise over the roughness of a cloud (``Evidence``) at most: 1.3 to 1.6 on smooth objects under simulated depth cameras,
-2 where every pixel is noisy by itself."""
+"""Noise over the roughness of a cloud (``Evidence``) at most: 1.3 to 1.6 on smooth objects under simulated depth
+cameras, 2 where every pixel is noisy by itself."""
 
 LARGEST = 1.0
 """Largest standard deviation of the cloud, in scene units: beyond, the fit is wrong and not the camera."""
