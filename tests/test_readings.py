@@ -9,7 +9,7 @@ from mereo.evaluation.sample_views import load_view
 from mereo.fitting.answer import answer
 from mereo.fitting.config import FitConfig
 from mereo.fitting.evidence import Evidence
-from mereo.fitting.noise import CLEAN, LARGEST, constants_for, noise_of_frame
+from mereo.fitting.noise import CLEAN, LARGEST, constants_for, is_noise, noise_of
 from mereo.fitting.readings import FittedFrame, fitted_frame
 from mereo.fitting.register import Registrar
 from mereo.geometry.camera import PointCloud
@@ -122,13 +122,15 @@ def test_a_noisy_frame_is_fitted_by_its_own_noise(model: Model, registrar: Regis
     assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=0.02)
 
 
-def test_a_wrong_fit_is_no_noise(points: np.ndarray) -> None:
-    """All points a unit off the model: a smooth cloud shows that no camera did that."""
-    evidence = Evidence.of(points)
-    assert noise_of_frame(np.full(500, 1.0), evidence) < 1.5 * CLEAN
-    rough = Evidence.of(noisy(points, 0.4))
-    assert rough.roughness > 3 * evidence.roughness
-    assert noise_of_frame(np.full(500, 0.25), rough) == pytest.approx(0.25 * 1.4826)
+def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
+    """An offset of all points, or of half of them, is the fit's; what each has for itself is the camera's."""
+    around, rng = Evidence.of(points).around, np.random.default_rng(0)
+    own = rng.normal(scale=0.3, size=len(points))
+    half = np.where(points[:, 0] > np.median(points[:, 0]), 2.0, 0.0)
+    assert noise_of(own, around) == pytest.approx(0.3, rel=0.1) and is_noise(own, noise_of(own, around))
+    assert noise_of(own + 1.0, around) == pytest.approx(0.3, rel=0.1)
+    assert not is_noise(own + 1.0, noise_of(own + 1.0, around))
+    assert noise_of(half, around) == 0.0
 
 
 def test_constants_follow_the_noise_and_end() -> None:

@@ -60,11 +60,11 @@ def test_a_ball_loses_slivers_of_its_outline_at_most() -> None:
     assert keep.mean() > 0.985 and longest_side(points) < 1.04 * longest_side(points[keep])
 
 
-def test_parts_of_different_density_keep_most() -> None:
-    """A ball of 3,000 points beside a plate of 600, which are five times as far apart: no shared pitch suits both."""
-    plate = np.random.default_rng(4).uniform((2, -1, 6), (4, 1, 6), (600, 3))
-    keep = surface_points(np.concatenate([ball(), plate]))
-    assert keep[:-600].mean() > 0.99 and keep.mean() > 0.8
+def test_parts_of_different_density_lose_nothing() -> None:
+    """A ball of 1,800 random points beside a plate of 600, which are farther apart."""
+    rng = np.random.default_rng(4)
+    plate = rng.uniform((2, -1, 6), (4, 1, 6), (600, 3))
+    assert surface_points(np.concatenate([rng.permutation(ball())[:1800], plate])).mean() > 0.99
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e4])

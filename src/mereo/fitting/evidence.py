@@ -10,7 +10,7 @@ The camera is at the origin.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from mereo.deformation.moving_least_squares import spread
@@ -35,9 +35,6 @@ With a pixel's own depth alone, 6 to 13 % of the true surface counted as in fron
 
 AROUND = 9
 
-SMOOTHEST = 0.1
-"""Share of the points, the smoothest, that tells the roughness: edges and curvature look like noise elsewhere."""
-
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -50,7 +47,7 @@ class Evidence:
         ranges: distance of each point from the camera.
         front: nearest of these among each line of sight and those around it; 0 along those of doubtful points.
         pitch: angle between neighbouring lines of sight.
-        roughness: how far points lie off the planes through those around them, where the cloud is smoothest.
+        around: indices of each point's neighbours among the lines of sight, up to 8.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -59,7 +56,7 @@ class Evidence:
     ranges: Float[np.ndarray, " n"]
     front: Float[np.ndarray, " s"]
     pitch: float
-    roughness: float
+    around: Int[np.ndarray, "n k"]
 
     @classmethod
     def of(cls, points: Float[np.ndarray, "n 3"], doubtful: Float[np.ndarray, "d 3"] | None = None) -> "Evidence":
@@ -75,12 +72,11 @@ class Evidence:
         # the fourth neighbour of a pixel is one pitch away, as the first is; irregular clouds are not so lucky
         pitch = float(np.median(angle[:, min(4, len(points)) - 1]))
         front = np.where(angle <= AROUND_PITCHES * pitch, ranges[near], np.inf).min(axis=1)
-        roughness = float(np.quantile(_off_planes(points[near]), SMOOTHEST))
         if doubtful is not None and len(doubtful):
             toward = doubtful / np.linalg.norm(doubtful, axis=1, keepdims=True)
             sight = cKDTree(np.concatenate([sight.data, toward]))
             front = np.concatenate([front, np.zeros(len(doubtful))])
-        return cls(points, points[spread(points, PARTNERS)], sight, ranges, front, pitch, roughness)
+        return cls(points, points[spread(points, PARTNERS)], sight, ranges, front, pitch, near[:, 1:])
 
     @property
     def with_more_partners(self) -> "Evidence":
@@ -104,10 +100,3 @@ class Evidence:
         ahead = self.front[near] - slack - distance
         direction = np.where(beside[:, None], out, toward)
         return direction, np.maximum(np.where(beside, length - self.pitch * distance, ahead), 0.0)
-
-
-def _off_planes(groups: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
-    """Standard deviation of each group of points about its own plane."""
-    offset = groups - groups.mean(axis=1, keepdims=True)
-    least = np.linalg.eigvalsh(np.matmul(offset.transpose(0, 2, 1), offset))[:, 0]
-    return np.sqrt(np.maximum(least, 0.0) / max(groups.shape[1] - 3, 1))

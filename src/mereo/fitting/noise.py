@@ -1,49 +1,49 @@
 """Noise of a frame, told by what a first fit leaves over, and the constants of a fit to such a frame.
 
 Depth cameras are off by a twentieth of a scene unit or by half of one, depending on their principle, the distance and
-the slant. The observed points' distances from a fitted model tell: their median hardly sees the places where the model
-is wrong. A fit that is wrong everywhere must not pass for a noisy camera, so the noise is at most what the cloud itself
-shows where it is smoothest; on thin objects, whose clouds are rough everywhere, that bounds little.
+the slant. Differences between neighbouring pixels do not tell, as edges and curvature look like noise too; a fitted
+model takes these away. What it leaves over is noise where every pixel has its own; where neighbours have the same, the
+model is wrong.
 """
 
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.evidence import Evidence
 
 TO_STD = 1.4826
 """Standard deviation of normal numbers over the median of their absolute values."""
 
 CLEAN = 0.1
-"""Noise, in scene units, up to which the constants are as they are; clean frames leave 0.05 to 0.06."""
+"""Noise, in scene units, up to which the constants are as they are; clean frames have 0.05 to 0.07."""
+
+COHERENT = 1.3
+"""What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1, whatever the camera."""
 
 SIGMAS = 3.0
 """Standard deviation that the cloud gets, in noises: as on clean frames."""
 
-MOST_ROUGH = 2.0
-"""Noise over the roughness of a cloud (``Evidence``) at most: 1.3 to 1.6 on smooth objects under simulated depth
-cameras, 2 where every pixel is noisy by itself."""
-
 LARGEST = 1.0
-"""Largest standard deviation of the cloud, in scene units: beyond, the fit is wrong and not the camera."""
+"""Largest standard deviation of the cloud, in scene units."""
 
 
-def noise_of(distance: Float[np.ndarray, " p"]) -> float:
-    """Standard deviation of the noise, from the observed points' distances from a fitted surface; robust."""
-    return TO_STD * float(np.median(distance))
-
-
-def noise_of_frame(distance: Float[np.ndarray, " p"], evidence: Evidence) -> float:
-    """Standard deviation of a frame's noise in scene units.
+def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> float:
+    """Standard deviation of what each point's offset does not share with those around it; robust.
 
     Args:
-        distance: of the observed points from a fitted surface.
-        evidence: the frame.
+        offset: signed distance of each observed point from a fitted surface.
+        around: indices of each point's neighbours.
     """
-    return min(noise_of(distance), MOST_ROUGH * evidence.roughness)
+    own = offset - np.median(offset[around], axis=1)
+    # the median of k neighbours is itself off by pi / 2k of their variance
+    return TO_STD * float(np.median(np.abs(own))) / float(np.sqrt(1.0 + np.pi / (2 * around.shape[1])))
+
+
+def is_noise(offset: Float[np.ndarray, " n"], noise: float) -> bool:
+    """Whether what a fit leaves over is noise, and not the fit's own error."""
+    return TO_STD * float(np.median(np.abs(offset))) <= COHERENT * noise
 
 
 def constants_for(noise: float, config: FitConfig) -> FitConfig:

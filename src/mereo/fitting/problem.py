@@ -11,7 +11,7 @@ from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import PARTNERS, Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed
 from mereo.fitting.joints import Joints
-from mereo.fitting.noise import constants_for, noise_of_frame
+from mereo.fitting.noise import constants_for, is_noise, noise_of
 from mereo.fitting.priors import PairTerm, Prior
 from mereo.fitting.residuals import (
     ROBUST,
@@ -99,9 +99,13 @@ class Problem:
         return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
 
     def as_noisy_as(self, posed: Posed) -> "Problem | None":
-        """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that."""
-        distance = Surface.of(self.model, posed).nearest(self.evidence.partners)[0]
-        config = constants_for(noise_of_frame(distance, self.evidence), self.config)
+        """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that.
+
+        None as well where what is left over is the fit's own error.
+        """
+        offset = Surface.of(self.model, posed).offsets(self.evidence.points)
+        noise = noise_of(offset, self.evidence.around)
+        config = constants_for(noise, self.config) if is_noise(offset, noise) else self.config
         return (
             None if config is self.config else replace(self, config=config, evidence=self.evidence.with_more_partners)
         )

@@ -76,6 +76,11 @@ class Surface:
         squared, face, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         return np.sqrt(squared), face.astype(np.int64), place
 
+    def offsets(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
+        """Signed distance of each point from the facing surface, negative behind it."""
+        distance, face, place = self.nearest(points)
+        return np.copysign(distance, np.einsum("pi,pi->p", points - place, self.normals[face]))
+
     def planes(
         self, points: Float[np.ndarray, "p 3"]
     ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float32[np.ndarray, "p 3 k"]]:

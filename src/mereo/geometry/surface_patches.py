@@ -27,6 +27,12 @@ JUMP = 4.0
 NOISE = 2.5
 """The same in median steps between nearest neighbours, where that is more: closer points differ by noise alone."""
 
+GRID = 0.8
+"""Nearest neighbour's angle over the fourth's from which on lines of sight are a grid of pixels; random ones have 0.5.
+
+On a grid the pitch is the same everywhere, and where neighbours are farther there are none: the few points that cameras
+add before edges would otherwise join to patches. Other clouds may be sparser in one part than in another."""
+
 INNER = 20
 """Neighbours of the same patch, of the 24, that make a point an inner one; a strip of three pixels has 14."""
 
@@ -73,16 +79,16 @@ def _patches(
     angle, neighbor = cKDTree(sight).query(sight, k=NEIGHBORS + 1)
     angle, neighbor = angle[:, 1:], neighbor[:, 1:]
     fourth = angle[:, 3]
-    pitch = float(np.median(fourth))
-    # as wide as of most points or as of those around, whichever is more: parts of a cloud may be sparser than others;
-    # what is beside each other is not told by it, as the few points that cameras add before edges would join to patches
-    around = AROUND * np.maximum(pitch, np.median(fourth[neighbor], axis=1))
+    everywhere = float(np.median(fourth))
+    around = np.maximum(everywhere, np.median(fourth[neighbor], axis=1))
+    on_grid = float(np.median(angle[:, 0])) > GRID * everywhere
+    pitch = np.full(len(points), everywhere) if on_grid else around
     step = np.abs(distance[neighbor] - distance[:, None])
     tall = np.maximum(JUMP * pitch * distance, NOISE * float(np.median(step[:, :4])))
-    row, column = np.nonzero((angle <= BESIDE * pitch) & (step <= tall[:, None]))
+    row, column = np.nonzero((angle <= BESIDE * pitch[:, None]) & (step <= tall[:, None]))
     edges = (np.ones(len(row), dtype=np.int8), (row, neighbor[row, column]))
     patch = connected_components(coo_matrix(edges, shape=(len(points),) * 2), directed=False)[1]
-    same = (angle <= around[:, None]) & (patch[neighbor] == patch[:, None])
+    same = (angle <= AROUND * around[:, None]) & (patch[neighbor] == patch[:, None])
     return patch.astype(np.int64), same.sum(axis=1) >= INNER, tall
 
 
