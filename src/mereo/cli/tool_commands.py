@@ -181,6 +181,7 @@ class BenchCommand:
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
         output: a JSON file for the figures.
+        force: replace an existing file, unless the weights are read from it.
     """
 
     weights: str | None = None
@@ -190,6 +191,7 @@ class BenchCommand:
     repeats: Count = 7
     rival: bool = False
     output: Path | None = None
+    force: bool = False
 
     def run(self) -> None:
         """Print the times of all stages of an answer."""
@@ -197,7 +199,9 @@ class BenchCommand:
         from mereo.models.device import find_device
 
         device = find_device(self.device)
-        benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.output)
+        benchmark(
+            self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.output, self.force
+        )
 
 
 @dataclass(frozen=True)
