@@ -28,7 +28,8 @@ def show_modes(scene: str, output: Path | None, states: int, force: bool = False
         states: random states from which a scene's model is built.
         force: replace an existing picture, unless it is read.
 
-    Raises ``FileExistsError`` as ``atomic_file`` does, and ``ValueError`` for too few states, for weights without a model and for another suffix than .png.
+    Raises ``FileExistsError`` as ``atomic_file`` does; ``ValueError`` for too few states, for weights
+    without a model and for another suffix than .png.
     """
     check_file_place(output, force=force)
     if output is not None and output.suffix.lower() != ".png":

@@ -9,7 +9,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from mereo.io.bounds import Count, CountOrNone
+from mereo.io.bounds import CountOrNone, States
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class SceneModes:
 
     scene: Positional[str]
     output: Path | None = None
-    states: Count = 1500
+    states: States = 1500
     force: bool = False
 
     def run(self) -> None:

@@ -56,7 +56,9 @@ def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Ite
     if path.exists() and not force:
         raise FileExistsError(f"{path} {EXISTS}")
     if path.exists() and any(_holds(Path(place), path) for place in inputs):
-        raise FileExistsError(f"{path} is read by this command; it is not replaced, not even by --force: choose another name")
+        raise FileExistsError(
+            f"{path} is read by this command; it is not replaced, not even by --force: choose another name"
+        )
 
 
 def _holds(place: Path, path: Path) -> bool:

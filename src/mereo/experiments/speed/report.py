@@ -55,7 +55,8 @@ def benchmark(
         output: a JSON file, or None.
         force: replace an existing file, unless it is the weights.
 
-    Raises ``FileExistsError`` as ``atomic_file`` does, and ``ValueError`` for weights of an object without a shipped view.
+    Raises ``FileExistsError`` as ``atomic_file`` does, and ``ValueError`` for weights of an object without a
+    shipped view.
     """
     check_file_place(output, force=force, inputs=[] if weights is None else [weights])
     model, view = _subject(weights, preset)
