@@ -73,9 +73,29 @@ def test_every_number_has_bounds_that_it_cannot_leave(settings: type, name: str,
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("train data --output run --batch 0", "batch is 0; it must be a whole number, at least 1: give for example 40"),
+        (
+            "train data --output run --batch 0",
+            "batch is 0; it must be a whole number, from 1 to 65536: give for",
+        ),
+        (
+            "train data --output run --network.width 51200",
+            "network.width is 51200; it must be a whole number, from 1",
+        ),
+        (
+            "train data --output run --network.skip-after 99",
+            "network.skip_after is 99, of 7 layers; the query and the latent vector can return after one of them",
+        ),
+        (
+            "generate rope --examples 1 --output run --workers 9999",
+            "--workers is 9999; it must be a whole number",
+        ),
+        (
+            "scene modes rope --states 150000",
+            "--states is 150000; it must be a whole number, from 1 to 20000",
+        ),
+        ("reconstruct a.npy --weights rope --output run --resolution 100000", "--resolution is 100000; it must be a"),
         ("train data --output run --learning-rate nan", "learning_rate is nan; it must be greater than 0: give for"),
-        ("train data --output run --network.mlp1 8 0", "network.mlp1 is 8 0; it must be whole numbers, each at least"),
+        ("train data --output run --network.mlp1 8 0", "network.mlp1 is 8 0; it must be whole numbers, each from"),
         ("train data --output run --augment.keep-points 1 0.5", "augment.keep_points is 1 0.5; the smaller prob"),
         (
             "train data --output run --network.local-width 6",
@@ -99,7 +119,7 @@ def test_an_option_out_of_its_bounds_is_refused_before_anything_is_read_or_writt
 
 
 def test_a_whole_number_may_be_larger_than_any_float() -> None:
-    check_values(TrainConfig, {"batch": 10**400})
+    check_values(TrainConfig, {"holdout": 10**400})
 
 
 def test_the_help_shows_bounds(capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,8 +132,8 @@ def test_settings_of_a_file_have_the_types_of_their_fields() -> None:
     for name, value, rule in (
         ("encoder", "transformer", "one of pointnet2, "),
         ("encode_positions", 1, "true or false"),
-        ("width", "64", "a whole number, at least 1"),
-        ("mlp1", 64, "whole numbers, each at least 1"),
+        ("width", "64", "a whole number, from 1 to 8192"),
+        ("mlp1", 64, "whole numbers, each from 1 to 8192"),
     ):
         with pytest.raises(ValueError, match=f"network.{name} is .*; it must be {rule}"):
             NetworkConfig.from_dict({name: value})

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration_state import load_state
 from mereo.fitting.state_file import STATE
 from mereo.geometry.solids import Solids
+from mereo.io.output_folders import MARKER, new_directory
 from mereo.models.model import EncodedCloud, Model
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import scene_model
@@ -67,3 +69,27 @@ def test_weights_without_one_show_the_network_alone_and_say_so(
     assert out.count("the network's answer: the weights 'rope' carry no statistical model") == 1
     assert "fit" not in out.splitlines()[2] and len(shown) == 1
     assert (tmp_path / "rope/summary.json").is_file() and not (tmp_path / "rope" / STATE).exists()
+
+
+def test_the_result_of_an_earlier_version_is_kept_and_stops_no_demo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has no list of its files, so nobody can tell it from somebody's own."""
+
+    def show(_case: object, _model: object, folder: Path, _console: object) -> None:
+        with new_directory(folder, force=True) as directory:
+            (directory / "summary.json").write_text("new")
+
+    case = SimpleNamespace(name="rope", weights="rope")
+    monkeypatch.setattr(demo, "_inputs", lambda: iter([lambda: case]))
+    monkeypatch.setattr(demo, "load_model", lambda _: None)
+    monkeypatch.setattr(demo, "_show", show)
+    (tmp_path / "rope").mkdir()
+    (tmp_path / "rope/summary.json").write_text("old")
+    for _ in range(2):  # the second time replaces what the first one wrote
+        demo.main(tmp_path)
+        kept = f"{tmp_path / 'rope'} holds what mereo may not replace; it is kept, and this result is written to"
+        assert f"{kept} {tmp_path / 'rope-2'}\n" in capsys.readouterr().out
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["rope", "rope-2"]
+    assert (tmp_path / "rope/summary.json").read_text() == "old" and not (tmp_path / "rope" / MARKER).exists()
+    assert (tmp_path / "rope-2/summary.json").read_text() == "new"

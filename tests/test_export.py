@@ -156,6 +156,26 @@ def test_the_runner_says_in_one_line_what_is_wrong(
     assert (tmp_path / "out.npz").is_fifo()
 
 
+def test_the_runner_replaces_a_file_when_forced_and_never_what_it_reads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("c.npy", "out.npz", "model.json"):
+        Path(name).write_text("precious")
+    arguments = ["mereo_onnx.py", "c.npy", "--points", "q.npy", "--model", ".", "-o"]
+    for output, text in {
+        "out.npz": "out.npz exists; it is not overwritten: choose another --output or pass --force",
+        "c.npy --force": "c.npy is read by this command; it is not replaced: choose another --output",
+        "./model.json --force": "model.json is read by this command",
+        "out.npz --force": "",  # got as far as the settings
+    }.items():
+        monkeypatch.setattr(sys, "argv", [*arguments, *output.split()])
+        assert main() == 2
+        err = capsys.readouterr().err
+        assert text in err and (text or "read by" not in err)
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"precious"}
+
+
 def test_the_runner_is_short_and_needs_numpy_and_onnxruntime_only() -> None:
     source = RUNNER.read_text(encoding="utf-8")
     assert len(source.splitlines()) < 150

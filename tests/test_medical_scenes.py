@@ -4,12 +4,14 @@ from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
+import igl
 import numpy as np
 import pytest
 from overlapping import check_overlap
 
 from mereo.deformation.maps import jacobian_determinant
 from mereo.geometry.manifold import mesh_of, solid_of
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.mesh_repair import close_holes, largest_piece
 from mereo.geometry.solids import Solids
 from mereo.scenes.builtin import _liver_parts, skull, tumor
@@ -95,6 +97,25 @@ def test_the_condyles_are_level_and_apart() -> None:
     assert -14.0 < across[1] < -12.0 and np.abs(across[[0, 2]]).max() < 0.06 * np.linalg.norm(across)
     mandible = Solids(skull.rest_mesh())
     assert mandible.segment_distance(3, np.stack([condyles.left, condyles.right])).max() < 0.6
+
+
+@pytest.mark.usefixtures("bones")
+def test_the_folds_of_the_cranium_mislead_few_labels() -> None:
+    """As ``Solids.label`` states it: outside points beside them count as inside, never the other way round."""
+    cranium = skull.rest_mesh().segments[1]
+    solids, rng = Solids(SegmentedMesh((cranium,))), np.random.default_rng(1)
+    corners = cranium.vertices[cranium.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    face = rng.choice(len(area), 100_000, p=area / area.sum())
+    offset = rng.choice([-1, 1], len(face)) * 10 ** rng.uniform(-5, -1, len(face))
+    points = np.einsum("ni,nij->nj", rng.dirichlet((1, 1, 1), len(face)), corners[face])
+    points += offset[:, None] * solids.face_normals(face)
+    points = points[solids.segment_distance(0, points) > 1e-7 * np.ptp(cranium.vertices, axis=0).max()]
+    winding = igl.fast_winding_number(cranium.vertices, cranium.faces, points)
+    inside = solids.label(points) == 1
+    assert winding.min() < -0.9 and inside[winding > 0.5].all()
+    misled = points[inside & (winding < 0.5)]
+    assert len(misled) < 1e-3 * (winding < 0.5).sum() and solids.segment_distance(0, misled).max() < 0.05
 
 
 @pytest.mark.usefixtures("bones")

@@ -6,6 +6,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
+from scene_files import HEAD, write_bar, write_mesh
+from shapes import box
 
 from mereo import __main__ as command_line
 from mereo.io.atomic_files import atomic_file
@@ -89,3 +91,62 @@ def test_every_command_refuses_a_pipe_first(
     assert command_line.main(command.format("pipe").split()) == 2
     assert "mereo: error: pipe is a device or pipe" in capsys.readouterr().err
     assert Path("pipe").is_fifo() and os.listdir() == ["pipe"]
+
+
+@pytest.mark.parametrize("command", ["scene preview rope", "scene export rope", "scene modes rope", "bench"])
+def test_an_existing_file_is_refused_before_the_work(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("notes.txt").write_text("precious")
+    assert command_line.main([*command.split(), "--output", "notes.txt"]) == 2
+    assert "notes.txt exists; it is not overwritten: choose another name or pass --force" in capsys.readouterr().err
+    assert os.listdir() == ["notes.txt"] and Path("notes.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    "command", ["scene export bar.yaml --output rest.ply", "scene modes bar.yaml --states 100 --output modes.png"]
+)
+def test_force_replaces_a_file(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So a command can run twice, and leaves nothing beside its output."""
+    monkeypatch.chdir(tmp_path)
+    write_bar(tmp_path)
+    output = Path(command.split()[-1])
+    output.write_text("old")
+    before = sorted(os.listdir())
+    for _ in range(2):
+        assert command_line.main([*command.split(), "--force"]) == 0
+        assert output.stat().st_size > 1000 and sorted(os.listdir()) == before
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "scene export bar.yaml --output right.ply",
+        "scene export bar.yaml --output deep/../right.ply",
+        "scene export bar.yaml --output linked.ply",
+        "scene preview scene.py --output scene.py",
+        "scene preview bar.yaml --output bar.yaml",
+        "scene preview bar.yaml --output left.ply",
+        "scene preview --all --output assets/bunny/bunny.off",
+        "bench --weights weights.safetensors --output weights.safetensors",
+    ],
+)
+def test_not_even_force_replaces_an_input(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By whatever name: the mesh of a scene file, the file itself, an asset of a built-in scene, weights."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MEREO_ASSETS", str(tmp_path / "assets"))
+    for name, low in (("left", 0), ("right", 20)):
+        write_mesh(box((low, 0, 0), (low + 20, 10, 10), name), Path(f"{name}.ply"))
+    Path("bar.yaml").write_text(HEAD.replace(".stl", ".ply"))
+    os.link("right.ply", "linked.ply")
+    for name in ("deep", "assets/bunny"):
+        Path(name).mkdir(parents=True)
+    for name in ("scene.py", "weights.safetensors", "assets/bunny/bunny.off"):
+        Path(name).write_text("precious")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert command_line.main([*command.split(), "--force"]) == 2
+    assert "is read by this command; it is not replaced, not even by --force: choose" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

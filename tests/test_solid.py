@@ -1,6 +1,7 @@
 """Inside, distance and label grids against closed forms, half spaces, symbolic shifts, and each other."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,6 +105,22 @@ def test_points_close_to_a_wall_are_told_apart_far_from_the_origin(shift: float)
     gap = rng.choice([-1e-5, 1e-5], size=3000)
     points[:, 0] = shift + 1 + gap
     assert np.array_equal(solids.inside(0, points), gap < 0)
+
+
+@pytest.mark.parametrize("shift", [0.0, 3000.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_labels_are_right_beyond_a_ten_millionth_of_the_longest_side(seed: int, shift: float) -> None:
+    """As ``Solids.label`` states it, for points that lie this close to faces, edges and corners."""
+    part, normal, offset = convex_polyhedron(seed)
+    side, rng = float(np.ptp(part.vertices, axis=0).max()), np.random.default_rng(seed)
+    face = rng.integers(len(part.faces), size=40_000)
+    corners = part.vertices[part.faces[face]]
+    points = np.einsum("ni,nij->nj", rng.dirichlet((0.3, 0.3, 0.3), len(face)), corners)
+    points += (rng.choice([-1, 1], len(face)) * side * 10 ** rng.uniform(-8, -3, len(face)))[:, None] * normal[face]
+    height = (points @ normal.T - offset).max(axis=1)
+    moved = replace(part, vertices=part.vertices + shift)
+    wrong = (Solids(one(moved)).label(points + shift) == 1) != (height < 0)
+    assert np.abs(height[wrong]).max() < 1e-7 * side
 
 
 def test_labels_of_neighbours_with_a_common_wall() -> None:

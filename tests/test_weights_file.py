@@ -54,7 +54,7 @@ WRONG: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
     "network.width is '64'; it must be a whole number": lambda h, t: h["network"].update(width="64"),
     "network.depth is 1000000000; it must be": lambda h, t: h["network"].update(depth=10**9),
     "the network settings differ in 'heads'": lambda h, t: h["network"].update(heads=3),
-    "header says [3, 1000000000]": lambda h, t: h["network"].update(width=10**9),
+    "header says [3, 8192]": lambda h, t: h["network"].update(width=8192),
     "a header of no possible network": lambda h, t: h["network"].update(width=10**15),
     "lacks the tensor decoder.head.bias": lambda h, t: t.pop("decoder.head.bias") is None or None,
     "has a tensor decoder.tail, which": lambda h, t: t.update({"decoder.tail": torch.zeros(1)}),
@@ -83,6 +83,12 @@ def test_what_is_wrong_with_weights_is_one_sentence_at_once(text: str, tmp_path:
     assert str(caught.value).startswith(str(path)) and text in str(caught.value)
     assert "\n" not in str(caught.value) and "again" in str(caught.value)
     assert trained_steps(path) is None or text in WRONG_STATES
+
+
+def test_weights_that_skip_to_a_layer_that_is_not_there_are_read_as_ever(tmp_path: Path) -> None:
+    """Earlier versions trained such networks, without the skip connection; new ones are refused."""
+    decoder = load_model(changed(tmp_path, lambda h, t: h["network"].update(skip_after=99))).network.config.decoder
+    assert decoder.skip_after == decoder.depth
 
 
 def test_the_command_line_says_so_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

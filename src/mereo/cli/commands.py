@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from mereo.fitting.config import FitChoice
-from mereo.io.bounds import Cells, Count, CountOrNone, NotNegative
+from mereo.io.bounds import Cells, Count, CountOrNone, NotNegative, Workers
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -99,7 +99,7 @@ class Generate:
     examples: Count
     output: Path
     seed: CountOrNone = 0
-    workers: CountOrNone = 0
+    workers: Workers = 0
     shard: str = "0/1"
     resume: bool = False
     test: bool = False

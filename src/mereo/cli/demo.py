@@ -95,10 +95,27 @@ def main(output: str | Path = Path("out/demo")) -> None:
         except AssetUnavailable as error:
             console.print(f"The real scan {REAL_SCAN} is left out: {error}\n", highlight=False, soft_wrap=True)
             continue
-        check_new_directory(Path(output) / case.name, force=True)
-        _show(case, load_model(case.weights), Path(output) / case.name, console)
+        folder = _folder(Path(output) / case.name)
+        _show(case, load_model(case.weights), folder, console)
     console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
     console.print(OWN_OBJECT, markup=True, highlight=False, soft_wrap=True)
+
+
+def _folder(wanted: Path) -> Path:
+    """Folder for a case: the first of NAME, NAME-2, NAME-3, ... that is free or holds only what mereo wrote.
+
+    A folder of a version without lists of files, or with somebody's notes, is kept and stops nobody: the next name is
+    taken, and replaced from then on.
+    """
+    for folder in (wanted, *(wanted.with_name(f"{wanted.name}-{number}") for number in range(2, 1000))):
+        try:
+            check_new_directory(folder, force=True)
+        except FileExistsError:
+            continue
+        if folder != wanted:
+            print(f"{wanted} holds what mereo may not replace; it is kept, and this result is written to {folder}")
+        return folder
+    raise FileExistsError(f"{wanted}, and every name up to {folder}, is taken: choose another --output")
 
 
 def _inputs() -> Iterator[Callable[[], Case]]:

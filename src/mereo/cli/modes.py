@@ -5,10 +5,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from mereo.io.atomic_files import check_file_place
+from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import LEAST_STATES, scene_model
-from mereo.scenes.registry import load_scene
+from mereo.scenes.registry import files_of, load_scene
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.visualization.mode_pictures import preview_modes
 
@@ -19,17 +19,19 @@ ENOUGH = 0.1
 """Distance in scene units that modes may leave of a state: the noise of the paper's sensor."""
 
 
-def show_modes(scene: str, output: Path | None, states: int) -> None:
+def show_modes(scene: str, output: Path | None, states: int, force: bool = False) -> None:
     """Print how many modes the states of an object need, and draw the largest; ``mereo scene modes``.
 
     Args:
         scene: name or file of a scene, or a file of weights that carry a statistical model.
         output: the picture; None draws none.
         states: random states from which a scene's model is built.
+        force: replace an existing picture, unless it is read.
 
-    Raises ``ValueError`` for too few states, for weights without a model and for another suffix than .png.
+    Raises ``FileExistsError`` as ``atomic_file`` does; ``ValueError`` for too few states, for weights
+    without a model and for another suffix than .png.
     """
-    check_file_place(output)
+    check_file_place(output, force=force)
     if output is not None and output.suffix.lower() != ".png":
         raise ValueError(f"{output} has the suffix {output.suffix!r}; the picture is a PNG file: rename it")
     name, model = _model_of(scene, states)
@@ -37,7 +39,8 @@ def show_modes(scene: str, output: Path | None, states: int) -> None:
     console.print(_table(name, model))
     console.print(_needed(model), highlight=False, soft_wrap=True)
     if output is not None:
-        preview_modes(model, output, name)
+        with atomic_file(output, force=force, inputs=files_of(scene)) as partial:
+            preview_modes(model, partial, name)
         console.print(f"wrote {output}", highlight=False, soft_wrap=True)
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from mereo.io.bounds import Count, CountOrNone
+from mereo.io.bounds import CountOrNone, States
 
 
 @dataclass(frozen=True)
@@ -77,27 +77,31 @@ class ScenePreview:
         scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
         all: draw every built-in scene: at rest, two random states and a depth image.
         seed: another seed shows other states.
+        force: replace an existing file, unless the scene is read from it.
     """
 
     output: Path
     scene: Positional[str] = ""
     all: bool = False
     seed: CountOrNone = 0
+    force: bool = False
 
     def run(self) -> None:
         """Write the picture of random states."""
-        from mereo.io.atomic_files import check_file_place
-        from mereo.scenes.registry import load_scene
+        from mereo.io.atomic_files import atomic_file, check_file_place
+        from mereo.scenes.registry import files_of, load_scene
         from mereo.visualization.previews import preview_all, preview_scene
 
-        check_file_place(self.output)
+        check_file_place(self.output, force=self.force)
         if self.all == bool(self.scene):
             given = f"both {self.scene!r} and --all are" if self.all else "neither a scene nor --all is"
             raise ValueError(f"{given} given; one of them is needed: name a scene, or give --all")
-        if self.all:
-            preview_all(self.output, self.seed)
-        else:
-            preview_scene(load_scene(self.scene), self.output, self.seed)
+        read = files_of(self.scene or "rope")  # of all built-in scenes these are the same: the assets
+        with atomic_file(self.output, force=self.force, inputs=read) as partial:
+            if self.all:
+                preview_all(partial, self.seed)
+            else:
+                preview_scene(load_scene(self.scene), partial, self.seed)
         print(f"wrote {self.output}")
 
 
@@ -110,17 +114,19 @@ class SceneModes:
             (.safetensors).
         output: the picture, a PNG file; without it only the numbers are printed.
         states: random states from which the model of a scene is built.
+        force: replace an existing file, unless the scene or the weights are read from it.
     """
 
     scene: Positional[str]
     output: Path | None = None
-    states: Count = 1500
+    states: States = 1500
+    force: bool = False
 
     def run(self) -> None:
         """Print how many modes are needed, and write the picture."""
         from mereo.cli.modes import show_modes
 
-        show_modes(self.scene, self.output, self.states)
+        show_modes(self.scene, self.output, self.states, self.force)
 
 
 @dataclass(frozen=True)
@@ -130,27 +136,30 @@ class SceneExport:
     Attributes:
         scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
         output: a PLY file (one mesh, coloured), or a GLB file (a node for each segment).
+        force: replace an existing file, unless the scene is read from it.
     """
 
     scene: Positional[str]
     output: Path
+    force: bool = False
 
     def run(self) -> None:
         """Write the mesh file of the segments at rest."""
         import numpy as np
 
-        from mereo.io.atomic_files import check_file_place
+        from mereo.io.atomic_files import atomic_file, check_file_place
         from mereo.io.writers.glb import write_segments_glb
         from mereo.io.writers.ply import write_segments_ply
-        from mereo.scenes.registry import load_scene
+        from mereo.scenes.registry import files_of, load_scene
 
-        check_file_place(self.output)
+        check_file_place(self.output, force=self.force)
         suffix = self.output.suffix.lower()
         if suffix not in (".ply", ".glb"):
             raise ValueError(f"{self.output} has the suffix {suffix!r}; it must be .ply or .glb: rename it")
         rest = load_scene(self.scene).rest
-        if suffix == ".ply":
-            write_segments_ply(self.output, rest)
-        else:
-            write_segments_glb(self.output, rest, np.eye(3))
+        with atomic_file(self.output, force=self.force, inputs=files_of(self.scene)) as partial:
+            if suffix == ".ply":
+                write_segments_ply(partial, rest)
+            else:
+                write_segments_glb(partial, rest, np.eye(3))
         print(f"wrote {self.output}")

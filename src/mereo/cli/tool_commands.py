@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
-from mereo.io.bounds import Cells, Count, CountOrNone, Port, Positive, PositiveOrUnknown
+from mereo.io.bounds import Cells, Count, Port, Positive, PositiveOrUnknown, Workers
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig, Precision
 from mereo.reconstruction.config import IsolationConfig
@@ -181,6 +181,7 @@ class BenchCommand:
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
         output: a JSON file for the figures.
+        force: replace an existing file, unless the weights are read from it.
     """
 
     weights: str | None = None
@@ -190,6 +191,7 @@ class BenchCommand:
     repeats: Count = 7
     rival: bool = False
     output: Path | None = None
+    force: bool = False
 
     def run(self) -> None:
         """Print the times of all stages of an answer."""
@@ -197,7 +199,7 @@ class BenchCommand:
         from mereo.models.device import find_device
 
         device = find_device(self.device)
-        benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.output)
+        benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.output, self.force)
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,7 @@ class Experiment:
     name: Positional[ExperimentName]
     scale: ScaleName = "smoke"
     output: Path = Path("out/experiments")
-    workers: CountOrNone = 0
+    workers: Workers = 0
 
     def run(self) -> None:
         """Run the experiment and print its table."""

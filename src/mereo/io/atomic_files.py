@@ -6,7 +6,7 @@ sees half a file and an error, Ctrl-C or a full disk leaves nothing behind.
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,23 +17,22 @@ from mereo.io.scratch_folders import check_place, scratch_folder
 
 
 @contextmanager
-def atomic_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
+def atomic_file(path: str | Path, *, force: bool = True, inputs: Iterable[str | Path] = ()) -> Iterator[Path]:
     """Yield a path of the same name in a scratch folder; rename it to ``path`` when the block succeeds.
 
     Args:
         path: the destination; missing parent directories are made (and removed again if the block fails).
         force: replace an existing file.
+        inputs: files and folders that are read, which are never replaced.
 
     Raises:
         ValueError: ``path`` is a link, a device or no usable name.
         FileExistsError: ``path`` exists and ``force`` is false, also where it came while the block ran; or it is a
-            directory.
+            directory, or one of the inputs.
         OSError: the disk is full, or the place cannot be written to.
     """
     path = Path(path)
-    check_file_place(path)
-    if path.exists() and not force:
-        raise FileExistsError(f"{path} {EXISTS}")
+    check_file_place(path, force=force, inputs=inputs)
     with scratch_folder(path) as scratch:
         partial = scratch / path.name
         yield partial
@@ -46,13 +45,27 @@ def atomic_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
 EXISTS = "exists; it is not overwritten: choose another name or pass --force"
 
 
-def check_file_place(path: str | Path | None) -> None:
+def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Iterable[str | Path] = ()) -> None:
     """Raise as ``atomic_file`` does for a place where no file can be put: before the work, not after. None is none."""
     if path is None:
         return
-    check_place(Path(path))
-    if Path(path).is_dir():
+    path = Path(path)
+    check_place(path)
+    if path.is_dir():
         raise FileExistsError(f"{path} is a directory; a file is written there: choose another name")
+    if path.exists() and not force:
+        raise FileExistsError(f"{path} {EXISTS}")
+    if path.exists() and any(_holds(Path(place), path) for place in inputs):
+        raise FileExistsError(
+            f"{path} is read by this command; it is not replaced, not even by --force: choose another name"
+        )
+
+
+def _holds(place: Path, path: Path) -> bool:
+    """Whether ``path``, which exists, is the file ``place`` by whatever name, or lies in the folder ``place``."""
+    if place.is_dir():
+        return path.resolve().is_relative_to(place.resolve())
+    return place.exists() and path.samefile(place)
 
 
 def _place_new(partial: Path, path: Path) -> None:

@@ -15,13 +15,16 @@ from mereo.io.bounds import (
     BelowOne,
     Count,
     CountOrNone,
-    Counts,
     Depth,
     Exponent,
+    Neighbors,
+    NeighborsOrNone,
     NotNegative,
     Points,
     Positive,
     Share,
+    Width,
+    Widths,
     check_bounds,
     check_values,
 )
@@ -99,14 +102,14 @@ class PointNet2Config:
         mlp_global: layer widths before the global max pool; the last one is the latent size of every encoder.
     """
 
-    neighbors: Count = 64
+    neighbors: Neighbors = 64
     ratio1: Share = 0.5
     radius1: Positive = 0.2
-    mlp1: Counts = (64, 64, 128)
+    mlp1: Widths = (64, 64, 128)
     ratio2: Share = 0.25
     radius2: Positive = 0.4
-    mlp2: Counts = (128, 128, 256)
-    mlp_global: Counts = (256, 512, 1024)
+    mlp2: Widths = (128, 128, 256)
+    mlp_global: Widths = (256, 512, 1024)
 
     def __post_init__(self) -> None:
         check_bounds(self, "network.")
@@ -121,8 +124,8 @@ class PointTransformerConfig:
         transformer_neighbors: nearest points that a point of it attends to; half as many in block one.
     """
 
-    transformer_widths: Counts = (32, 64, 128, 256, 512)
-    transformer_neighbors: Count = 16
+    transformer_widths: Widths = (32, 64, 128, 256, 512)
+    transformer_neighbors: Neighbors = 16
 
     def __post_init__(self) -> None:
         check_bounds(self, "network.")
@@ -153,14 +156,14 @@ class DecoderConfig:
     Attributes:
         width: channels of each of the decoder's layers.
         depth: number of these layers.
-        skip_after: the layer after which the query and the latent vector return.
+        skip_after: the layer after which the query and the latent vector return; after the last one, never.
         dropout: share of each of these layers' outputs set to zero in training.
         encode_positions: frequency encoding of the query position; off means the three coordinates themselves.
         lowest_exponent: least e of the frequencies 2^e * pi.
         highest_exponent: greatest e of these frequencies.
     """
 
-    width: Count = 512
+    width: Width = 512
     depth: Depth = 7
     skip_after: Count = 4
     dropout: BelowOne = 0.0
@@ -174,6 +177,11 @@ class DecoderConfig:
             raise ValueError(
                 f"network.lowest_exponent is {self.lowest_exponent} and network.highest_exponent is "
                 f"{self.highest_exponent}; the lowest must not be above the highest: give for example -4 and 5"
+            )
+        if self.skip_after > self.depth:
+            raise ValueError(
+                f"network.skip_after is {self.skip_after}, of {self.depth} layers; the query and the latent vector can "
+                f"return after one of them: give for example {max(1, self.depth // 2)}"
             )
 
 
@@ -189,9 +197,9 @@ class AdditionsConfig:
         rest_template: look queries up in the rest pose's model, at predicted rest coordinates.
     """
 
-    local_neighbors: CountOrNone = 0
-    local_width: Count = 128
-    sight_neighbors: CountOrNone = 0
+    local_neighbors: NeighborsOrNone = 0
+    local_width: Width = 128
+    sight_neighbors: NeighborsOrNone = 0
     align_points: CountOrNone = 0
     rest_template: bool = False
 

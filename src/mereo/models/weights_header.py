@@ -90,8 +90,11 @@ def _checked(path: Path, model: type[Checked], content: Any, *within: str) -> Ch
 
 def read_config(path: Path, header: Header) -> NetworkConfig:
     """Settings of the network; ``ValueError`` names the file and the setting that is unknown or out of its bounds."""
+    layers, after = header.network.get("depth"), header.network.get("skip_after")
+    # earlier versions took a layer that there is not, and it meant what the last one means
+    beyond = isinstance(layers, int) and isinstance(after, int) and after > layers
     try:
-        return NetworkConfig.from_dict(header.network)
+        return NetworkConfig.from_dict(header.network | ({"skip_after": layers} if beyond else {}))
     except ValueError as error:
         raise ValueError(f"{path} has a header of no possible network ({error}); {CURE}") from None
 

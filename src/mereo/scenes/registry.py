@@ -24,6 +24,22 @@ def scene_named_in(file: Path, name: str) -> Scene:
     return load_scene(name if name in SCENES else file.parent / name)
 
 
+def files_of(name: str | Path) -> list[Path]:
+    """Files and folders that a scene is read from, so that no output takes their place.
+
+    Of a Python scene that is its file alone, because what it reads is not known; of a built-in one, all assets here.
+    Raises as ``load_scene`` does for a faulty YAML file.
+    """
+    if is_yaml(name):
+        listed: list[Path] = import_module("mereo.scenes.files.build").files_of(Path(name))
+        return listed
+    if name not in SCENES:
+        return [Path(name)]
+    from mereo.scenes.assets import ASSETS, location
+
+    return [path for path in map(location, ASSETS) if path is not None]
+
+
 def load_scene(name: str | Path) -> Scene:
     """Scene by its built-in name, or from a file, YAML or Python.
 

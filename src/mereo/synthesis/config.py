@@ -8,7 +8,17 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes
 
-from mereo.io.bounds import Count, ImageSize, NotNegative, Points, Positive, Probability, check_bounds
+from mereo.io.bounds import (
+    ImageSize,
+    Multiple,
+    NotNegative,
+    Points,
+    Positive,
+    Probability,
+    Queries,
+    Times,
+    check_bounds,
+)
 
 SensorModel = Literal["structured-light", "time-of-flight"]
 
@@ -135,10 +145,10 @@ class SamplingConfig:
     """
 
     sampler: Sampler = "sort-sample"
-    per_segment: Count = 256
-    oversample: Count = 1
+    per_segment: Queries = 256
+    oversample: Times = 1
     box_margin: Positive = 0.5
-    uniform_fraction: NotNegative = 0.15
+    uniform_fraction: Multiple = 0.15
 
     def __post_init__(self) -> None:
         check_bounds(self)

@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, get_args
 
 from mereo.io.bounds import (
+    Batch,
     BelowOne,
-    Count,
     CountOrNone,
     NotNegative,
     Positive,
@@ -84,7 +84,7 @@ class TrainConfig:
     init: str = ""
     loss: Loss = "ce+l1"
     l1_weight: NotNegative = 100.0
-    batch: Count = 40
+    batch: Batch = 40
     queries: CountOrNone = 0
     epochs: Positive = 300.0
     learning_rate: Positive = 5e-4

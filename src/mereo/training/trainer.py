@@ -155,13 +155,20 @@ class Trainer:
         self.optimizer.step()
         self.step += 1
         update_average(self.average, self.network, self.step, self.config.ema_decay)
-        if self.log is not None:
-            values = {"norm": norm, "loss": loss.detach(), **terms}
-            self.unread.append((self.step, self.config.learning_rate * part, values))
-            if self.device.type == "cpu":  # where reading waits for nothing
-                self._read_losses()
-            if self.step % REPORT_EVERY == 0 or self.step == self.total:
-                self._report_progress()
+        values = {"norm": norm, **self._of_all({"loss": loss.detach(), **terms})}
+        self.unread.append((self.step, self.config.learning_rate * part, values))
+        if self.device.type == "cpu":  # where reading waits for nothing
+            self._read_losses()
+        if self.step % REPORT_EVERY == 0 or self.step == self.total:
+            self._report_progress()
+
+    def _of_all(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Means over all processes, which so stop at the same step, as DDP has made them of the gradients."""
+        if self.process.world == 1:
+            return terms
+        means = torch.stack([value.float() for value in terms.values()]) / self.process.world
+        dist.all_reduce(means)
+        return dict(zip(terms, means, strict=True))
 
     def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of a batch, and its terms by name for the record."""
@@ -177,8 +184,9 @@ class Trainer:
         """Log the steps since the last call, all with one copy from the device, which would wait at every step.
 
         Whoever saves calls it first, so nothing is saved of a step whose loss or gradient is not finite, or after it.
+        All processes call it at the same steps, and raise the same.
         """
-        if self.log is None or not self.unread:
+        if not self.unread:
             return
         values = torch.stack([torch.stack(list(terms.values())) for _, _, terms in self.unread]).tolist()
         for (step, rate, terms), row in zip(self.unread, values, strict=True):
@@ -186,7 +194,8 @@ class Trainer:
             norm = losses.pop("norm")
             if not (math.isfinite(norm) and math.isfinite(losses["loss"])):
                 raise ValueError(self._divergence(step, losses["loss"], norm))
-            self.log.add_step(step, rate, losses)
+            if self.log is not None:
+                self.log.add_step(step, rate, losses)
         self.unread.clear()
 
     def _divergence(self, step: int, loss: float, norm: float) -> str:
@@ -206,7 +215,8 @@ class Trainer:
 
     def _report_progress(self) -> None:
         self._read_losses()
-        assert self.log is not None
+        if self.log is None:
+            return
         loss = self.log.rows[-1]["loss"]
         rate = (self.step - self.first_step) / (time.monotonic() - self.started)
         left_s = (self.total - self.step) / max(rate, 1e-9)
@@ -220,8 +230,8 @@ class Trainer:
         due = self.step % math.ceil(self.total / VALIDATIONS) == 0 or self.step == self.total
         if not (due and self.config.holdout):
             return
+        self._read_losses()
         if self.log is not None:
-            self._read_losses()
             self._update_codes()
             scores = validate(self.average, self.data, self.config)
             self.log.add_validation(self.step, scores.iou, scores.miou)
@@ -236,8 +246,8 @@ class Trainer:
 
         The checkpoint is the last, so whatever stops this leaves one from which the others are written again.
         """
+        self._read_losses()
         if self.log is not None:
-            self._read_losses()
             self._update_codes()
             self.log.write()
             offsets = choose_offsets(self.average, self.data, self.config) if finished else None

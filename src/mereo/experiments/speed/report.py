@@ -41,6 +41,7 @@ def benchmark(
     repeats: int,
     rival: bool,
     output: Path | None,
+    force: bool = False,
 ) -> list[Stage]:
     """Time all stages, print the table, and write it as JSON where ``output`` says so.
 
@@ -52,10 +53,12 @@ def benchmark(
         repeats: repetitions of each stage.
         rival: whether to time the straightforward implementation too.
         output: a JSON file, or None.
+        force: replace an existing file, unless it is the weights.
 
-    Raises ``ValueError`` for weights of an object without a shipped view.
+    Raises ``FileExistsError`` as ``atomic_file`` does, and ``ValueError`` for weights of an object without a
+    shipped view.
     """
-    check_file_place(output)
+    check_file_place(output, force=force, inputs=[] if weights is None else [weights])
     model, view = _subject(weights, preset)
     model.network.to(device)
     fast = replace(model, precision=precision)
@@ -66,7 +69,7 @@ def benchmark(
     print(table(stages, facts, cost))
     if output is not None:
         rows = [{**asdict(stage), "ratio": stage.ratio} for stage in stages]
-        write_json(output, {**facts, "cost": None if cost is None else asdict(cost), "stages": rows})
+        write_json(output, {**facts, "cost": None if cost is None else asdict(cost), "stages": rows}, force=force)
         print(f"wrote {output}")
     return stages
 

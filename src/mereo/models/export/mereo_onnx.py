@@ -113,12 +113,19 @@ def main() -> int:
     parser.add_argument(
         "--model", default=str(Path(__file__).parent), help="folder of the graphs; default: of this file"
     )
+    parser.add_argument("--force", action="store_true", help="replace an existing output, unless it is read")
     options = parser.parse_args()
     output = Path(options.output)
     partial = Path(f"{options.output}.{os.getpid()}.partial.npz")
     try:
         if output.is_symlink() or (output.exists() and not output.is_file()):
             raise ValueError(f"{output} is no ordinary file, and would be replaced; choose another --output")
+        if output.exists() and not options.force:
+            raise ValueError(f"{output} exists; it is not overwritten: choose another --output or pass --force")
+        graphs = [Path(options.model, name) for name in ("encoder.onnx", "query.onnx", "model.json")]
+        read = [Path(options.cloud), Path(options.points), *graphs]
+        if output.exists() and any(path.exists() and output.samefile(path) for path in read):
+            raise ValueError(f"{output} is read by this command; it is not replaced: choose another --output")
         runner = Runner(options.model)
         answers = dict(
             zip(("labels", "distances", "directions"), runner(*map(np.load, (options.cloud, options.points))))

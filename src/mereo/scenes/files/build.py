@@ -51,6 +51,14 @@ def read(document: Document) -> SceneFile:
     return file
 
 
+def files_of(path: Path) -> list[Path]:
+    """The scene file, the meshes or volume that it names, and its recorded states, whether they exist or not."""
+    file = read(Document(path))
+    parts = [part.file for part in file.segments or ()]
+    named = [name for name in (*parts, file.model, file.labels, file.states) if name is not None]
+    return [path, *(path.parent / name for name in named)]
+
+
 def with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
     """Mesh with segments that are no solids marked so, and one warning for each of them."""
     cure = f"repair it with `mereo scene check {document.path} --repair`"
