@@ -145,7 +145,7 @@ def save_cloud(path: Path) -> None:
 
     points = organized().reshape(-1, 3)
     points[points[:, 2] == 0] = np.nan
-    points = points[~(np.abs(points[:, 0] + 0.21) > 0.14)][::-1]  # about the box, as the writers are slow; NaN stays
+    points = points[~(np.abs(points[:, 0] + 0.21) > 0.14)]  # about the box, as the writers are slow; NaN stays
     points = points[~np.isnan(points[:, 2]) | (np.arange(len(points)) % 100 == 0)]
     path.write_bytes(save_ply(points, "binary_little_endian") if path.suffix == ".ply" else save_pcd(points, "binary"))
 
