@@ -157,6 +157,10 @@ FORMATS: dict[str, tuple[Callable[[Path], None], InputConfig]] = {
     "image.npy": (lambda path: np.save(path, millimetres()), InputConfig(KINECT)),
     "image.exr": (save_exr, InputConfig(KINECT)),
     "organized.npy": (lambda path: np.save(path, organized()), InputConfig(drop_invalid=True)),
+    "integers.npy": (  # as the Azure Kinect's kit gives them
+        lambda path: np.save(path, np.rint(1000 * organized()).astype(np.int16)),
+        InputConfig(drop_invalid=True, unit_m=0.001),
+    ),
     "cloud.npz": (
         lambda path: np.savez(path, points=1000 * organized().reshape(-1, 3)),
         InputConfig(drop_invalid=True, unit_m=0.001),
