@@ -1,5 +1,6 @@
 """docs/cameras.md: its table follows our formulas, and its code for a mask makes one that is read."""
 
+import json
 import re
 from pathlib import Path
 
@@ -8,7 +9,9 @@ import pytest
 from PIL import Image
 from test_documentation import ROOT, blocks
 
+from mereo.io.config import InputConfig
 from mereo.io.readers import read_mask
+from mereo.io.sensor_frame import read_frame
 from mereo.synthesis.config import SensorModel
 from mereo.synthesis.depth_sensor import KINECT_DISPARITY_M, axial_std_m, quantize
 
@@ -32,6 +35,12 @@ def test_the_table_of_distances_follows_the_formulas() -> None:
     assert 1e3 * np.median(np.diff(depths)) == pytest.approx(2.85, abs=0.02), "the step as it is simulated"
 
 
+def run_block(word: str) -> None:
+    """Run the page's only Python block that has this word, in the current folder."""
+    (code,) = (code for code in blocks(PAGE, "python") if word in code)
+    exec(compile(code, str(PAGE), "exec"), {})
+
+
 def models() -> tuple[SensorModel, SensorModel]:
     return "structured-light", "time-of-flight"
 
@@ -50,8 +59,31 @@ def test_the_colour_threshold_finds_the_orange_ball(tmp_path: Path, monkeypatch:
     picture[10:30, 130:150] = (250, 110, 20)
     picture[100, 5] = (250, 110, 20)
     Image.fromarray(picture).save(tmp_path / "color.png")
-    (code,) = (code for code in blocks(PAGE, "python") if "ndimage" in code)
     monkeypatch.chdir(tmp_path)
-    exec(compile(code, "cameras.md", "exec"), {})
+    run_block("ndimage")
     mask = read_mask(tmp_path / "mask.png")
     assert not (mask & ~ball).any() and mask.sum() > 0.9 * ball.sum()
+
+
+def test_averaged_pixels_lie_on_the_same_plane_and_mix_no_surfaces(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A slanted plane keeps its place, a step of its depth stays a step, a hole of less than four pixels is filled."""
+    camera = {"fx": 60.0, "fy": 50.0, "cx": 31.5, "cy": 20.0}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    row, column = np.mgrid[:41, :64]
+    x, y = (column - camera["cx"]) / camera["fx"], (row - camera["cy"]) / camera["fy"]
+    plane = 600 / (1 - 0.2 * x + 0.1 * y)  # z = 600 mm + 0.2 X - 0.1 Y
+    depth = np.where(column < 33, plane, 1500)
+    depth[10, 11], depth[20:22, 20:22] = 0, 0
+    Image.fromarray(np.rint(depth).astype(np.uint16)).save(tmp_path / "depth.png")
+    monkeypatch.chdir(tmp_path)
+    run_block("half.tif")
+    points = read_frame(tmp_path / "half.tif", InputConfig(tmp_path / "half.json")).cloud.points
+    assert len(points) == 20 * 32 - 1
+    near = points[points[:, 2] < 1.2]
+    off = np.abs(near @ [-0.2, 0.1, 1.0] - 0.6)
+    assert np.quantile(off, 0.9) < 0.0005, "rounding to millimetres, halved"
+    assert off.max() < 0.003, "where a part of the four was measured"
+    np.testing.assert_allclose(points[points[:, 2] >= 1.2, 2], 1.5, atol=1e-6)
+    assert len(near) == 20 * 17 - 1, "the column on the edge has as much of both sides; the nearer one counts"
