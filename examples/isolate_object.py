@@ -5,7 +5,8 @@
 
 Without an input it takes a real scan of the Stanford bunny, puts it on a table before a wall with points floating
 about, and scores the reconstruction against the truth: the scan alone, crowded, and isolated again. With one it reads
-your file with the options of `mereo reconstruct` and writes pictures of what was there and of what is kept.
+your file with the options of `mereo reconstruct` and writes pictures of what was there and of what is kept, without the
+strays that would be dropped there where no registration decides.
 """
 
 from dataclasses import replace
@@ -25,6 +26,7 @@ from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import isolate
 from mereo.reconstruction.observation import find_object
+from mereo.reconstruction.strays import readings
 from mereo.visualization.contact_sheets import cloud_picture, contact_sheet, save_png
 from mereo.visualization.renderer import Viewpoint
 
@@ -90,10 +92,14 @@ def main(
     if input is None:
         crowded_bunny(output)
         return
-    found = find_object(read_frame(input, reading), isolation)
-    print(found)
-    whole = read_frame(input, replace(reading, mask=None))
-    draw(output, {"everything": whole.cloud, "the object": found.cloud})
+    try:
+        found = find_object(read_frame(input, reading), isolation)
+        whole = read_frame(input, replace(reading, mask=None))
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"error: {error}") from None
+    likely = readings(found.cloud, found.frame.axes, isolation.keep_all)[0]
+    print(found.read_as(likely))
+    draw(output, {"everything": whole.cloud, "the object": likely.cloud})
 
 
 if __name__ == "__main__":
