@@ -107,3 +107,18 @@ def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states:
     narrowed = [draws_narrowing(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]
     assert narrowed[0] > 1.0
     assert narrowed[1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_second_pass_follows_where_the_first_has_failed(
+    model: StatisticalModel, states: DrawnStates, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Modes that are wrong and a single step leave the cloud unexplained; a pass from there comes nearer."""
+    points, material = shown(model, 0.5)
+    fitted = ModesFit.of(points, said(model, material), model, 1.0)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.found)
+    wrong = replace(fitted.posed, z=np.full(model.count, 2.0))
+    poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, jumps=0, hopeless=0.0)
+    once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
+    assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
+    monkeypatch.setattr("mereo.fitting.draws_fit.second_pass", None)  # not called where the first explains the cloud
+    assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None

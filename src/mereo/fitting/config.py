@@ -98,6 +98,8 @@ class DrawsConfig:
         gain: relative gain of a step below which nothing more is tried.
         explained: the cloud's misfit above which the network's answer is a start too, and draws may jump.
         hopeless: the same, above which the next starts are tried, in at most ``batches`` of them.
+        passes: while it is above ``hopeless``, how often the modes are refined from where the draws ended, and the
+            draws fitted to that shape again.
         jumps: how often one draw may jump to one of ``places`` places; 0 also leaves out the network's answer.
         few: scenes with more draws than this get ``MANY_DRAWS`` instead: every set of differences plays each draw once.
         near: how many states count as near where draws are guessed from the modes.
