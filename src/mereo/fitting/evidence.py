@@ -22,7 +22,7 @@ MOST_POINTS = 6000
 PARTNERS = 500
 """Observed points, evenly spread, that are compared with the model's surface."""
 
-MORE_PARTNERS = 1500
+MORE_PARTNERS = 4000
 """The same of a noisy frame, whose noise averages out over more of them."""
 
 SILHOUETTE_PITCHES = 1.2
