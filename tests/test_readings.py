@@ -9,7 +9,7 @@ from mereo.evaluation.sample_views import load_view
 from mereo.fitting.answer import answer
 from mereo.fitting.config import FitConfig
 from mereo.fitting.evidence import Evidence
-from mereo.fitting.noise import CLEAN, LARGEST, constants_for, is_noise, noise_of
+from mereo.fitting.noise import ACCEPTED, CLEAN, LARGEST, constants_for, is_noise, noise_of
 from mereo.fitting.readings import FittedFrame, fitted_frame
 from mereo.fitting.register import Registrar
 from mereo.geometry.camera import PointCloud
@@ -137,8 +137,10 @@ def test_constants_follow_the_noise_and_end() -> None:
     config = FitConfig()
     assert constants_for(CLEAN, config) is config
     found = constants_for(0.2, config)
-    assert (found.cloud_sigma, found.tolerance) == pytest.approx((0.6, 1.35))
-    assert replace(found, cloud_sigma=config.cloud_sigma, tolerance=config.tolerance) == config
+    assert (found.cloud_sigma, found.tolerance, found.accepted) == pytest.approx((0.6, 1.35, ACCEPTED))
+    clean = replace(found, cloud_sigma=config.cloud_sigma, tolerance=config.tolerance, accepted=config.accepted)
+    assert clean == config
+    assert constants_for(0.2, replace(config, accepted=0.5)).accepted == 0.5
     assert constants_for(9.0, config).cloud_sigma == LARGEST
 
 

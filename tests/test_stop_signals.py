@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +17,17 @@ import mereo.__main__ as command_line
 from mereo.cli.stop_signals import STOPPING, Stopped, stop_signals
 from mereo.cli.stream import stream_reconstructions
 from mereo.io.atomic_files import atomic_file
+
+
+@pytest.fixture(autouse=True)
+def hang_ups_count() -> Iterator[None]:
+    """As in a terminal, also where the tests themselves were started to outlive one (nohup)."""
+    if not hasattr(signal, "SIGHUP"):
+        yield
+        return
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 def run(work: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> int:
