@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file, save_file
+from toy_data import make_small_datasets
 from toy_scene import toy_scene
 
-from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
 from mereo.training.dataset import Dataset
@@ -22,8 +22,7 @@ FILES = ("shard-00001.safetensors", "template.safetensors", "statistical_model.s
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards, "SHARD_SIZE", 2)
-    monkeypatch.setattr(shards, "states_for", lambda _: 12)
+    make_small_datasets(monkeypatch)
 
 
 def make(output: Path, seed: int = 3, resume: bool = False) -> Path:
@@ -35,8 +34,7 @@ def make(output: Path, seed: int = 3, resume: bool = False) -> Path:
 def originals(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two datasets of the same scene with other seeds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards, "SHARD_SIZE", 2)
-        patch.setattr(shards, "states_for", lambda _: 12)
+        make_small_datasets(patch)
         folder = tmp_path_factory.mktemp("originals")
         return make(folder / "a"), make(folder / "b", seed=4)
 

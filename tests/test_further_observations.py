@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
+from toy_data import make_small_datasets
 from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
 from mereo.cli import commands
 from mereo.geometry.surface_patches import without_strays
 from mereo.scenes.seeds import example_rng
-from mereo.synthesis import observations, shards
+from mereo.synthesis import observations
 from mereo.synthesis.config import OBSERVATIONS, SENSORS, GenerateConfig, SamplingConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import Example, _sample_view, synthesize
@@ -27,16 +28,14 @@ SEED, EXAMPLES = 3, 5
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards, "SHARD_SIZE", 2)
-    monkeypatch.setattr(shards, "states_for", lambda _: 12)
+    make_small_datasets(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The same examples without and with further observations."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards, "SHARD_SIZE", 2)
-        patch.setattr(shards, "states_for", lambda _: 12)
+        make_small_datasets(patch)
         folder = tmp_path_factory.mktemp("observed")
         for name, settings in (("plain", SMALL), ("seen", SEEN)):
             generate(TOY, folder / name, settings, examples=EXAMPLES, seed=SEED)

@@ -9,13 +9,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from safetensors.numpy import save_file
 
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
+from mereo.synthesis import shards
 from mereo.synthesis.config import TEMPLATE
 
 NAMES = ("left", "right")
 SHARD = 32
+
+
+def make_small_datasets(patch: pytest.MonkeyPatch) -> None:
+    """Let generated shards have two examples, and statistical models twelve states."""
+    patch.setattr(shards, "SHARD_SIZE", 2)
+    patch.setattr(shards, "states_for", lambda _: 12)
 
 
 def write_toy_dataset(

@@ -101,7 +101,7 @@ def find_candidates(
         each["full"] = _registered(frame.modes.with_draws(registrar.at_hand), grid, encoding)
         default = "full"
     found = each[default].registration
-    if registrar.choice == "auto" and found is not None and not found.accepted:
+    if found is not None and not registrar.takes(found):
         default = "network"
     return Candidates(code, each, default)
 

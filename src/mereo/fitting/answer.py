@@ -84,12 +84,14 @@ def answer_fitted(
     label_points: bool = False,
 ) -> Answer:
     """``answer`` to a frame that ``registrar`` has been fitted to already, with its arguments."""
-    auto = registrar is None or registrar.choice == "auto"
-    if found.error is not None and not auto:
+    if registrar is not None and registrar.choice != "auto" and found.error is not None:
         raise found.error
-    registration = None if registrar is None or found.modes is None else registrar.finish(found.modes)
-    if registration is not None and (registration.accepted or not auto):
-        return Answer(registered(found.seen, registration, model, resolution, label_points), registration, taken=True)
+    registration = None
+    if registrar is not None and found.modes is not None:
+        registration = registrar.finish(found.modes)
+        if registrar.takes(registration):
+            result = registered(found.seen, registration, model, resolution, label_points)
+            return Answer(result, registration, taken=True)
     result = extract(found.unaided, model, resolution, label_points)
     return Answer(result, registration, refusal=None if found.error is None else str(found.error))
 

@@ -5,6 +5,7 @@ code -correspondences-> pose and state of the model -deform-> SegmentedMesh, and
 
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -95,17 +96,21 @@ class ModesFit:
 
     def off_surface(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Distances, in scene units, of points of the camera frame in the cloud's unit from the facing surface."""
-        material = self.registration().material / self.unit
-        return Surface.through(self.problem.model, material).nearest(points / self.unit)[0]
+        return self.surface.nearest(points / self.unit)[0]
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The posed model in scene units: by its modes, or at rest where the frame speaks for that."""
+        model = self.problem.model
+        if self.rest is None:
+            return Surface.of(model, self.posed)
+        return Surface.through(model, self.rest.posed.place(model.rest_points))
 
     def registration(self) -> Registration:
         """The answer of the modes, or the rest model where the frame speaks for that."""
-        model = self.problem.model
         if self.rest is not None:
-            material = self.rest.posed.place(model.rest_points)
-            return self._registration("rest", model.rest_z, self.rest.posed, material, self.seconds)
-        material = self.posed.place(model.material(self.posed.z))
-        return self._registration("modes", self.posed.z, self.posed, material, self.seconds)
+            return self._registration("rest", self.problem.model.rest_z, self.rest.posed, self.surface, self.seconds)
+        return self._registration("modes", self.posed.z, self.posed, self.surface, self.seconds)
 
     def with_draws(self, states: DrawnStates) -> Registration:
         """The answer of the scene's own draws where their misfit is lower or their evidence greater, else the modes'.
@@ -123,7 +128,7 @@ class ModesFit:
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
             return replace(self.registration(), seconds=seconds)
-        found = self._registration("draws", drawn.z, drawn.posed, drawn.placed(), seconds)
+        found = self._registration("draws", drawn.z, drawn.posed, drawn.surface, seconds)
         return replace(found, drawn=replace(drawn.drawn, z=drawn.z))
 
     def _registration(
@@ -131,14 +136,14 @@ class ModesFit:
         method: Method,
         z: Float[np.ndarray, " k"],
         posed: Posed,
-        material: Float[np.ndarray, "m 3"],
+        surface: Surface,
         seconds: float,
     ) -> Registration:
-        distance = Surface.through(self.problem.model, material).nearest(self.problem.evidence.partners)[0]
+        distance = surface.nearest(self.problem.evidence.partners)[0]
         explained = float((distance <= self.problem.config.tolerance).mean())
         return Registration(
             model=self.problem.model,
-            material=material * self.unit,
+            material=surface.material * self.unit,
             method=method,
             z=z,
             scene_unit=self.unit * float(np.exp(posed.log_scale)),

@@ -105,10 +105,10 @@ class Problem:
         """
         offset = Surface.of(self.model, posed).offsets(self.evidence.points)
         noise = noise_of(offset, self.evidence.around)
-        config = constants_for(noise, self.config) if is_noise(offset, noise) else self.config
-        return (
-            None if config is self.config else replace(self, config=config, evidence=self.evidence.with_more_partners)
-        )
+        config = constants_for(noise, self.config)
+        if config is self.config or not is_noise(offset, noise):
+            return None
+        return replace(self, config=config, evidence=self.evidence.with_more_partners)
 
     @cached_property
     def samples(self) -> SampledSurface:

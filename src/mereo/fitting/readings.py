@@ -10,9 +10,10 @@ for some points that the fit explains as well, these are given back, and the fra
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mereo.fitting.fit import ModesFit
 from mereo.fitting.register import Registrar
@@ -55,11 +56,11 @@ class FittedFrame:
         """Which of the points are taken for the object's."""
         return self.seen.reading
 
-    def explains(self, tolerance: float) -> Bool[np.ndarray, " n"]:
-        """Which of all points lie on the facing surface, up to a tolerance in scene units."""
+    @cached_property
+    def off_surface(self) -> Float[np.ndarray, " n"]:
+        """Distance of each of all points from the facing surface, scene units."""
         assert self.modes is not None
-        points = transform_points(self.seen.T_camera_input, self.reading.whole.points)
-        return self.modes.off_surface(points) <= tolerance
+        return self.modes.off_surface(transform_points(self.seen.T_camera_input, self.reading.whole.points))
 
 
 def fitted_frame(
@@ -113,14 +114,14 @@ def chosen(everything: FittedFrame, surfaces: FittedFrame, fitted: Callable[[Rea
     """The better of two readings, or a third one: the second with the points that its fit explains given back."""
     if everything.modes is None or surfaces.modes is None:
         return everything if surfaces.modes is None else surfaces
-    explained, keep = surfaces.explains(surfaces.modes.tolerance), surfaces.reading.keep
+    explained, keep = surfaces.off_surface <= surfaces.modes.tolerance, surfaces.reading.keep
     if explained[~keep].mean() > GIVEN_BACK:
         return everything
     again = fitted(replace(surfaces.reading, keep=keep | explained)) if explained[~keep].any() else surfaces
     again = surfaces if again.modes is None else again
     tried = (everything, surfaces, again)
     tolerance = min(one.modes.tolerance for one in tried if one.modes is not None)
-    by_all, by_surfaces, by_again = (float(one.explains(tolerance).mean()) for one in tried)
+    by_all, by_surfaces, by_again = (float((one.off_surface <= tolerance).mean()) for one in tried)
     if by_all >= max(by_surfaces, by_again) + CLEARLY:
         return everything
     return again if by_again >= by_surfaces - AS_WELL else surfaces

@@ -125,6 +125,10 @@ class Registrar:
         states = None if self.choice == "modes" or fitted.rest is not None else self.at_hand
         return fitted.registration() if states is None else fitted.with_draws(states)
 
+    def takes(self, registration: Registration) -> bool:
+        """Whether a registration is the answer: with "auto" one that explains its frame, with other choices any."""
+        return registration.accepted or self.choice != "auto"
+
     @cached_property
     def at_hand(self) -> DrawnStates | None:
         """``states``, but None where "auto" cannot have the scene's mesh: the weights carry all that the modes need."""

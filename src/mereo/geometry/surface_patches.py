@@ -97,6 +97,11 @@ def longest_side(points: Float[np.ndarray, "n 3"]) -> float:
     return float(np.ptp(points, axis=0).max())
 
 
+def stretch(points: Float[np.ndarray, "n 3"], keep: Bool[np.ndarray, " n"]) -> float:
+    """Times that the longest side of the points' box is as long as that of those that are kept, from 1 up."""
+    return longest_side(points) / max(longest_side(points[keep]), np.finfo(float).tiny)
+
+
 def without_strays(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Whether each point is left where strays are removed: all are, unless strays make the box ``STRETCH`` longer.
 
@@ -104,6 +109,6 @@ def without_strays(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         points: seen from the origin (camera frame), any unit and density.
     """
     keep = surface_points(points)
-    if keep.all() or longest_side(points) <= STRETCH * longest_side(points[keep]):
+    if keep.all() or stretch(points, keep) <= STRETCH:
         return np.ones(len(points), dtype=bool)
     return keep

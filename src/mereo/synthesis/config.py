@@ -108,9 +108,9 @@ SENSORS: dict[Sensor, SensorConfig] = {
     ),
 }
 
-Observation = Literal["paper", "structured-light", "time-of-flight", "tool", "hand", "mask"]
+ObservationName = Literal["paper", "structured-light", "time-of-flight", "tool", "hand", "mask"]
 
-OBSERVATIONS: dict[Observation, SensorConfig] = {
+OBSERVATIONS: dict[ObservationName, SensorConfig] = {
     "paper": SENSORS["paper"],
     "structured-light": SENSORS["structured-light"],
     "time-of-flight": SENSORS["time-of-flight"],
@@ -182,7 +182,7 @@ class GenerateConfig:
     # the marker keeps --sampler short on the command line, where --sensor.axial keeps its prefix
     sampling: OmitArgPrefixes[SamplingConfig] = field(default_factory=SamplingConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    observations: tuple[Observation | Literal["all"], ...] = ()
+    observations: tuple[ObservationName | Literal["all"], ...] = ()
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -193,7 +193,7 @@ class GenerateConfig:
             )
 
     @property
-    def further(self) -> dict[Observation, SensorConfig]:
+    def further(self) -> dict[ObservationName, SensorConfig]:
         """Sensors of the further observations by name, in the order in which they are stored."""
         if "all" in self.observations:
             return {name: sensor for name, sensor in OBSERVATIONS.items() if sensor != self.sensor}
