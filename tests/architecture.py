@@ -26,6 +26,7 @@ ROOMS = (
     "evaluation",
     "training",
     "visualization",
+    "learning",
     "experiments",
     "cli",
 )

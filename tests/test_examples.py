@@ -10,6 +10,7 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 EXPECTED = {
+    "desk_lamp.py": "mereo learn lamp/lamp.yaml --output learned",
     "isolate_object.py": "isolated",
     "loop.py": "wrote loop.webp: 9 frames",
     "query_points.py": "to the nearest surface",

@@ -16,6 +16,7 @@ from tyro.conf import subcommand
 
 from mereo.cli import commands, scene_commands, tool_commands
 from mereo.cli.last_resort import is_foreseen, sentence
+from mereo.cli.learn import LearnCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.io.bounds import check_bounds
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
@@ -142,6 +143,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
     return (
         Annotated[commands.Demo, subcommand("demo")]
         | Annotated[commands.Doctor, subcommand("doctor")]
+        | Annotated[LearnCommand, subcommand("learn")]
         | Annotated[_group(scene), subcommand("scene", description="List, write, check, draw or export scenes.")]
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
         | Annotated[_starting(commands.Generate, settings=GenerateConfig(sensor=sensor)), subcommand("generate")]

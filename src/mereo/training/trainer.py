@@ -238,7 +238,7 @@ class Trainer:
             if self.data.further:
                 scores = validate(self.average, self.data, self.config, further=True)
                 self.log.add_validation(self.step, scores.iou, scores.miou, "sensor")
-            self.say(f"held-out examples at step {self.step}: {self.log.summary()}")
+            self.say(f"held-out examples at step {self.step}: {self.log.summary()}{self.log.doubt(self.total)}")
         self._wait()
 
     def save(self, finished: bool = False) -> None:

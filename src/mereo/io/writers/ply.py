@@ -45,9 +45,9 @@ def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
     _write(path, comment_lines(cloud.names, cloud.colors), {"vertex": vertices})
 
 
-def write_positions_ply(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
-    """Write a cloud's positions alone, as float32."""
-    _write(path, [], {"vertex": _records(_positions(points))})
+def write_positions_ply(path: str | Path, points: Float[np.ndarray, "n 3"], comment: str = "") -> None:
+    """Write a cloud's positions alone, as float32; ``comment`` is for people who open the file."""
+    _write(path, [comment] if comment else [], {"vertex": _records(_positions(points))})
 
 
 Columns = dict[str, tuple[str, np.ndarray]]

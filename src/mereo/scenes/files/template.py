@@ -50,19 +50,22 @@ class _Source:
     reason: str
 
 
-def write_scene_file(files: Sequence[Path], output: Path | None = None, units: str | None = None) -> Path:
+def write_scene_file(
+    files: Sequence[Path], output: Path | None = None, units: str | None = None, name: str | None = None
+) -> Path:
     """Write a commented YAML file that names ``files`` relative to itself; returns its path.
 
     Args:
         files: one mesh for each segment, one file of named parts, or one label volume.
         output: by default ``NAME.yaml`` in the working directory, after the first file.
         units: a key of ``geometry.conventions.UNITS_M``; None guesses.
+        name: of the scene; by default that of ``output``.
 
     Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files.
     """
     if not files:
         raise ValueError("no mesh is given; a scene needs at least one: name your files")
-    name = identifier((output or files[0]).name.split(".")[0])
+    name = identifier(name or (output or files[0]).name.split(".")[0])
     path = output or Path(f"{name}.yaml")
     if path.suffix not in (".yaml", ".yml"):
         raise ValueError(f"{path} has the suffix {path.suffix!r}; a scene file is .yaml: rename it")

@@ -1,0 +1,197 @@
+"""``mereo learn``: from an object to weights that answer, in stages that each leave something whole.
+
+    object -check-> measure -plan-> generate -> train -> evaluate -> scores, a report, and a frame to try
+
+The plan is written down once it is made, so the same command continues where it was stopped, with the same numbers.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mereo.evaluation.scoring import evaluate
+from mereo.io.atomic_files import atomic_file, write_json
+from mereo.io.output_folders import MARKER, claim_directory
+from mereo.io.scratch_folders import scratch_folder
+from mereo.learning.example_frame import FRAME, write_example_frame
+from mereo.learning.object_files import check, names_scene, scene_for
+from mereo.learning.outcome import show_outcome
+from mereo.learning.probe import measure
+from mereo.learning.schedule import OFFSET_EXAMPLES, Plan, Rates, epochs_for, holdout, plan_for, tests_for
+from mereo.models.weights import load_model
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.shards import generate
+from mereo.training.config import PRESETS, TrainConfig
+from mereo.training.trainer import WEIGHTS, train
+from mereo.visualization.result_files import evaluate_weights
+
+SETTINGS, PLAN = "learn.json", "plan.json"
+"""What was asked for, and what was decided, with the measurements behind it."""
+
+DATA, RUN, TEST = "data", "run", "test"
+
+SEED = 1
+"""Of examples and training. What is learnt from another one differs by chance alone."""
+
+COMPILED_FROM_MIN = 60.0
+"""Minutes from which compiling the network, which takes one or two, is left to ``compiling_pays``."""
+
+TIMED = 2
+"""Test views that are timed, to know how many there is time for."""
+
+
+@dataclass
+class Clock:
+    """Time of one run of the command, out of its budget."""
+
+    budget_s: float
+    started: float
+
+    @classmethod
+    def of(cls, minutes: float) -> "Clock":
+        """Clock that starts now."""
+        return cls(60 * minutes, time.monotonic())
+
+    @property
+    def left_s(self) -> float:
+        """Seconds of the budget that are left; below 0 where it is overdrawn."""
+        return self.budget_s - (time.monotonic() - self.started)
+
+    def stage(self, number: int, what: str) -> None:
+        """Print which stage begins, and the time left."""
+        left = f"{self.left_s / 60:.1f} of {self.budget_s / 60:g} min left" if self.left_s > 0 else "out of time"
+        print(f"[{number}/5] {what} ({left})", flush=True)
+
+
+def learn(
+    files: Sequence[Path],
+    output: Path,
+    *,
+    minutes: float = 10.0,
+    init: str = "",
+    units: str | None = None,
+    workers: int = 1,
+) -> dict[str, Any]:
+    """Learn an object in about so many minutes; returns the scores, as ``test/metrics.json`` has them.
+
+    Args:
+        files: a scene's name or file, or the object's meshes, as ``mereo scene new`` takes them.
+        output: folder to create; one that the same call has begun is continued.
+        minutes: the budget of all stages together.
+        init: weights to start from; empty compares the shipped ones.
+        units: of the meshes; guessed where not given.
+        workers: processes that make examples.
+
+    Raises ``ValueError`` for other arguments than the folder was begun with, and as the stages do.
+    """
+    clock = Clock.of(minutes)
+    _claim(output, {"object": [_place(file) for file in files], "minutes": minutes, "init": init, "units": units})
+    scene = scene_for(files, output, units)
+    recipe = recipe_for(minutes)
+    clock.stage(1, f"check {scene}")
+    loaded = load_scene(scene) if (output / PLAN).is_file() else check(scene)
+    plan = _decided(output)
+    fresh = plan is None
+    if plan is None:
+        clock.stage(2, "measure this machine, and choose weights to start from")
+        plan = _measured(scene, output, recipe, clock, init, workers)
+    clock.stage(3, f"generate {plan.examples} examples, about {_duration(plan.generation_s)}")
+    generate(scene, output / DATA, GenerateConfig(), examples=plan.examples, seed=SEED, workers=workers, resume=True)
+    if fresh:
+        plan = _revised(output, plan, clock, recipe.batch)
+    clock.stage(
+        4, f"train from the weights of {plan.init}, {plan.epochs:.1f} passes, about {_duration(plan.training_s)}"
+    )
+    weights = train(output / DATA, output / RUN, trained(recipe, plan))
+    with atomic_file(output / WEIGHTS) as partial:
+        shutil.copyfile(weights, partial)
+    clock.stage(5, "evaluate on views that training has not seen")
+    if not (output / TEST / MARKER).is_file():
+        _evaluate(output, scene, max(clock.left_s, plan.evaluation_s))
+    text = write_example_frame(loaded, output / FRAME)
+    metrics: dict[str, Any] = json.loads((output / TEST / "metrics.json").read_text("utf-8"))
+    show_outcome(metrics, output, scene, text, minutes, (time.monotonic() - clock.started) / 60)
+    return metrics
+
+
+def recipe_for(minutes: float) -> TrainConfig:
+    """Recipe for a budget, but for what the plan decides."""
+    base = PRESETS["base"]
+    return replace(base, compile=base.compile if minutes >= COMPILED_FROM_MIN else "off", seed=SEED)
+
+
+def trained(recipe: TrainConfig, plan: Plan) -> TrainConfig:
+    """Recipe with what the plan decides."""
+    offsets = min(OFFSET_EXAMPLES, plan.examples)
+    return replace(recipe, init=plan.init, epochs=plan.epochs, holdout=holdout(plan.examples), offset_examples=offsets)
+
+
+# --- what is kept between runs of the command -------------------------------------------------------------------------
+
+
+def _place(file: Path) -> str:
+    """Name of a built-in scene, or the absolute path of a file."""
+    return str(file) if names_scene([file]) and not file.suffix else str(file.absolute())
+
+
+def _claim(output: Path, settings: dict[str, Any]) -> None:
+    """Take the folder, or check that it was begun with the same arguments."""
+    before = claim_directory(output, SETTINGS, settings, "what is learnt")
+    for name, value in settings.items():
+        if before is not None and before.get(name) != value:
+            raise ValueError(
+                f"{output} was begun with {name} = {before.get(name)!r}, not {value!r}; it is continued with equal "
+                "arguments: repeat those, or choose another --output"
+            )
+
+
+def _decided(output: Path) -> Plan | None:
+    """The plan that an earlier run has made."""
+    path = output / PLAN
+    if not path.is_file():
+        return None
+    try:
+        return Plan(**json.loads(path.read_text("utf-8"))["plan"])
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(f"{path} holds no plan; remove it, and it is made again") from None
+
+
+def _measured(scene: str, output: Path, recipe: TrainConfig, clock: Clock, init: str, workers: int) -> Plan:
+    """The plan by what is measured, which is written down."""
+    with scratch_folder(output / "measured") as scratch:
+        rates, start = measure(scene, scratch, recipe, init=init, seed=SEED, workers=workers)
+    plan = plan_for(clock.left_s, rates, start, recipe.batch)
+    expected_s = plan.generation_s + plan.training_s + plan.evaluation_s
+    if expected_s > 1.1 * max(clock.left_s, 0.0):
+        print(f"the least that can be learnt from takes about {_duration(expected_s)} from here, more than is left")
+    write_json(output / PLAN, {"plan": asdict(plan), "rates": asdict(rates)})
+    return plan
+
+
+def _revised(output: Path, plan: Plan, clock: Clock, batch: int) -> Plan:
+    """The plan with as much training as there is time for, now that the examples are there."""
+    found = json.loads((output / PLAN).read_text("utf-8"))
+    rates = Rates(**found["rates"])
+    again = epochs_for(clock.left_s - plan.evaluation_s, rates, plan.init, plan.examples, batch)
+    plan = replace(plan, epochs=again.epochs, training_s=again.training_s)
+    write_json(output / PLAN, {**found, "plan": asdict(plan)})
+    return plan
+
+
+def _evaluate(output: Path, scene: str, left_s: float) -> None:
+    """Score the weights on as many views as there is time for."""
+    started = time.monotonic()
+    evaluate(load_model(output / WEIGHTS), scene, examples=TIMED, seed=TEST_SEED_START)
+    used_s = time.monotonic() - started
+    tests = tests_for(left_s - used_s, used_s / TIMED)
+    evaluate_weights(output / WEIGHTS, output / TEST, examples=tests, scene=scene)
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"

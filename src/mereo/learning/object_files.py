@@ -1,0 +1,80 @@
+"""What is learnt: a scene, or meshes for which a scene file is written; and what is wrong with it before any work."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mereo.scenes.files.check import check_scene
+from mereo.scenes.files.template import write_scene_file
+from mereo.scenes.registry import is_yaml, load_scene
+from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.seeds import example_rng
+
+SCENE = "scene.yaml"
+"""Scene file that is written for meshes."""
+
+STATES = 24
+"""Random states from which it is seen how far an object deforms."""
+
+HARDLY = 0.005
+"""Mean way of the surface from its mean place, as a share of the object's length, below which it hardly deforms."""
+
+
+def names_scene(files: Sequence[Path]) -> bool:
+    """Whether a scene is named: one that is built in, or a scene file; other files are meshes."""
+    return len(files) == 1 and (str(files[0]) in SCENES or is_yaml(files[0]) or files[0].suffix == ".py")
+
+
+def scene_for(files: Sequence[Path], folder: Path, units: str | None) -> str:
+    """Name or file of the scene to learn; for meshes ``folder / SCENE``, which is written where it is missing.
+
+    Raises ``ValueError`` for no files, and for a unit of a scene, which says its own; and as ``write_scene_file`` does.
+    """
+    if not files:
+        raise ValueError("no object is given; name a scene file, or its meshes: mereo learn base.stl arm.stl ...")
+    if names_scene(files):
+        if units is not None:
+            raise ValueError(f"--units is {units}, but {files[0]} says its own: leave it out, or correct the file")
+        return str(files[0])
+    path = folder / SCENE
+    if not path.is_file():
+        write_scene_file(files, path, units, name=files[0].name.split(".")[0])
+        print(
+            f"wrote {path}: the object bends as if it were of rubber; where it has joints or moves in other ways, say "
+            "so in that file (docs/own-object.md), and learn it anew: mereo learn FILE --output ANOTHER"
+        )
+    return str(path)
+
+
+def check(scene: str) -> Scene:
+    """Scene after the checks of ``mereo scene check``, whose findings are printed.
+
+    Raises ``ValueError`` where something is wrong, with what may repair it.
+    """
+    try:
+        check_scene(scene)
+    except ValueError as error:
+        if not is_yaml(scene) or "fault" not in str(error):
+            raise
+        repaired = Path(scene).with_name(f"{Path(scene).stem}-repaired{Path(scene).suffix}")
+        raise ValueError(
+            f"{scene} has faults, listed above, and nothing is learnt of a wrong object: correct them, or let "
+            f"`mereo scene check {scene} --repair` try, and learn {repaired}"
+        ) from None
+    loaded = load_scene(scene)
+    way = deformation(loaded)
+    if way < HARDLY:
+        print(
+            f"warning: {loaded.name} hardly deforms: by {way:.2%} of its length; if it does more than that, widen its "
+            f"deformations{f' in {scene}' if is_yaml(scene) else ''}"
+        )
+    return loaded
+
+
+def deformation(scene: Scene) -> float:
+    """Mean distance of vertices from their mean place over random states, as a share of the object's longest side."""
+    states = np.stack([scene.sample_state(example_rng(0, index)).mesh.merged()[0] for index in range(STATES)])
+    states -= states.mean(axis=1, keepdims=True)
+    low, high = scene.rest.bounds
+    return float(np.linalg.norm(states - states.mean(axis=0), axis=-1).mean() / (high - low).max())

@@ -1,0 +1,113 @@
+"""Short trainings on a few examples: what a step costs, and from which shipped weights an object is learnt fastest."""
+
+import time
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mereo.models.device import keep_freed_memory, pick_device
+from mereo.models.weights import shipped_names
+from mereo.training.config import TrainConfig
+from mereo.training.dataset import Batch, Dataset
+from mereo.training.run_directory import Process, fit_config, start_network
+from mereo.training.trainer import Trainer
+from mereo.training.validation import validate
+
+COMPARED = 24
+"""Examples on which all shipped weights are compared as they are."""
+
+FINALISTS = 3
+"""How many of these, those with the lowest loss, are then trained."""
+
+STEPS = 12
+"""Steps of a trial: a training of its own, with warm-up and decay."""
+
+JUDGED = 4
+"""Steps, the last ones, whose mean loss is compared."""
+
+SCORED = 16
+"""Examples from which the time of an answer is taken."""
+
+
+def small_dataset(folder: Path) -> Dataset:
+    """Dataset of a folder where training would have it; raises as ``Dataset.load``."""
+    keep_freed_memory()
+    return Dataset.load(folder, pick_device(0))
+
+
+def nearest(data: Dataset, recipe: TrainConfig, folder: Path) -> dict[str, float]:
+    """Shipped weights nearest to a dataset, the best first, each with its loss after a trial.
+
+    All are compared by their loss as they are; the ``FINALISTS`` among them then by that after a trial.
+
+    Args:
+        data: a few examples.
+        recipe: of the training to come.
+        folder: for what a run writes.
+    """
+    before = {name: Trial.of(data, replace(recipe, init=name), folder).loss_now() for name in shipped_names()}
+    after = {}
+    for name in sorted(before, key=lambda name: before[name])[:FINALISTS]:
+        after[name] = Trial.of(data, replace(recipe, init=name), folder).run().latest_loss()
+    return dict(sorted(after.items(), key=lambda item: item[1]))
+
+
+def timed(data: Dataset, recipe: TrainConfig, folder: Path) -> tuple[float, float]:
+    """Seconds that an example takes in a step of training, and to be answered at all its queries.
+
+    Raises ``ValueError`` where the weights that ``recipe`` starts from are of another architecture.
+    """
+    trial = Trial.of(data, recipe, folder).run()
+    started = time.monotonic()
+    validate(trial.average, data, replace(trial.config, holdout=SCORED))
+    score_s = (time.monotonic() - started) / SCORED
+    return float(np.median(trial.times_s)) / recipe.batch, score_s
+
+
+class Trial(Trainer):
+    """Training of ``STEPS`` steps on all of its data, of which only losses and speed are asked."""
+
+    @classmethod
+    def of(cls, data: Dataset, recipe: TrainConfig, folder: Path) -> "Trial":
+        """Trial of a recipe, but for its length and what is held out."""
+        config = replace(recipe, holdout=0, epochs=STEPS * recipe.batch / len(data), compile="off")
+        config = fit_config(config, data)
+        return cls(config, data, start_network(config, data), folder, Process(), data.cloud.device)
+
+    @cached_property
+    def times_s(self) -> list[float]:
+        """Seconds of each step so far."""
+        return []
+
+    def say(self, text: str) -> None:
+        """Print nothing: nobody waits for these steps."""
+
+    def run(self) -> "Trial":
+        """Take all steps."""
+        for batch in self.batches():
+            self.train_step(batch)
+        return self
+
+    def train_step(self, batch: Batch) -> None:
+        """Take one step, and its time."""
+        started = time.monotonic()
+        super().train_step(batch)
+        self._read_losses()
+        self.times_s.append(time.monotonic() - started)
+
+    def latest_loss(self) -> float:
+        """Mean of the last ``JUDGED`` steps."""
+        assert self.log is not None
+        return float(np.mean([row["loss"] for row in self.log.rows[-JUDGED:]]))
+
+    @torch.no_grad()
+    def loss_now(self) -> float:
+        """Mean loss of the first examples, without a step."""
+        self.network.train()
+        config, rng = self.config, torch.Generator().manual_seed(self.config.seed)
+        index = torch.arange(min(COMPARED, len(self.data)))
+        batch = self.data.batch(index, config.network.points, config.queries, config.augment, rng)
+        return float(self._loss(batch)[0])
