@@ -33,7 +33,7 @@ deformations:  # the joint at the tip comes first
 def parts() -> dict[str, trimesh.Trimesh]:
     """Closed meshes of the lamp at rest."""
     shade = trimesh.creation.revolve([(0, -5), (20, -5), (55, -80), (60, -80), (24, 0), (0, 0)], sections=40)
-    shade.apply_translation(np.array(NECK) + (0, -20, -24))
+    shade.apply_translation(np.add(NECK, (0, -20, -24)))
     return {
         "base": trimesh.creation.cylinder(75.0, segment=[(0, 0, 0), (0, 0, 20)], sections=48),
         "lower_arm": arm(SHOULDER, ELBOW),

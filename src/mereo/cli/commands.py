@@ -131,7 +131,7 @@ class Train:
         dataset: folder written by `mereo generate`.
         output: folder of the run.
         preset: what the options below start from: as published, as published for --network.encoder autodecoder,
-            recommended, the same for a GPU, a two-minute trial.
+            recommended, the same for a GPU, one for tests.
         config: the recipe; defaults are the chosen preset's.
     """
 

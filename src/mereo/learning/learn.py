@@ -21,7 +21,7 @@ from mereo.learning.example_frame import FRAME, write_example_frame
 from mereo.learning.object_files import check, names_scene, scene_for
 from mereo.learning.outcome import show_outcome
 from mereo.learning.probe import measure
-from mereo.learning.schedule import OFFSET_EXAMPLES, Plan, Rates, epochs_for, holdout, plan_for, tests_for
+from mereo.learning.schedule import OFFSET_EXAMPLES, Plan, Rates, epochs_for, holdout, plan_for, views_for
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
@@ -189,7 +189,7 @@ def _evaluate(output: Path, scene: str, left_s: float) -> None:
     started = time.monotonic()
     evaluate(load_model(output / WEIGHTS), scene, examples=TIMED, seed=TEST_SEED_START)
     used_s = time.monotonic() - started
-    tests = tests_for(left_s - used_s, used_s / TIMED)
+    tests = views_for(left_s - used_s, used_s / TIMED)
     evaluate_weights(output / WEIGHTS, output / TEST, examples=tests, scene=scene)
 
 

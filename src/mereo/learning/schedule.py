@@ -96,7 +96,7 @@ def holdout(examples: int) -> int:
     return min(HOLDOUT, examples // 10)
 
 
-def tests_for(left_s: float, each_s: float) -> int:
+def views_for(left_s: float, each_s: float) -> int:
     """Number of test views that can be scored in ``left_s`` seconds at ``each_s`` for one."""
     return int(max(LEAST_TESTS, min(MOST_TESTS, left_s / max(each_s, 1e-3))))
 

@@ -129,7 +129,7 @@ PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
     base               what to train for real, also on a CPU: the paper's network at half its widths, local features at
                        the query, a modern schedule, and many small steps (docs/design/0002-learning.md)
     large              the same with the paper's widths and larger steps, for a GPU
-    tiny               two minutes on two CPU cores: for tests and for a first look at one's own object
+    tiny               two minutes on two CPU cores: for tests; objects of one's own are learnt by `mereo learn`
 """
 
 Table = dict[str, tuple[Any, ...]]
