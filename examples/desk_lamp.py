@@ -3,7 +3,7 @@
     python examples/desk_lamp.py
     mereo learn lamp/lamp.yaml --output learned
 
-The lamp stands on the origin, z up, in millimetres: base, two arms and a shade, each a closed mesh in a file of its own.
+The lamp stands on the origin, z up, in millimetres: base, two arms and a shade, each a closed mesh in its own file.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``mereo learn``: the plan is arithmetic, each stage leaves something whole, and repeating the command continues it."""
+"""``mereo learn``: the plan is arithmetic, each stage leaves something whole, and the same command continues it."""
 
 import json
 import re
