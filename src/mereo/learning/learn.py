@@ -169,7 +169,7 @@ def _measured(scene: str, output: Path, recipe: TrainConfig, clock: Clock, init:
     plan = plan_for(clock.left_s, rates, start, recipe.batch)
     expected_s = plan.generation_s + plan.training_s + plan.evaluation_s
     if expected_s > 1.1 * max(clock.left_s, 0.0):
-        print(f"the least that can be learnt from takes about {_duration(expected_s)} from here, more than is left")
+        print(f"warning: the least that can be learnt from takes {_duration(expected_s)} from here, more than is left")
     write_json(output / PLAN, {"plan": asdict(plan), "rates": asdict(rates)})
     return plan
 

@@ -66,6 +66,7 @@ def plan_for(left_s: float, rates: Rates, init: str, batch: int) -> Plan:
 
     Examples are made until each is learnt from ``PASSES`` times in what is left then.
     """
+    left_s = max(left_s, 0.0)
     work_s = left_s * (1 - EVALUATION_SHARE)
     each_s = rates.generate_s + PASSES * rates.train_s / MARGIN
     examples = int(max(LEAST_EXAMPLES, min(MOST_EXAMPLES, (work_s - _scored_s(rates) / MARGIN) / each_s)))
