@@ -94,9 +94,10 @@ def test_meshes_get_a_scene_file_once(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_what_hardly_deforms_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = check(str(write_bar(tmp_path, NOTHING)))
+    scene = write_bar(tmp_path, NOTHING)
+    check([scene], None)
     assert "warning: bar hardly deforms: by 0.0" in capsys.readouterr().out
-    assert deformation(scene) < 0.001
+    assert deformation(load_scene(scene)) < 0.001
     assert deformation(load_scene(write_bar(tmp_path))) > 0.006
 
 
@@ -104,7 +105,34 @@ def test_a_faulty_object_is_refused_with_what_may_mend_it(tmp_path: Path) -> Non
     path = write_bar(tmp_path)
     (tmp_path / "right.stl").write_bytes((tmp_path / "left.stl").read_bytes())
     with pytest.raises(ValueError, match=r"bar.yaml --repair` try, and learn .*bar-repaired.yaml"):
-        check(str(path))
+        learn([path], tmp_path / "out")
+    meshes = [tmp_path / "left.stl", tmp_path / "right.stl"]
+    with pytest.raises(
+        ValueError, match=r"let `mereo scene new .*right.stl --output left.yaml` and `mereo scene check"
+    ):
+        learn(meshes, tmp_path / "out")
+    with pytest.raises(FileNotFoundError, match="none.stl does not exist"):
+        learn([tmp_path / "none.stl"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_arguments_bind_once_something_is_made_of_them(tmp_path: Path) -> None:
+    scene, out = write_bar(tmp_path), tmp_path / "out"
+    with pytest.raises(FileNotFoundError, match="there are no weights 'bunnny'"):
+        learn([scene], out, init="bunnny")
+    assert not out.exists()
+    learning._claim(out, {"object": "a", "minutes": 1.0})
+    learning._claim(out, {"object": "b", "minutes": 2.0})
+    assert json.loads((out / "learn.json").read_text()) == {"object": "b", "minutes": 2.0}
+    (out / "scene.yaml").write_text("of b")
+    learning._claim(out, {"object": "b", "minutes": 3.0})
+    with pytest.raises(ValueError, match="was begun with object = 'b', not 'a'"):
+        learning._claim(out, {"object": "a", "minutes": 3.0})
+    (out / "plan.json").write_text("of 3 minutes")
+    with pytest.raises(ValueError, match=r"was begun with minutes = 3.0, not 1.0; .*choose another --output"):
+        learning._claim(out, {"object": "b", "minutes": 1.0})
+    with pytest.raises(ValueError, match=r"plan.json holds no plan; remove it"):
+        learning._decided(out)
 
 
 # --- the frame --------------------------------------------------------------------------------------------------------
@@ -189,11 +217,10 @@ def test_one_command_and_the_same_again(
     small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, out = write_bar(tmp_path), tmp_path / "out"
-    scores = learn([scene], out, minutes=0.05)
+    scores = learn([scene], out, minutes=0.05, init="rope")
     said = capsys.readouterr().out
     assert re.findall(r"\[(\d)/5\]", said) == list("12345")
     assert "the least that can be learnt from takes" in said
-    assert "loss after 12 steps from the weights of rope" in said
     assert f"mereo reconstruct {out}/frame.ply --weights {out}/weights.safetensors --scene {scene}" in said
     assert {place.name for place in out.iterdir()} == {
         "learn.json", "plan.json", "data", "run", "test", "weights.safetensors", "frame.ply"
@@ -202,11 +229,14 @@ def test_one_command_and_the_same_again(
     assert plan.examples == 30 and plan.init == "rope"
     before = {path: path.stat().st_mtime_ns for path in (out / "data").glob("shard-*")}
     monkeypatch.setattr(learning, "evaluate_weights", None)  # all is there
-    assert learn([scene], out, minutes=0.05) == scores
+    assert learn([scene], out, minutes=0.05, init="rope") == scores
     assert before == {path: path.stat().st_mtime_ns for path in (out / "data").glob("shard-*")}
     for arguments, message in (
-        ({"minutes": 1.0}, r"was begun with minutes = 0.05, not 1.0; .* repeat those, or choose another --output"),
-        ({"minutes": 0.05, "init": "rope"}, "was begun with init = '', not 'rope'"),
+        (
+            {"minutes": 1.0, "init": "rope"},
+            r"was begun with minutes = 0.05, not 1.0; .* repeat those, or choose another --output",
+        ),
+        ({"minutes": 0.05, "init": "skull"}, "was begun with init = 'rope', not 'skull'"),
     ):
         with pytest.raises(ValueError, match=message):
             learn([scene], out, **arguments)  # type: ignore[arg-type]
@@ -218,6 +248,16 @@ def test_one_command_and_the_same_again(
 
 def _stop(*_: object, **__: object) -> None:
     raise KeyboardInterrupt
+
+
+@pytest.mark.slow
+def test_the_nearest_weights_are_those_that_adapt_fastest(
+    small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "shipped_names", lambda: ("rope", "skull"))
+    _, name = probe.measure(str(write_bar(tmp_path)), tmp_path, LIGHT, init="", seed=1, workers=1)
+    losses = re.findall(r"(rope|skull) (\d+\.\d+)", capsys.readouterr().out)
+    assert len(losses) == 2 and float(losses[0][1]) <= float(losses[1][1]) and name == losses[0][0]
 
 
 @pytest.mark.slow

@@ -18,11 +18,11 @@ from mereo.io.atomic_files import atomic_file, write_json
 from mereo.io.output_folders import MARKER, claim_directory
 from mereo.io.scratch_folders import scratch_folder
 from mereo.learning.example_frame import FRAME, write_example_frame
-from mereo.learning.object_files import check, names_scene, scene_for
+from mereo.learning.object_files import SCENE, check, names_scene, scene_for
 from mereo.learning.outcome import show_outcome
 from mereo.learning.probe import measure
 from mereo.learning.schedule import OFFSET_EXAMPLES, Plan, Rates, epochs_for, holdout, plan_for, views_for
-from mereo.models.weights import load_model
+from mereo.models.weights import find_weights, load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
@@ -91,11 +91,14 @@ def learn(
     Raises ``ValueError`` for other arguments than the folder was begun with, and as the stages do.
     """
     clock = Clock.of(minutes)
+    if init:
+        find_weights(init)  # a name that is none is better said before the work
+    if not (output / PLAN).is_file():
+        clock.stage(1, "check the object")
+        check(files, units)
     _claim(output, {"object": [_place(file) for file in files], "minutes": minutes, "init": init, "units": units})
     scene = scene_for(files, output, units)
-    recipe = recipe_for(minutes)
-    clock.stage(1, f"check {scene}")
-    loaded = load_scene(scene) if (output / PLAN).is_file() else check(scene)
+    loaded, recipe = load_scene(scene), recipe_for(minutes)
     plan = _decided(output)
     fresh = plan is None
     if plan is None:
@@ -141,14 +144,18 @@ def _place(file: Path) -> str:
 
 
 def _claim(output: Path, settings: dict[str, Any]) -> None:
-    """Take the folder, or check that it was begun with the same arguments."""
+    """Take the folder, or check that it was begun with the same arguments: they bind once something is made of them."""
     before = claim_directory(output, SETTINGS, settings, "what is learnt")
+    planned, written = (output / PLAN).is_file(), (output / SCENE).is_file()
     for name, value in settings.items():
-        if before is not None and before.get(name) != value:
+        binds = planned or (written and name in ("object", "units"))
+        if before is not None and binds and before.get(name) != value:
             raise ValueError(
                 f"{output} was begun with {name} = {before.get(name)!r}, not {value!r}; it is continued with equal "
                 "arguments: repeat those, or choose another --output"
             )
+    if before not in (None, settings):
+        write_json(output / SETTINGS, settings)
 
 
 def _decided(output: Path) -> Plan | None:

@@ -1,7 +1,9 @@
 """What is learnt: a scene, or meshes for which a scene file is written; and what is wrong with it before any work."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -26,7 +28,7 @@ def names_scene(files: Sequence[Path]) -> bool:
     return len(files) == 1 and (str(files[0]) in SCENES or is_yaml(files[0]) or files[0].suffix == ".py")
 
 
-def scene_for(files: Sequence[Path], folder: Path, units: str | None) -> str:
+def scene_for(files: Sequence[Path], folder: Path, units: str | None, quiet: bool = False) -> str:
     """Name or file of the scene to learn; for meshes ``folder / SCENE``, which is written where it is missing.
 
     Raises ``ValueError`` for no files, and for a unit of a scene, which says its own; and as ``write_scene_file`` does.
@@ -40,6 +42,8 @@ def scene_for(files: Sequence[Path], folder: Path, units: str | None) -> str:
     path = folder / SCENE
     if not path.is_file():
         write_scene_file(files, path, units, name=files[0].name.split(".")[0])
+        if quiet:
+            return str(path)
         print(
             f"wrote {path}: the object bends as if it were of rubber; where it has joints or moves in other ways, say "
             "so in that file (docs/own-object.md), and learn it anew: mereo learn FILE --output ANOTHER"
@@ -47,29 +51,39 @@ def scene_for(files: Sequence[Path], folder: Path, units: str | None) -> str:
     return str(path)
 
 
-def check(scene: str) -> Scene:
-    """Scene after the checks of ``mereo scene check``, whose findings are printed.
+def check(files: Sequence[Path], units: str | None) -> None:
+    """Check an object as ``mereo scene check`` does, and print what that finds; nothing is written.
 
     Raises ``ValueError`` where something is wrong, with what may repair it.
     """
-    try:
-        check_scene(scene)
-    except ValueError as error:
-        if not is_yaml(scene) or "fault" not in str(error):
-            raise
-        repaired = Path(scene).with_name(f"{Path(scene).stem}-repaired{Path(scene).suffix}")
-        raise ValueError(
-            f"{scene} has faults, listed above, and nothing is learnt of a wrong object: correct them, or let "
-            f"`mereo scene check {scene} --repair` try, and learn {repaired}"
-        ) from None
-    loaded = load_scene(scene)
+    with TemporaryDirectory() as folder:
+        scene = scene_for(files, Path(folder), units, quiet=True)
+        try:
+            check_scene(scene)
+        except ValueError as error:
+            if not is_yaml(scene) or "listed above" not in str(error):
+                raise
+            raise ValueError(_refusal(files)) from None
+        loaded = load_scene(scene)
     way = deformation(loaded)
     if way < HARDLY:
+        place = f" in {files[0]}" if names_scene(files) and is_yaml(files[0]) else ""
         print(
             f"warning: {loaded.name} hardly deforms: by {way:.2%} of its length; if it does more than that, widen its "
-            f"deformations{f' in {scene}' if is_yaml(scene) else ''}"
+            f"deformations{place}"
         )
-    return loaded
+
+
+def _refusal(files: Sequence[Path]) -> str:
+    """Sentence about an object with faults: which commands may mend it."""
+    named = names_scene(files)
+    path = files[0] if named else Path(f"{files[0].stem}.yaml")
+    new = "" if named else f"`mereo scene new {shlex.join(map(str, files))} --output {path}` and "
+    return (
+        f"{files[0] if named else 'the object'} has faults, listed above, and nothing is learnt of a wrong object: "
+        f"correct them, or let {new}`mereo scene check {path} --repair` try, and learn "
+        f"{path.with_name(f'{path.stem}-repaired{path.suffix}')}"
+    )
 
 
 def deformation(scene: Scene) -> float:
