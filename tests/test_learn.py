@@ -51,7 +51,7 @@ def test_stages_fill_the_time_that_is_left(left_s: float, generate_s: float) -> 
     steps = plan.epochs * (plan.examples - holdout(plan.examples)) / 6
     assert steps == pytest.approx(round(steps))
     # the tail is in it: what is expected of training is its steps and its scores, and some more
-    scores_s = (20 * 32 + schedule.OFFSET_EXAMPLES) * rates.score_s
+    scores_s = (20 * holdout(plan.examples) + min(schedule.OFFSET_EXAMPLES, plan.examples)) * rates.score_s
     assert schedule.MARGIN * plan.training_s == pytest.approx(6 * steps * rates.train_s + scores_s)
 
 

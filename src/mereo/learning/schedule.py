@@ -68,8 +68,9 @@ def plan_for(left_s: float, rates: Rates, init: str, batch: int) -> Plan:
     """
     left_s = max(left_s, 0.0)
     work_s = left_s * (1 - EVALUATION_SHARE)
-    each_s = rates.generate_s + PASSES * rates.train_s / MARGIN
-    examples = int(max(LEAST_EXAMPLES, min(MOST_EXAMPLES, (work_s - _scored_s(rates) / MARGIN) / each_s)))
+    examples = LEAST_EXAMPLES
+    while examples < MOST_EXAMPLES and _work_s(examples + 1, rates) <= work_s:
+        examples += 1
     generation_s = examples * rates.generate_s
     return epochs_for(work_s - generation_s, rates, init, examples, batch, generation_s, left_s * EVALUATION_SHARE)
 
@@ -85,10 +86,10 @@ def epochs_for(
 ) -> Plan:
     """Plan for examples that are there already, and so many seconds of training."""
     learnt = examples - holdout(examples)
-    steps_s = MARGIN * training_s - _scored_s(rates)
+    steps_s = MARGIN * training_s - _scored_s(examples, rates)
     epochs = max(1.0, steps_s / rates.train_s / learnt)
     epochs = math.ceil(epochs * learnt / batch) * batch / learnt  # whole steps
-    expected_s = (epochs * learnt * rates.train_s + _scored_s(rates)) / MARGIN
+    expected_s = (epochs * learnt * rates.train_s + _scored_s(examples, rates)) / MARGIN
     return Plan(init, examples, epochs, generation_s, expected_s, evaluation_s)
 
 
@@ -102,6 +103,12 @@ def views_for(left_s: float, each_s: float) -> int:
     return int(max(LEAST_TESTS, min(MOST_TESTS, left_s / max(each_s, 1e-3))))
 
 
-def _scored_s(rates: Rates) -> float:
+def _work_s(examples: int, rates: Rates) -> float:
+    """Seconds in which so many examples are made, and learnt from ``PASSES`` times."""
+    steps_s = PASSES * (examples - holdout(examples)) * rates.train_s
+    return examples * rates.generate_s + (steps_s + _scored_s(examples, rates)) / MARGIN
+
+
+def _scored_s(examples: int, rates: Rates) -> float:
     """Seconds of training that are no steps: the validation curve and the class offsets."""
-    return (VALIDATIONS * HOLDOUT + OFFSET_EXAMPLES) * rates.score_s
+    return (VALIDATIONS * holdout(examples) + min(OFFSET_EXAMPLES, examples)) * rates.score_s
