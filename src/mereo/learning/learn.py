@@ -42,6 +42,9 @@ SEED = 1
 COMPILED_FROM_MIN = 60.0
 """Minutes from which compiling the network, which takes one or two, is left to ``compiling_pays``."""
 
+CHECKPOINT_S = 60.0
+"""Seconds between checkpoints: what a stopped run loses at most."""
+
 TIMED = 2
 """Test views that are timed, to know how many there is time for."""
 
@@ -111,7 +114,7 @@ def learn(
     clock.stage(
         4, f"train from the weights of {plan.init}, {plan.epochs:.1f} passes, about {_duration(plan.training_s)}"
     )
-    weights = train(output / DATA, output / RUN, trained(recipe, plan))
+    weights = train(output / DATA, output / RUN, trained(recipe, plan), checkpoint_every_s=CHECKPOINT_S)
     with atomic_file(output / WEIGHTS) as partial:
         shutil.copyfile(weights, partial)
     clock.stage(5, "evaluate on views that training has not seen")
