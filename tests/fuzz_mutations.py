@@ -140,7 +140,8 @@ def _zip(content: bytes, rng: Random) -> bytes:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
         for name, data in members:
-            archive.writestr(zipfile.ZipInfo(name), data)
+            if name not in archive.namelist():
+                archive.writestr(zipfile.ZipInfo(name), data)
     return packed.getvalue()
 
 
@@ -173,8 +174,9 @@ def _glb(content: bytes, rng: Random) -> bytes:
 def _safetensors(content: bytes, rng: Random) -> bytes:
     (length,) = struct.unpack("<Q", content[:8])
     header = json.loads(content[8 : 8 + length])
-    own = header.get("__metadata__", {}).get("mereo")
-    if own and rng.random() < 0.6:
+    facts = header.get("__metadata__") if isinstance(header, dict) else None
+    own = facts.get("mereo") if isinstance(facts, dict) else None
+    if isinstance(own, str) and rng.random() < 0.6:
         header["__metadata__"]["mereo"] = _json(own.encode(), rng).decode("utf-8", "replace")
     elif rng.random() < 0.5:
         header = changed_tree(header, rng)

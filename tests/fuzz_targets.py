@@ -362,7 +362,7 @@ ALL: tuple[Target, ...] = (
     Target("checkpoint.safetensors", lambda p: save_checkpoint(p.parent, checkpoint()),
            lambda p: load_checkpoint(p.parent, checkpoint())),  # fmt: skip
     Target("state.json", state, read_registration),
-    Target("start.json", start, lambda p: read_start(p, rest())),
+    Target("start.json", start, lambda p: read_start(p, rest(), 1.0)),
     Target("view.npz", view, load_view),
 )
 TARGETS = {target.name: target for target in ALL if find_spec(target.library) is not None}

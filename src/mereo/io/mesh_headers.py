@@ -59,15 +59,23 @@ def _check_gltf(path: Path) -> None:
     if path.suffix.lower() == ".gltf":
         document = json.loads(path.read_text("utf-8"))
     else:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(20)[12:16], "little")
-            document = json.loads(file.read(min(length, path.stat().st_size)))
+        document = json.loads(_glb_text(path.read_bytes()))
     views = document.get("bufferViews", [])
     for view in views:
         room = document["buffers"][view["buffer"]]["byteLength"] - view.get("byteOffset", 0)
         check_count(view["byteLength"], room, "bytes")
     for accessor in document.get("accessors", []):
         _check_accessor(path, accessor, views)
+
+
+def _glb_text(content: bytes) -> bytes:
+    """First chunk of a GLB file, which is JSON; none may state more bytes than follow, for which trimesh asks at once."""
+    at = 12
+    while at + 8 <= len(content):
+        length = int.from_bytes(content[at : at + 4], "little")
+        check_count(length, len(content) - at - 8, "bytes")
+        at += 8 + length
+    return content[20 : 20 + int.from_bytes(content[12:16], "little")]
 
 
 def _check_accessor(path: Path, accessor: dict[str, Any], views: list[dict[str, Any]]) -> None:
