@@ -51,7 +51,9 @@ def _put(content: bytes, start: int, end: int, piece: bytes) -> bytes:
 
 def _flip(content: bytes, rng: Random) -> bytes:
     start, _ = _span(content, rng)
-    return _put(content, start, start + 1, bytes([(content[start] if start < len(content) else 0) ^ 1 << rng.randrange(8)]))
+    return _put(
+        content, start, start + 1, bytes([(content[start] if start < len(content) else 0) ^ 1 << rng.randrange(8)])
+    )
 
 
 def _truncate(content: bytes, rng: Random) -> bytes:
@@ -134,7 +136,9 @@ def _zip(content: bytes, rng: Random) -> bytes:
         members = [(item.filename, archive.read(item)) for item in archive.infolist()]
     at = rng.randrange(len(members))
     name, data = members[at]
-    members[at] = rng.choice(((name, damaged(data, rng)),) * 4 + ((damaged(name.encode(), rng).decode("latin-1"), data),))
+    members[at] = rng.choice(
+        ((name, damaged(data, rng)),) * 4 + ((damaged(name.encode(), rng).decode("latin-1"), data),)
+    )
     if rng.random() < 0.1:
         members.pop(rng.randrange(len(members)))
     packed = io.BytesIO()
@@ -237,5 +241,7 @@ def changed_tree(tree: Any, rng: Random) -> Any:
         return with_value(tree, place[:-1], {**above, rng.choice(("", "a", "\n", f"{place[-1]}_")): value})
     several = value * 2 if isinstance(value, (list, str)) else [value, value]
     other = value_at(tree, rng.choice(list(places(tree))))
-    new = rng.choice((*ODD_VALUES, *(ODD_VALUES if rng.random() < 0.5 else ()), *(..., ..., [value], several, other) * 2))
+    new = rng.choice(
+        (*ODD_VALUES, *(ODD_VALUES if rng.random() < 0.5 else ()), *(..., ..., [value], several, other) * 2)
+    )
     return with_value(tree, place, None if new is ... and not place else new)

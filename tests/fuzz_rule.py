@@ -90,7 +90,9 @@ def fault_of(read: Callable[[Path], object], path: Path, names: tuple[str, ...] 
             del os.environ[LIMIT_VARIABLE]
     seconds = time.monotonic() - start
     fault = None if error is None else _fault_of_error(error, (path.name, *names))
-    strange = [w for w in warned if not issubclass(w.category, SILENT) and not w.category.__module__.startswith("mereo")]
+    strange = [
+        w for w in warned if not issubclass(w.category, SILENT) and not w.category.__module__.startswith("mereo")
+    ]
     if fault is None and strange:
         kind = f"{strange[0].category.__name__} at {strange[0].filename}:{strange[0].lineno}"
         fault = Fault(kind, f"{kind}: {strange[0].message}; then {error!r}")

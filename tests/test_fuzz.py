@@ -6,10 +6,8 @@ as they allow, each kind in a process of its own, so that a crash of a library i
 
 import json
 import os
-import re
 import subprocess
 import sys
-from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -17,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from fuzz_mutations import ODD_VALUES, damaged, places, with_value
+from fuzz_mutations import ODD_VALUES, places, with_value
 from fuzz_rule import fault_of, limits, listing
 from fuzz_run import cases
-from fuzz_targets import TARGETS, Target
+from fuzz_targets import TARGETS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -31,7 +29,13 @@ MINUTES = float(os.environ.get("MEREO_FUZZ_MINUTES", "30"))
 COUNT = 60
 """Inputs of a kind in the fast test."""
 
-DEAR = {"bar.yaml": 12, "left.stl": 12, "weights.safetensors": 4, "checkpoint.safetensors": 20, "states.safetensors": 30}
+DEAR = {
+    "bar.yaml": 12,
+    "left.stl": 12,
+    "weights.safetensors": 4,
+    "checkpoint.safetensors": 20,
+    "states.safetensors": 30,
+}
 """Fewer where one takes long."""
 
 
@@ -94,14 +98,18 @@ COMMANDS: dict[str, str] = {
     "poses.csv": "reconstruct cloud.npy --weights tiny.safetensors --resolution 8 --carry {} --output out",
     "bar.yaml": "scene preview {} --output out.png",
     "volume.yaml": "scene export {} --output out",
-    "start.json": "align cloud.npy bar.yaml --start {} --output out",
-    "manifest.json": "train . --preset tiny --epochs 1 --steps 1 --output out",
+    "start.json": "align cloud.npy --scene bar.yaml --start {} --output out",
+    "manifest.json": "train . --preset tiny --epochs 1 --output out",
 }  # fmt: skip
 
 
 def beside(folder: Path) -> None:
     """What the commands need besides the file that is damaged."""
-    for name, other in (("weights.safetensors", "tiny.safetensors"), ("depth.png", "depth.png"), ("bar.yaml", "bar.yaml")):
+    for name, other in (
+        ("weights.safetensors", "tiny.safetensors"),
+        ("depth.png", "depth.png"),
+        ("bar.yaml", "bar.yaml"),
+    ):
         if not (folder / other).exists():
             TARGETS[name].write(folder / other)
     if not (folder / "cloud.npy").exists():

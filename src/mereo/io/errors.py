@@ -1,13 +1,14 @@
 """Errors of reading: whatever a parsing library raises becomes one sentence, and what else it says is not shown."""
 
 import ctypes
+import io
 import logging
 import os
 import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -64,23 +65,25 @@ def quiet() -> Iterator[None]:
 def captured_output() -> Iterator[list[str]]:
     """Keep what compiled libraries print in the block; its text is the list's only entry afterwards.
 
-    They write to the process's own streams, so this takes what other threads print at that moment too.
+    They write to Python's streams or to the process's, so this takes what other threads print at that moment too.
     """
     said: list[str] = []
+    text = io.StringIO()
     _flush()
     kept = [os.dup(stream) for stream in (1, 2)]
     with tempfile.TemporaryFile() as file:
         try:
             for stream in (1, 2):
                 os.dup2(file.fileno(), stream)
-            yield said
+            with redirect_stdout(text), redirect_stderr(text):
+                yield said
         finally:
             _flush()
             for stream, place in zip((1, 2), kept, strict=True):
                 os.dup2(place, stream)
                 os.close(place)
             file.seek(0)
-            said.append(file.read().decode("utf-8", errors="replace"))
+            said.append(text.getvalue() + file.read().decode("utf-8", errors="replace"))
 
 
 def _flush() -> None:

@@ -169,4 +169,6 @@ def _unpacked(path: Path, states: dict[str, np.ndarray], header: Header) -> Stat
         return unpack_model(states, header.states or {})
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         kind = "nothing is called " if isinstance(error, KeyError) else ""
-        raise ValueError(f"{path} has a statistical model that cannot be read ({kind}{reason(error)}); {CURE}") from None
+        raise ValueError(
+            f"{path} has a statistical model that cannot be read ({kind}{reason(error)}); {CURE}"
+        ) from None
