@@ -46,30 +46,37 @@ def cases(target: Target, folder: Path, seed: int, first: int = 0) -> Iterator[C
 
 
 def main() -> None:
+    """Try the targets one after the other; exit code 1 where any broke the rule."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("target", choices=TARGETS)
+    parser.add_argument("targets", nargs="+", choices=TARGETS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of the first input")
-    parser.add_argument("--count", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=float("inf"))
+    parser.add_argument("--count", type=int, default=1, help="inputs of each target")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="at most, of each target")
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()), help="where inputs with faults go")
     options = parser.parse_args()
-    end, counts, kinds = time.monotonic() + options.seconds, Counter[str](), set()
-    with tempfile.TemporaryDirectory() as folder:
-        for case in cases(TARGETS[options.target], Path(folder), options.seed, options.first):
+    kinds = sum(_try(name, options) for name in options.targets)
+    sys.exit(1 if kinds else 0)
+
+
+def _try(name: str, options: argparse.Namespace) -> int:
+    """Number of kinds of faults of one target, which are printed."""
+    end, counts, kinds = time.monotonic() + options.seconds, Counter[str](), set[str]()
+    with tempfile.TemporaryDirectory(dir=options.keep) as folder:  # it stays where a library ends the process
+        for case in cases(TARGETS[name], Path(folder), options.seed, options.first):
             counts["taken" if case.taken else "refused"] += 1
             if case.fault is not None:
                 counts["faults"] += 1
-            if case.fault is not None and case.fault.kind not in kinds:
+                if case.fault.kind not in kinds:
+                    kept = options.keep / f"{case.number}-{Path(name).name}"
+                    kept.write_bytes(case.content)
+                    found = {"kind": case.fault.kind, "text": case.fault.text, "number": case.number}
+                    print(json.dumps({"fault": name, **found, "kept": str(kept)}), flush=True)
                 kinds.add(case.fault.kind)
-                kept = options.keep / f"{case.number}-{Path(options.target).name}"
-                kept.write_bytes(case.content)
-                found = {"kind": case.fault.kind, "text": case.fault.text, "number": case.number, "kept": str(kept)}
-                print(json.dumps(found), flush=True)
-            if sum((counts["taken"], counts["refused"])) >= options.count or time.monotonic() > end:
+            if counts["taken"] + counts["refused"] >= options.count or time.monotonic() > end:
                 break
-    print(json.dumps({"target": options.target, **counts}), flush=True)
-    sys.exit(1 if kinds else 0)
+    print(json.dumps({"target": name, **counts}), flush=True)
+    return len(kinds)
 
 
 if __name__ == "__main__":
