@@ -119,11 +119,8 @@ def damaged(content: bytes, rng: Random) -> bytes:
 
 
 def _inside(content: bytes, rng: Random) -> bytes:
-    for start, change in INSIDES:
-        if content[: len(start)] == start:
-            break
-    else:
-        change = _safetensors if content[8:9] == b"{" else _json
+    otherwise = _safetensors if content[8:9] == b"{" else _json
+    change = next((change for start, change in INSIDES if content.startswith(start)), otherwise)
     try:
         return change(content, rng)
     except (ValueError, EOFError, OSError, zlib.error, struct.error, zipfile.BadZipFile, LookupError, RecursionError,

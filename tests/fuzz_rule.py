@@ -1,4 +1,4 @@
-"""The rule that every input is held to: it is taken, or refused with one sentence, soon, in little memory, and silently.
+"""The rule for every input: it is taken, or refused with one sentence, soon, in little memory, and silently.
 
 A refusal is an error that the command line knows as its user's (exit code 2), whose text is one line that names the
 file. Nothing is written. What else comes out is a fault of mereo.
@@ -23,7 +23,7 @@ from mereo.io.size_limits import LIMIT_VARIABLE
 MOST_SECONDS, MOST_GB = 20.0, 2.0
 MOST_CHARACTERS = 3000
 UNPACKED_GB = "0.2"
-"""Limit on what files may unpack to while the rule is checked: the default of 4 is a user's 2 GB more than the rule's."""
+"""Limit on what files may unpack to while the rule is checked; the default of 4 alone is more than the rule allows."""
 
 SILENT = (DeprecationWarning, PendingDeprecationWarning, ResourceWarning, ImportWarning)
 """Warnings that Python shows to nobody."""

@@ -144,7 +144,7 @@ ALL: tuple[Target, ...] = (
         lambda p: scene_file(p.with_name("bar.yaml")),
         lambda p: load_scene(p.with_name("bar.yaml")),
         folder=True,
-    ),  # fmt: skip
+    ),
     Target("weights.safetensors", weights, load_model),
     Target("manifest.json", dataset, lambda p: Dataset.load(p.parent), folder=True),
     Target("shard-00000.safetensors", dataset, lambda p: Dataset.load(p.parent), folder=True),
@@ -154,7 +154,7 @@ ALL: tuple[Target, ...] = (
         "checkpoint.safetensors",
         lambda p: save_checkpoint(p.parent, checkpoint()),
         lambda p: load_checkpoint(p.parent, checkpoint()),
-    ),  # fmt: skip
+    ),
     Target("state.json", state, read_registration),
     Target("start.json", start, lambda p: read_start(p, rest(), 1.0)),
     Target("view.npz", view, load_view),

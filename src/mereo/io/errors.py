@@ -5,7 +5,6 @@ import io
 import logging
 import os
 import sys
-import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -62,28 +61,25 @@ def quiet() -> Iterator[None]:
 
 
 @contextmanager
-def captured_output() -> Iterator[list[str]]:
-    """Keep what compiled libraries print in the block; its text is the list's only entry afterwards.
+def without_output() -> Iterator[None]:
+    """Drop what compiled libraries print in the block, to Python's streams or to the process's.
 
-    They write to Python's streams or to the process's, so this takes what other threads print at that moment too.
+    What other threads print at that moment is lost too.
     """
-    said: list[str] = []
-    text = io.StringIO()
     _flush()
     kept = [os.dup(stream) for stream in (1, 2)]
-    with tempfile.TemporaryFile() as file:
-        try:
-            for stream in (1, 2):
-                os.dup2(file.fileno(), stream)
-            with redirect_stdout(text), redirect_stderr(text):
-                yield said
-        finally:
-            _flush()
-            for stream, place in zip((1, 2), kept, strict=True):
-                os.dup2(place, stream)
-                os.close(place)
-            file.seek(0)
-            said.append(text.getvalue() + file.read().decode("utf-8", errors="replace"))
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in (1, 2):
+            os.dup2(nowhere, stream)
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            yield
+    finally:
+        _flush()
+        for stream, place in zip((1, 2), kept, strict=True):
+            os.dup2(place, stream)
+            os.close(place)
+        os.close(nowhere)
 
 
 def _flush() -> None:

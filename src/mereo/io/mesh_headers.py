@@ -69,7 +69,7 @@ def _check_gltf(path: Path) -> None:
 
 
 def _glb_text(content: bytes) -> bytes:
-    """First chunk of a GLB file, which is JSON; none may state more bytes than follow, for which trimesh asks at once."""
+    """First chunk of a GLB file, JSON; none may state more bytes than follow, for which trimesh asks at once."""
     at = 12
     while at + 8 <= len(content):
         length = int.from_bytes(content[at : at + 4], "little")

@@ -106,8 +106,8 @@ def _tetrahedral(path: Path, arrays: dict[str, np.ndarray]) -> TetrahedralRecord
         )
     if "rest_nodes" not in arrays or ("nodes" in arrays) == ("displacements" in arrays):
         raise ValueError(
-            f"{path} has the arrays {', '.join(map(repr, sorted(arrays)))}; tetrahedral states need rest_nodes, tetrahedra and "
-            "one of nodes or displacements: add or remove what differs"
+            f"{path} has the arrays {', '.join(map(repr, sorted(arrays)))}; tetrahedral states need rest_nodes, "
+            "tetrahedra and one of nodes or displacements: add or remove what differs"
         )
     rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(np.float64)
     key = "nodes" if "nodes" in arrays else "displacements"
@@ -147,8 +147,8 @@ def _floats(path: Path, key: str, array: np.ndarray, axes: int) -> np.ndarray:
 def _check_names(path: Path, found: set[str], names: tuple[str, ...]) -> None:
     if missing := [name for name in names if name not in found]:
         raise ValueError(
-            f"{path} has states of {', '.join(map(repr, sorted(found))) or 'nothing'} but not of segment {missing[0]!r}; every "
-            "segment needs its own: name each array or folder after its segment"
+            f"{path} has states of {', '.join(map(repr, sorted(found))) or 'nothing'} but not of segment "
+            f"{missing[0]!r}; every segment needs its own: name each array or folder after its segment"
         )
     if unknown := sorted(found - set(names)):
         raise ValueError(
