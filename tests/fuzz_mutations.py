@@ -141,8 +141,9 @@ def _zip(content: bytes, rng: Random) -> bytes:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
         for name, data in members:
-            if name not in archive.namelist():
-                archive.writestr(zipfile.ZipInfo(name), data)
+            entry = zipfile.ZipInfo(name)  # which ends names at a zero
+            if entry.filename not in archive.namelist():
+                archive.writestr(entry, data)
     return packed.getvalue()
 
 

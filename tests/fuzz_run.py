@@ -61,9 +61,10 @@ def main() -> None:
 
 def _try(name: str, options: argparse.Namespace) -> int:
     """Number of kinds of faults of one target, which are printed."""
-    end, counts, kinds = time.monotonic() + options.seconds, Counter[str](), set[str]()
+    end, counts, kinds = float("inf"), Counter[str](), set[str]()
     with tempfile.TemporaryDirectory(dir=options.keep) as folder:  # it stays where a library ends the process
         for case in cases(TARGETS[name], Path(folder), options.seed, options.first):
+            end = min(end, time.monotonic() + options.seconds)  # from the first on: it may import much
             counts["taken" if case.taken else "refused"] += 1
             if case.fault is not None:
                 counts["faults"] += 1
