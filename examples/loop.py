@@ -25,6 +25,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
+from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import reconstruct
 from mereo.scenes.draw_recorder import Recorder
@@ -283,15 +284,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Draw the path from a bending object to its segments as a loop.")
     parser.add_argument("--output", type=Path, default=Path("loop.webp"), help="the animated WebP to write")
     parser.add_argument("--fps", type=float, default=20.0, help="frames per second")
+    parser.add_argument("--force", action="store_true", help="replace the file where it exists")
     options = parser.parse_args()
+    try:
+        check_file_place(options.output, force=options.force)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
 
     loop = Loop()
     times = np.arange(round(SECONDS * options.fps)) / options.fps
     frames = [loop.frame(float(time)) for time in times]
     duration_ms = round(1000 / options.fps)
-    frames[0].save(
-        options.output, save_all=True, append_images=frames[1:], duration=duration_ms, loop=0, quality=72, method=6
-    )
+    with atomic_file(options.output, force=options.force) as partial:
+        frames[0].save(
+            partial,
+            "WEBP",
+            save_all=True,
+            append_images=frames[1:],
+            duration=duration_ms,
+            loop=0,
+            quality=72,
+            method=6,
+        )
     print(f"wrote {options.output}: {len(frames)} frames, {options.output.stat().st_size / 1e6:.2f} MB")
 
 

@@ -132,7 +132,8 @@ class StreamCommand:
         rate: frames per second at which a folder was recorded.
         every_frame: answer all frames, however long it takes, instead of the latest.
         watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
-        surfaces: folder for the surfaces of each answered frame, one GLB file each.
+        surfaces: folder for the surfaces of each answered frame, one GLB file each; one with content is refused.
+        force: write into a folder with content, and replace the files of the same names in it.
         reading: how a frame is read.
         isolation: what is left out of it.
         inference: where and how exactly the network computes.
@@ -145,6 +146,7 @@ class StreamCommand:
     every_frame: bool = False
     watch: bool = False
     surfaces: Path | None = None
+    force: bool = False
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
@@ -163,6 +165,7 @@ class StreamCommand:
             every_frame=self.every_frame,
             watch=self.watch,
             surfaces=self.surfaces,
+            force=self.force,
             reading=self.reading,
             isolation=self.isolation,
             inference=self.inference,

@@ -186,7 +186,8 @@ def _write(document: Document, mesh: SegmentedMesh, changed: set[str]) -> Path:
 
 def _ply(mesh: SegmentedMesh, name: str) -> bytes:
     segment = mesh.segments[mesh.names.index(name)]
-    content: bytes = trimesh.Trimesh(segment.vertices, segment.faces, process=False).export(file_type="ply")
+    content = trimesh.Trimesh(segment.vertices, segment.faces, process=False).export(file_type="ply")
+    assert isinstance(content, bytes)
     return content
 
 
