@@ -8,7 +8,6 @@ functions of ``os`` are wrapped, and an audit hook of Python's own counts the sa
 import io
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -115,9 +114,6 @@ def _run(asked: dict[str, Any], main: Callable[[list[str]], int], said: int, rep
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", closefd=False), write_through=True)
         sys.stderr = io.TextIOWrapper(os.fdopen(2, "wb", closefd=False), write_through=True)
         os.chdir(asked["folder"])
-        if asked["most_bytes"]:
-            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as Python does at its start
-            resource.setrlimit(resource.RLIMIT_FSIZE, (asked["most_bytes"], resource.RLIM_INFINITY))
         points = Failpoints(CALLS if asked["all"] else MOVES, asked["at"], asked["after"], report)
         code = main(asked["arguments"])
         if points.count != points.seen:
@@ -145,7 +141,6 @@ class Commands:
         at: int = -1,
         after: bool = False,
         every_call: bool = False,
-        most_bytes: int = 0,
     ) -> Ended:
         """Run a command in ``folder``, killed before (or after) call ``at`` of the moves, or of all calls."""
         asked = {
@@ -154,7 +149,6 @@ class Commands:
             "at": at,
             "after": after,
             "all": every_call,
-            "most_bytes": most_bytes,
         }
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.write(json.dumps(asked) + "\n")

@@ -7,11 +7,14 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from written_results import segments
 
 from mereo import __main__ as command_line
 from mereo.cli.stream import SurfaceFolder
+from mereo.io.output_folders import new_directory
+from mereo.io.writers.glb import write_segments_glb
 from mereo.reconstruction.stream import Outcome
 
 FRAMES = ("a.npy", "b.npy")
@@ -86,3 +89,35 @@ def test_an_example_replaces_no_file(name: str, tmp_path: Path) -> None:
     )
     assert done.returncode != 0 and "it is not overwritten" in done.stderr and "Traceback" not in done.stderr
     assert place.read_text() == "precious" and len(list(place.parent.iterdir())) == 1
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "align"])
+def test_the_meshes_of_a_scene_are_not_replaced(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not even where mereo wrote them: a result that a scene file names as its mesh."""
+    with new_directory(tmp_path / "out") as folder:
+        write_segments_glb(folder / "segments.glb", segments(), np.eye(3))
+    (tmp_path / "s.yaml").write_text("name: s\nunits: m\nmodel: out/segments.glb\n")
+    np.save(tmp_path / "cloud.npy", np.ones((300, 3)))
+    before = (tmp_path / "out" / "segments.glb").read_bytes()
+    more = ["--weights", "rope"]
+    arguments = [command, tmp_path / "cloud.npy", "--scene", tmp_path / "s.yaml", "--output", tmp_path / "out"]
+    assert command_line.main([*map(str, arguments), *more, "--force"]) == 2
+    said = capsys.readouterr().err
+    assert "segments.glb, which is read; it is not replaced: choose another --output" in said, said
+    assert (tmp_path / "out" / "segments.glb").read_bytes() == before
+
+
+def test_an_experiment_says_what_to_do_with_older_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Results that a version without lists of files has left; the folder of all the work is not the one to change."""
+    older = tmp_path / "results" / "noise-smoke"
+    older.mkdir(parents=True)
+    (older / "table.md").write_text("precious")
+    assert command_line.main(["experiment", "noise", "--output", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == (
+        f"mereo: error: {older} has no .mereo.json, so its content is not mereo's, or an earlier version's; it is not "
+        "replaced: move it away or delete it, and run the same command again, which keeps the datasets, runs and "
+        "scores and writes these results anew\n"
+    )
+    assert (older / "table.md").read_text() == "precious" and not (tmp_path / "datasets").exists()

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -73,6 +74,63 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", ["release over another", "scene export"])
 def test_a_killed_command_is_finished_by_the_next(name: str, commands: Commands, inputs: Path, tmp_path: Path) -> None:
     check_boundaries(commands, CASES[name], inputs, tmp_path, every_call=False)
+
+
+# --- a full disk ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 8 MB that is in memory."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = shutil.which("mount") and subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(place)], capture_output=True, text=True, check=False
+    )
+    if not mounted or mounted.returncode:
+        pytest.skip(f"no disk can be mounted here: {mounted.stderr.strip() if mounted else 'there is no mount'}")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def check_full_disk(commands: Commands, case: Case, inputs: Path, place: Path, room: int) -> None:
+    """With ``room`` bytes the command says that the disk is full and leaves nothing; with more it does its work."""
+    arguments = case.arguments.replace("INPUTS", str(inputs))
+    if case.first:
+        assert commands.run(place, case.first.replace("INPUTS", str(inputs))).code == 0
+    before = {path.name: path.read_bytes() for path in place.rglob("*") if path.is_file()}
+    with (place / "ballast").open("wb") as file:
+        file.write(bytes(os.statvfs(place).f_bavail * os.statvfs(place).f_frsize - room))
+    full = commands.run(place, arguments)
+    assert (full.code, full.said.count("mereo: error: ")) == (2, 1), full.said
+    assert "the disk is full while writing" in full.said or "MB free" in full.said, full.said
+    assert "Traceback" not in full.said
+    (place / "ballast").unlink()
+    if "--output out " not in f"{arguments} " or arguments.split()[0] not in ("train", "generate"):
+        assert {path.name: path.read_bytes() for path in place.rglob("*") if path.is_file()} == before
+    assert not list(place.rglob("*.partial"))
+    done = commands.run(place, arguments)
+    if done.code:
+        assert case.again and case.again in done.said, done.said
+        done = commands.run(place, f"{arguments} {case.again}")
+    assert done.code == 0, done.said
+    assert not list(place.rglob("*.partial"))
+
+
+@pytest.mark.parametrize("name", ["release over another", "scene export"])
+def test_a_full_disk_is_said_and_leaves_nothing(name: str, commands: Commands, inputs: Path, small_disk: Path) -> None:
+    check_full_disk(commands, CASES[name], inputs, small_disk, room=40_000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("room", [0, 8_192])
+def test_whatever_room_a_disk_has(name: str, room: int, commands: Commands, inputs: Path, small_disk: Path) -> None:
+    """No room at all, and some for folders, locks and the smallest files."""
+    check_full_disk(commands, CASES[name], inputs, small_disk, room)
+
+
+# --- every call -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
