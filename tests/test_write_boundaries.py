@@ -73,7 +73,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", ["release over another", "scene export"])
 def test_a_killed_command_is_finished_by_the_next(name: str, commands: Commands, inputs: Path, tmp_path: Path) -> None:
-    check_boundaries(commands, CASES[name], inputs, tmp_path, every_call=False)
+    check_boundaries(commands, CASES[name], inputs, tmp_path, every_call=False, step=2)
 
 
 # --- a full disk ------------------------------------------------------------------------------------------------------
@@ -81,11 +81,11 @@ def test_a_killed_command_is_finished_by_the_next(name: str, commands: Commands,
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 8 MB that is in memory."""
+    """A disk of 24 MB that is in memory."""
     place = tmp_path / "disk"
     place.mkdir()
     mounted = shutil.which("mount") and subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(place)], capture_output=True, text=True, check=False
+        ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(place)], capture_output=True, text=True, check=False
     )
     if not mounted or mounted.returncode:
         pytest.skip(f"no disk can be mounted here: {mounted.stderr.strip() if mounted else 'there is no mount'}")
@@ -102,12 +102,16 @@ def check_full_disk(commands: Commands, case: Case, inputs: Path, place: Path, r
     with (place / "ballast").open("wb") as file:
         file.write(bytes(os.statvfs(place).f_bavail * os.statvfs(place).f_frsize - room))
     full = commands.run(place, arguments)
+    if room and full.code == 0:  # a small file had room
+        return
     assert (full.code, full.said.count("mereo: error: ")) == (2, 1), full.said
     assert "the disk is full while writing" in full.said or "MB free" in full.said, full.said
     assert "Traceback" not in full.said
     (place / "ballast").unlink()
-    if "--output out " not in f"{arguments} " or arguments.split()[0] not in ("train", "generate"):
-        assert {path.name: path.read_bytes() for path in place.rglob("*") if path.is_file()} == before
+    after = {path.name: path.read_bytes() for path in place.rglob("*") if path.is_file()}
+    if arguments.startswith(("train", "generate", "scene check")):  # whole files stay, and the work is continued
+        after = {name: after[name] for name in before}
+    assert after == before
     assert not list(place.rglob("*.partial"))
     done = commands.run(place, arguments)
     if done.code:
