@@ -6,6 +6,7 @@ short of. Each check raises ``ValueError`` with its reason only, or ``SizeError`
 
 import json
 import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,17 @@ def _check_stl(path: Path) -> None:
         raise ValueError("it is truncated: it does not end in endsolid")
 
 
+XML_FACTOR = 22
+"""Bytes of memory for each byte of 3MF's XML, which lxml keeps as a tree (measured on vertices and triangles)."""
+
+
+def _check_3mf(path: Path) -> None:
+    check_archive(path)
+    with zipfile.ZipFile(path) as archive:
+        models = [member.file_size for member in archive.infolist() if member.filename.lower().endswith(".model")]
+    check_bytes(path, XML_FACTOR * sum(models))
+
+
 def _check_gltf(path: Path) -> None:
     if path.suffix.lower() == ".gltf":
         document = json.loads(path.read_text("utf-8"))
@@ -97,6 +109,6 @@ CHECKS: dict[str, Callable[[Path], None]] = {
     ".stl": _check_stl,
     ".glb": _check_gltf,
     ".gltf": _check_gltf,
-    ".3mf": check_archive,
+    ".3mf": _check_3mf,
 }
 """Check of each suffix; OBJ has no counts."""
