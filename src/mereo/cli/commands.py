@@ -191,7 +191,9 @@ class Evaluate:
             from mereo.models.weights import load_for
 
             if settings != GenerateConfig():
-                raise ValueError("--scans are real and take no simulated camera: leave out --sensor, --image-size and --noise-std")
+                raise ValueError(
+                    "--scans are real and take no simulated camera: leave out --sensor, --image-size and --noise-std"
+                )
             model = load_for(self.weights, self.inference)
             evaluate_on_scans(model, self.output, truths=self.scans, scene=self.scene, choice=self.fit)
             return
