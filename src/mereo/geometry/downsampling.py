@@ -11,7 +11,7 @@ SPACING_SAMPLE = 1000
 """Points whose nearest neighbour is looked up for the spacing; its median is then good to a few percent."""
 
 STEEPEST = 4.0
-"""Gap in range, in widths of a cell there, between two surfaces along the same lines of sight: one seen at 76 degrees."""
+"""Gap in range, in widths of a cell there, from which on there are two surfaces: one would be seen at 76 degrees."""
 
 SMALLEST_EXTENT = 1e-6
 """Extent across lines of sight, as a slope, that counts as none: a tenth of a millimetre in a hundred metres."""
@@ -58,6 +58,7 @@ def means_along_sight(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.
 
     Args:
         points: seen from the origin (camera frame), any unit, within 90 degrees of their middle.
+        limit: number of points, and about that of the cells.
     """
     if len(points) <= limit:
         return points
