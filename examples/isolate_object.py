@@ -20,6 +20,7 @@ from jaxtyping import Float
 from mereo.evaluation.scans import scan_in_camera
 from mereo.evaluation.scoring import grid_scores
 from mereo.geometry.camera import PointCloud
+from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
@@ -54,7 +55,7 @@ def _pixels(points: Float[np.ndarray, "n 3"]) -> np.ndarray:
     return np.floor(500 * points[:, :2] / points[:, 2:]).astype(int)
 
 
-def crowded_bunny(output: Path) -> None:
+def crowded_bunny(output: Path, force: bool) -> None:
     """Print and draw the scan alone, crowded and isolated."""
     scan, truth, _ = scan_in_camera(SCAN)
     crowded = PointCloud(crowd(scan.points, np.random.default_rng(0)))
@@ -67,10 +68,10 @@ def crowded_bunny(output: Path) -> None:
     for name, cloud in (("alone", scan), ("crowded", crowded), ("isolated", isolated)):
         scores = grid_scores(model, cloud, truth, cells=64)
         print(f"{name:<9} {len(cloud):>7} points  IoU {scores.iou:.3f}  mIoU {scores.miou:.3f}")
-    draw(output, {"crowded": crowded, "isolated": isolated})
+    draw(output, {"crowded": crowded, "isolated": isolated}, force)
 
 
-def draw(path: Path, clouds: dict[str, PointCloud]) -> None:
+def draw(path: Path, clouds: dict[str, PointCloud], force: bool) -> None:
     """Each cloud as the camera sees it and from its right."""
     pictures, captions = [], []
     for name, cloud in clouds.items():
@@ -79,7 +80,8 @@ def draw(path: Path, clouds: dict[str, PointCloud]) -> None:
             view = Viewpoint.along(bounds, direction, (0.0, -1.0, 0.0))
             pictures.append(cloud_picture(cloud.points, view, (420, 420)))
             captions.append(f"{name}, {side}")
-    save_png(path, contact_sheet(pictures, captions, 4))
+    with atomic_file(path, force=force) as partial:
+        save_png(partial, contact_sheet(pictures, captions, 4))
     print(f"wrote {path}")
 
 
@@ -88,18 +90,20 @@ def main(
     reading: Annotated[InputConfig, tyro.conf.arg(name="")] = InputConfig(),  # noqa: B008 (frozen)
     isolation: Annotated[IsolationConfig, tyro.conf.arg(name="")] = IsolationConfig(),  # noqa: B008
     output: Path = Path("out/isolated.png"),
+    force: bool = False,
 ) -> None:
-    if input is None:
-        crowded_bunny(output)
-        return
     try:
+        check_file_place(output, force=force, inputs=[] if input is None else [input])
+        if input is None:
+            crowded_bunny(output, force)
+            return
         found = find_object(read_frame(input, reading), isolation)
         whole = read_frame(input, replace(reading, mask=None))
     except (OSError, ValueError) as error:
         raise SystemExit(f"error: {error}") from None
     likely = readings(found.cloud, found.frame.axes, isolation.keep_all)[0]
     print(found.read_as(likely))
-    draw(output, {"everything": whole.cloud, "the object": likely.cloud})
+    draw(output, {"everything": whole.cloud, "the object": likely.cloud}, force)
 
 
 if __name__ == "__main__":

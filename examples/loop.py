@@ -25,6 +25,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
+from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import reconstruct
 from mereo.scenes.draw_recorder import Recorder
@@ -35,13 +36,11 @@ from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
 from mereo.visualization.contact_sheets import INK, Picture, depth_to_rgb, fit_font, font
 from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
 
-SCENE, SEED = "bunny", 1_000_007
-NOISE_STD = 0.1
-"""The sensor's noise in scene units, the paper's."""
+SCENE, SEED, NOISE_STD = "bunny", 1_000_007, 0.1
+"""The last is the sensor's noise in scene units, the paper's."""
 
-SECONDS = 9.0
-STILL, FILL, MOVE = 2.8, 4.9, 6.3
-"""When the object comes to rest, when the segments begin to fill the cloud, when it moves on."""
+SECONDS, STILL, FILL, MOVE = 9.0, 2.8, 4.9, 6.3
+"""Its length, and when the object comes to rest, when the segments begin to fill the cloud, when it moves on."""
 
 FADE, BLINK = 0.7, 0.3
 """Seconds in which the segments become the first cloud again, and in which one caption becomes the next."""
@@ -49,9 +48,8 @@ FADE, BLINK = 0.7, 0.3
 REST = 0.33
 """Where on the circle of states the object rests."""
 
-RESOLUTION = 112
-SENSOR_PIXELS, VIEW_UNITS, DISTANCE = 100, 37.0, 120.0
-"""Of the camera: pixels and scene units across its picture, and its distance from ``MIDDLE``."""
+RESOLUTION, SENSOR_PIXELS, VIEW_UNITS, DISTANCE = 112, 100, 37.0, 120.0
+"""Of the answers, and of the camera: pixels and scene units across its picture, and its distance from ``MIDDLE``."""
 
 MIDDLE, UP = np.array([-1.5, -0.3, 0.0]), np.array([0.0, 1.0, 0.0])
 AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(-15.0), np.deg2rad(15.0)
@@ -283,15 +281,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Draw the path from a bending object to its segments as a loop.")
     parser.add_argument("--output", type=Path, default=Path("loop.webp"), help="the animated WebP to write")
     parser.add_argument("--fps", type=float, default=20.0, help="frames per second")
+    parser.add_argument("--force", action="store_true", help="replace the file where it exists")
     options = parser.parse_args()
-
+    try:
+        check_file_place(options.output, force=options.force)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
     loop = Loop()
-    times = np.arange(round(SECONDS * options.fps)) / options.fps
-    frames = [loop.frame(float(time)) for time in times]
-    duration_ms = round(1000 / options.fps)
-    frames[0].save(
-        options.output, save_all=True, append_images=frames[1:], duration=duration_ms, loop=0, quality=72, method=6
-    )
+    frames = [loop.frame(number / options.fps) for number in range(round(SECONDS * options.fps))]
+    with atomic_file(options.output, force=options.force) as partial:
+        ms = round(1000 / options.fps)
+        frames[0].save(partial, "WEBP", save_all=True, append_images=frames[1:], duration=ms, quality=72, method=6)
     print(f"wrote {options.output}: {len(frames)} frames, {options.output.stat().st_size / 1e6:.2f} MB")
 
 

@@ -10,18 +10,25 @@ from pathlib import Path
 
 import mereo
 from mereo.evaluation.sample_views import load_view
+from mereo.io.output_folders import check_new_directory
 
 
-def main(cloud_path: str | None = None, output: str = "out/example", weights: str = "bunny") -> None:
+def main(
+    cloud_path: str | None = None, output: str = "out/example", weights: str = "bunny", *, force: bool = False
+) -> None:
+    try:
+        check_new_directory(Path(output), force, [] if cloud_path is None else [cloud_path])
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"error: {error}") from None
     cloud = mereo.read_point_cloud(cloud_path) if cloud_path else load_view("bunny").depth.to_points()
     model = mereo.load_model(weights)
     result = mereo.reconstruct(cloud, model, resolution=64)
     for segment in result.segments:
         x, y, z = segment.centroid
         print(f"{segment.name:<12} at ({x:.3f}, {y:.3f}, {z:.3f})  confidence {segment.confidence:.2f}")
-    mereo.write_reconstruction(result, cloud, output, force=True)
+    mereo.write_reconstruction(result, cloud, output, force=force)
     print(f"wrote {output}; open {Path(output) / 'report.html'}")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:3])
+    main(*[word for word in sys.argv[1:] if word != "--force"][:2], force="--force" in sys.argv)

@@ -15,6 +15,7 @@ import numpy as np
 
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.solids import Solids
+from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.clutter import OBJECT, OCCLUDER
@@ -57,7 +58,12 @@ def main() -> None:
     parser.add_argument("--scene", default="robot")
     parser.add_argument("--output", type=Path, default=Path("sensors.png"), help="the PNG to write")
     parser.add_argument("--seed", type=int, default=6)
+    parser.add_argument("--force", action="store_true", help="replace the file where it exists")
     options = parser.parse_args()
+    try:
+        check_file_place(options.output, force=options.force)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
 
     view = sample_view(load_scene(options.scene), GenerateConfig(noise_std=0.0), example_rng(options.seed, 0))
     solids, camera = Solids(view.mesh), view.depth.camera
@@ -68,7 +74,8 @@ def main() -> None:
         pictures.append(draw(seen, (float(near), float(far)), 4 * 64))
         stray = int(seen.image.valid.sum()) - seen.object_points
         captions.append(f"{name}: {seen.object_points} pixels" + (f" + {stray}" if stray else ""))
-    save_png(options.output, contact_sheet(pictures, captions, 4, f"{options.scene}: one view, many sensors"))
+    with atomic_file(options.output, force=options.force) as partial:
+        save_png(partial, contact_sheet(pictures, captions, 4, f"{options.scene}: one view, many sensors"))
     print(f"wrote {options.output}")
 
 

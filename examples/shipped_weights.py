@@ -11,6 +11,7 @@ from pathlib import Path
 
 from mereo.evaluation.results import EvaluatedView
 from mereo.evaluation.scoring import evaluate
+from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model, shipped_names
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.seeds import TEST_SEED_START
@@ -29,7 +30,12 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("objects.png"), help="the PNG to write")
     parser.add_argument("--weights", nargs="*", default=shipped_names(), help="names of shipped weights; default all")
     parser.add_argument("--cells", type=int, default=100, help="grid cells along each axis")
+    parser.add_argument("--force", action="store_true", help="replace the file where it exists")
     options = parser.parse_args()
+    try:
+        check_file_place(options.output, force=options.force)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
 
     views: list[EvaluatedView] = []
     for name in options.weights:
@@ -37,7 +43,8 @@ def main() -> None:
             views.append(first_view(name, options.cells))
         except AssetUnavailable as error:
             print(f"{name} is left out: {error}")
-    error_picture(options.output, views)
+    with atomic_file(options.output, force=options.force) as partial:
+        error_picture(partial, views)
     print(f"wrote {options.output}")
 
 

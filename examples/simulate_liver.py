@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 
 from mereo.deformation.tetrahedral import Tetrahedra
 from mereo.geometry.solids import Solids
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.scenes import assets
 from mereo.scenes.registry import load_scene
 
@@ -182,7 +182,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("liver_states.npz"), help="the NPZ to write")
+    parser.add_argument("--force", action="store_true", help="replace the file where it exists")
     options = parser.parse_args(arguments)
+    try:
+        check_file_place(options.output, force=options.force)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
     tets = lattice_around_organs() if options.organs else read_vtk(assets.get("liver/lapgym_liver_volumetric.vtk"))
     mesh = Tetrahedra(*tets)
     try:
@@ -196,7 +201,7 @@ def main(arguments: list[str] | None = None) -> None:
         largest = np.linalg.norm(displacements[frame].astype(np.float64), axis=1).max()
         each = (time.monotonic() - start) / (frame + 1)
         print(f"state {frame}: up to {largest:.1f} mm, {each:.2f} s each", flush=True)
-    with atomic_file(options.output) as partial:
+    with atomic_file(options.output, force=options.force) as partial:
         np.savez_compressed(
             partial,
             rest_nodes=mesh.nodes.astype(np.float32),

@@ -110,15 +110,15 @@ def test_evaluation_looks_through_the_sensor_and_says_so(tmp_path: Path, monkeyp
 
     encode = Model.encode
     monkeypatch.setattr(Model, "encode", watch)
-    for number, settings in enumerate((None, GenerateConfig(noise_std=0.5, sensor=SENSORS["structured-light"]))):
+    for number, settings in enumerate((None, GenerateConfig(128, 0.5, sensor=SENSORS["structured-light"]))):
         evaluate_weights("rope", tmp_path / str(number), examples=1, cells=12, settings=settings, choice="off")
     facts = [json.loads((tmp_path / str(number) / "metrics.json").read_text()) for number in range(2)]
-    assert [fact["noise_std"] for fact in facts] == [0.1, 0.5]
+    assert [(fact["image_size"], fact["noise_std"]) for fact in facts] == [(96, 0.1), (128, 0.5)]
     assert [SensorConfig(**fact["sensor"]) for fact in facts] == [SENSORS["paper"], SENSORS["structured-light"]]
     assert len(clouds) == 2 and not np.array_equal(clouds[0].points[:20], clouds[1].points[:20])
 
 
 def test_real_scans_take_no_simulated_errors() -> None:
     arguments = ["evaluate", "bunny", "--output", "out", "--scans", "--sensor", "time-of-flight"]
-    with pytest.raises(ValueError, match="--scans are real and take no simulated errors: leave out --sensor and"):
+    with pytest.raises(ValueError, match="--scans are real and take no simulated camera: leave out --sensor, --image"):
         command_line.parse(arguments).run()

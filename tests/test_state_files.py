@@ -148,7 +148,7 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, np.ndarray]], str]] = {
     "vertex count": (lambda: surfaces(left=moved_vertices()["left"][:, 1:]), "97 vertices .* 98 .*'left.rest'"),
     "order": (lambda: surfaces(left=shuffled()), "seem to be in another order or unit"),
     "inside out": (lambda: surfaces(left=inside_out()), "frame 4 turns 'left' inside out"),
-    "missing": (lambda: {"left": moved_vertices()["left"]}, "states of left but not of segment 'right'"),
+    "missing": (lambda: {"left": moved_vertices()["left"]}, "states of 'left' but not of segment 'right'"),
     "stranger": (lambda: surfaces(middle=np.zeros((10, 4, 3))), "'middle', which is no segment"),
     "other rest": (lambda: surfaces(**{"left.rest": 2 * boxes().segments[0].vertices}), "miss a vertex of its mesh by"),
     "rest count": (lambda: surfaces(**{"left.rest": np.zeros((5, 3))}), "5 rest positions of 'left' but 98"),

@@ -78,9 +78,70 @@ def test_a_refusal_says_which_address_to_open() -> None:
 
 def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     @contextlib.contextmanager
-    def unused() -> Iterator[list[str]]:
+    def unused(_: object) -> Iterator[list[str]]:
         yield []
 
     monkeypatch.setattr(display, "guarded_servers", unused)
     with pytest.raises(ImportError, match="starts its server in a way that mereo cannot guard"):
         display.start_server(0, "mereo")
+
+
+# --- bound to another address -----------------------------------------------------------------------------------------
+
+OTHER = "127.0.0.2"
+"""An address that is not this machine's usual own, as one of a network would be, and that nobody else reaches."""
+
+
+@pytest.fixture(scope="module")
+def open_port() -> Iterator[tuple[int, guard.Entry]]:
+    entry = guard.Entry.of(OTHER)
+    try:
+        started = display.start_server(0, "mereo", entry)
+    except OSError as error:
+        pytest.skip(f"this system has no {OTHER}: {error}")
+    yield started.get_port(), entry
+    display.stop_server(started)
+
+
+def page_of(port: int, path: str, **headers: str) -> tuple[int, str]:
+    """Status of a page of the other address, and the cookie that comes with it."""
+    with contextlib.closing(http.client.HTTPConnection(OTHER, port, timeout=20)) as line:
+        line.request("GET", path, headers=headers)
+        answer = line.getresponse()
+        return answer.status, answer.getheader("Set-Cookie") or ""
+
+
+def socket_of(port: int, **headers: str) -> bytes:
+    with connect(
+        f"ws://{OTHER}:{port}", origin=f"http://{OTHER}:{port}", additional_headers=headers,
+        subprotocols=[f"viser-v{viser.__version__}"],
+    ) as page:  # fmt: skip
+        return bytes(page.recv(timeout=20))
+
+
+def test_another_address_needs_the_token_that_is_printed(open_port: tuple[int, guard.Entry]) -> None:
+    port, entry = open_port
+    assert len(entry.token) == 32 and entry.address(port) == f"http://{OTHER}:{port}/?token={entry.token}"
+    assert [page_of(port, path)[0] for path in ("/", "/?token=", "/?token=wrong", "/?token=%ff")] == [403] * 4
+    status, cookie = page_of(port, f"/?token={entry.token}")
+    assert status == 200 and cookie.endswith("; Path=/; HttpOnly; SameSite=Strict")
+    kept = cookie.partition(";")[0]
+    assert page_of(port, "/", Cookie=kept) == (200, "")
+    assert page_of(port, "/", Cookie=kept, Origin="http://evil.example")[0] == 403
+    assert page_of(port, "/", Cookie=f"mereo_{port}=wrong")[0] == 403
+    assert socket_of(port, Cookie=kept)
+    for headers in ({}, {"Cookie": f"mereo_{port}=wrong"}, {"Cookie": f"mereo_1={entry.token}"}):
+        with pytest.raises(InvalidStatus, match="403"):
+            socket_of(port, **headers)
+
+
+def test_tokens_are_random_and_this_machine_needs_none() -> None:
+    assert guard.Entry.of("0.0.0.0").token != guard.Entry.of("0.0.0.0").token
+    assert all(not guard.Entry.of(host).token for host in ("127.0.0.1", "localhost", "::1"))
+    assert guard.Entry("::1").address(80) == "http://[::1]:80"
+
+
+@pytest.mark.parametrize("host, reason", [("192.0.2.1", "no address of this machine"), ("no.such.invalid", "no name")])
+def test_a_host_that_is_not_here_is_refused(host: str, reason: str) -> None:
+    with pytest.raises(OSError, match=f"{reason}.*; choose another --host"):
+        display.start_server(0, "mereo", guard.Entry.of(host))

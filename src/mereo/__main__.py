@@ -81,11 +81,17 @@ def one_line(error: Exception) -> str:
         reason = error.strerror[0].lower() + error.strerror[1:]
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{reason}: correct that and run the same command again"
-    return " ".join(str(error).split()) or type(error).__name__
+    return _printed(str(error)) or type(error).__name__
+
+
+def _printed(text: str) -> str:
+    """Text in one line, with what a terminal would obey (files may have it in names) as Python spells it."""
+    line = " ".join(text.split())
+    return line if line.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:
-    return f"mereo: warning: {' '.join(str(message).split())}\n"
+    return f"mereo: warning: {_printed(str(message))}\n"
 
 
 def _stop(message: str, code: int) -> int:

@@ -18,7 +18,7 @@ from mereo.io.output_folders import new_directory
 from mereo.io.readers import read_point_cloud
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.weights import load_model
-from mereo.scenes.registry import is_yaml, load_scene
+from mereo.scenes.registry import files_of, is_yaml, load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.visualization.contact_sheets import save_png
 from mereo.visualization.scan_overlay import overlay
@@ -55,7 +55,7 @@ def align_file(
             "NAME (docs/own-object.md says how to make a start file)"
         )
     load_icp()  # its absence is better said before the work
-    read = [path for path in (scan.path, scene, start, weights) if path is not None]
+    read = [path for path in (scan.path, *files_of(scene), start, weights) if path is not None]
     with new_directory(output, force, read) as directory:
         loaded = load_scene(scene)
         cloud = read_point_cloud(scan.path, scan.drop_invalid)

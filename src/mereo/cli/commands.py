@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from mereo.fitting.config import FitChoice
-from mereo.io.bounds import Cells, Count, CountOrNone, NotNegative, Workers
+from mereo.io.bounds import Cells, Count, CountOrNone, ImageSize, NotNegative, Workers
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -161,6 +161,7 @@ class Evaluate:
         scans: score real scans instead of rendered views: truth files, or their folders, of `mereo align`; without
             any, the four range scans of the bunny, whose poses are known.
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
+        image_size: the depth image is square, in pixels; 96 is the paper's, a depth camera gives the object 200 to 400.
         noise_std: Gaussian noise on the depth, standard deviation in scene units.
         terms: what else is wrong with the depth image.
         inference: where and how exactly the network computes.
@@ -175,6 +176,7 @@ class Evaluate:
     scene: str | None = None
     scans: tuple[Path, ...] | None = None
     sensor: Sensor = "paper"
+    image_size: ImageSize = 96
     noise_std: NotNegative = 0.1
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
@@ -184,12 +186,14 @@ class Evaluate:
         """Write scores and pictures of their errors, and print the table."""
         from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
 
-        settings = GenerateConfig(noise_std=self.noise_std, sensor=self.terms)
+        settings = GenerateConfig(image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms)
         if self.scans is not None:
             from mereo.models.weights import load_for
 
             if settings != GenerateConfig():
-                raise ValueError("--scans are real and take no simulated errors: leave out --sensor and --noise-std")
+                raise ValueError(
+                    "--scans are real and take no simulated camera: leave out --sensor, --image-size and --noise-std"
+                )
             model = load_for(self.weights, self.inference)
             evaluate_on_scans(model, self.output, truths=self.scans, scene=self.scene, choice=self.fit)
             return

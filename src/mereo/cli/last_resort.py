@@ -40,6 +40,7 @@ def sentence(error: Exception, arguments: list[str], variable: str) -> str:
         variable: of the environment, by which the traceback is shown.
     """
     text = " ".join(str(error).split())
+    text = text if text.isprintable() else ascii(text)[1:-1]
     text = text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
     what = f"{type(error).__name__}: {text}" if text else type(error).__name__
     where = f"{_command(arguments)}: {what}"

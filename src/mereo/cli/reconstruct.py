@@ -24,6 +24,7 @@ from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
 from mereo.reconstruction.pipeline import Reconstruction
+from mereo.scenes.registry import files_of
 from mereo.visualization.result_files import write_files
 
 
@@ -69,7 +70,8 @@ def reconstruct_file(
         raise ValueError(f"--carry-frame is {carry_frame!r} and nothing is carried: name a file with --carry")
     if attachments and choice == "off":
         raise ValueError("--fit is off, but --carry needs a registration, along which things move: use --fit auto")
-    read = [path for path in (input, weights, scene, reading.intrinsics, reading.mask, *carry) if path is not None]
+    named = () if scene is None else files_of(scene)
+    read = [path for path in (input, weights, *named, reading.intrinsics, reading.mask, *carry) if path is not None]
     with new_directory(output, force, read) as directory:
         frame = read_frame(input, reading)
         seen = find_object(frame, isolation)

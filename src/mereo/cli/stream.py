@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from mereo.geometry.conventions import CloudAxes
-from mereo.io.atomic_files import to_json
+from mereo.io.atomic_files import atomic_file, to_json
 from mereo.io.config import InputConfig
-from mereo.io.scratch_folders import check_place
+from mereo.io.scratch_folders import check_place, remove_all_abandoned
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
@@ -31,16 +31,19 @@ def stream_reconstructions(
     every_frame: bool = False,
     watch: bool = False,
     surfaces: Path | None = None,
+    force: bool = False,
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
     inference: InferenceConfig | None = None,
 ) -> Summary:
     """Print a line of JSON for each answered or bad frame, and the summary at the end or after Ctrl-C.
 
-    Raises ``ValueError`` where not one frame could be answered, and what broke the sequence off, where something did.
+    ``surfaces`` is a folder without content, or with ``force`` one in which files of the same name are replaced.
+
+    Raises ``ValueError`` where not one frame could be answered, and what broke the sequence off, where something did;
+    ``FileExistsError`` for a folder of surfaces with content, without ``force``.
     """
-    if surfaces is not None:
-        check_place(surfaces, may_be_link=True)
+    folder = None if surfaces is None else SurfaceFolder(surfaces, force)
     reading, isolation = reading or InputConfig(), isolation or IsolationConfig()
     model = load_for(weights, inference or InferenceConfig())
     frames: Iterable[StreamFrame | None] = (
@@ -54,7 +57,7 @@ def stream_reconstructions(
     broken_off: Exception | None = None
     try:
         for answered in outcomes:
-            outcome = answered if surfaces is None else written(answered, surfaces, reading.frame)
+            outcome = answered if folder is None else folder.written(answered, reading.frame)
             counter.add(outcome)
             last_error = outcome.error or last_error
             print(json.dumps(to_json(line(outcome))), flush=True)
@@ -73,16 +76,45 @@ def stream_reconstructions(
     return summary
 
 
-def written(outcome: Outcome[Reconstruction], folder: Path, axes: CloudAxes) -> Outcome[Reconstruction]:
-    """Write the surfaces of an answered frame; where that fails, the outcome is a failed one."""
-    if outcome.result is None:
+class SurfaceFolder:
+    """Folder for the surfaces of answered frames, one file each; what is in it is kept, unless ``force`` is given.
+
+    Attributes:
+        path: of the folder; it is made when the first surfaces are written.
+        force: replace files that are there; nothing else in the folder is touched.
+    """
+
+    def __init__(self, path: Path, force: bool) -> None:
+        self.path, self.force = path, force
+        self._frames: dict[str, str] = {}
+        check_place(path, may_be_link=True)
+        if path.exists() and not path.is_dir():
+            raise FileExistsError(f"{path} is a file; surfaces are written into a folder: choose another --surfaces")
+        remove_all_abandoned(path)
+        if path.is_dir() and any(path.iterdir()) and not force:
+            raise FileExistsError(
+                f"{path} exists and is not empty; nothing in it is overwritten: choose another --surfaces or pass "
+                "--force, which replaces the files of the same names"
+            )
+
+    def written(self, outcome: Outcome[Reconstruction], axes: CloudAxes) -> Outcome[Reconstruction]:
+        """Write the surfaces of an answered frame; where that fails, the outcome is a failed one.
+
+        A frame that comes again replaces its own file; two frames never share one.
+        """
+        if outcome.result is None:
+            return outcome
+        name = re.sub(r"[^\w.-]+", "_", outcome.name)
+        try:
+            owner = self._frames.get(name)
+            if owner not in (None, outcome.name):
+                raise FileExistsError(f"{self.path / name}.glb holds the surfaces of {owner}: rename {outcome.name}")
+            with atomic_file(self.path / f"{name}.glb", force=self.force or owner is not None) as partial:
+                write_segments_glb(partial, outcome.result.surfaces, viewer_rotation(axes))
+            self._frames[name] = outcome.name
+        except Exception as problem:
+            return replace(outcome, result=None, error=sentence(problem, outcome.name))
         return outcome
-    name = re.sub(r"[^\w.-]+", "_", outcome.name)
-    try:
-        write_segments_glb(folder / f"{name}.glb", outcome.result.surfaces, viewer_rotation(axes))
-    except Exception as problem:
-        return replace(outcome, result=None, error=sentence(problem, outcome.name))
-    return outcome
 
 
 def line(outcome: Outcome[Reconstruction]) -> dict[str, Any]:

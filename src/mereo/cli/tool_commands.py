@@ -79,7 +79,9 @@ class ViewCommand:
         weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
         scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
         state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
-        port: where the page is, on this machine only (127.0.0.1); 0 takes any that is free.
+        port: where the page is; 0 takes any that is free.
+        host: address of this machine that the page is at. Only this machine reaches the default. Another one needs the
+            token of the address that is printed, and others on the network can read along: ssh -L is safer.
         resolution: grid cells along the longest side.
         reading: how the frame is read.
         isolation: what of the frame is left out.
@@ -91,6 +93,7 @@ class ViewCommand:
     scene: str | None = None
     state: Path | None = None
     port: Port = 8080
+    host: str = "127.0.0.1"
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
@@ -105,13 +108,14 @@ class ViewCommand:
         if self.scene is not None:
             if input is not None:
                 raise ValueError(f"both {input} and --scene {self.scene} are given; one can be shown: drop one")
-            view_scene(self.scene, self.weights, state=state, port=self.port, inference=self.inference)
+            view_scene(self.scene, self.weights, state=state, port=self.port, host=self.host, inference=self.inference)
             return
         show = partial(view_frame, resolution=self.resolution) if state is None else partial(view_state, state)
         show(
             input,
             self.weights,
             port=self.port,
+            host=self.host,
             reading=self.reading,
             isolation=self.isolation,
             inference=self.inference,
@@ -132,7 +136,8 @@ class StreamCommand:
         rate: frames per second at which a folder was recorded.
         every_frame: answer all frames, however long it takes, instead of the latest.
         watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
-        surfaces: folder for the surfaces of each answered frame, one GLB file each.
+        surfaces: folder for the surfaces of each answered frame, one GLB file each; one with content is refused.
+        force: write into a folder with content, and replace the files of the same names in it.
         reading: how a frame is read.
         isolation: what is left out of it.
         inference: where and how exactly the network computes.
@@ -145,6 +150,7 @@ class StreamCommand:
     every_frame: bool = False
     watch: bool = False
     surfaces: Path | None = None
+    force: bool = False
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
@@ -163,6 +169,7 @@ class StreamCommand:
             every_frame=self.every_frame,
             watch=self.watch,
             surfaces=self.surfaces,
+            force=self.force,
             reading=self.reading,
             isolation=self.isolation,
             inference=self.inference,

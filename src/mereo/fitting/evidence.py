@@ -14,10 +14,10 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.geometry.downsampling import random_subset
+from mereo.geometry.downsampling import means_along_sight
 
 MOST_POINTS = 6000
-"""Denser clouds are thinned."""
+"""Denser clouds are averaged to so many points, which have less noise."""
 
 PARTNERS = 500
 """Observed points, evenly spread, that are compared with the model's surface."""
@@ -65,7 +65,7 @@ class Evidence:
         Along those of ``doubtful`` points, which a front end has taken for strays, anything may be: they are within
         the silhouette, and rule nothing out.
         """
-        points = random_subset(points, MOST_POINTS)
+        points = means_along_sight(points, MOST_POINTS)
         ranges = np.linalg.norm(points, axis=1)
         sight = cKDTree(points / ranges[:, None])
         angle, near = sight.query(sight.data, k=range(1, min(AROUND, len(points)) + 1))

@@ -71,8 +71,7 @@ class ModesFit:
     ) -> "ModesFit":
         """Fit of the modes to a cloud, seen from the origin, with correspondences in its unit.
 
-        ``doubtful`` points are none of the cloud: along their lines of sight nothing is known (``Evidence.of``). Where
-        what the fit leaves over shows a noisy frame, it is fitted again as such.
+        ``doubtful`` points are none of the cloud: along their lines of sight nothing is known (``Evidence.of``).
         """
         started = time.perf_counter()
         unit = estimate_unit(found) if scene_unit is None else scene_unit
@@ -81,10 +80,7 @@ class ModesFit:
         with threadpool_limits(1, "blas"):  # products this small are slower on two threads, 20 times on busy cores
             evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit)
             problem = Problem.of(model, found, evidence, scale_std, config)
-            modes = fit_modes(problem)
-            noisy = problem.as_noisy_as(modes.posed)
-            if noisy is not None:
-                problem, modes = noisy, fit_modes(noisy)
+            problem, modes = fit_as_noisy(problem)
             rest = fit_rest(problem, found, modes.posed)
             at_rest = is_at_rest(problem, modes, rest)
         return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
@@ -153,6 +149,19 @@ class ModesFit:
             seconds=seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
         )
+
+
+def fit_as_noisy(problem: Problem) -> tuple[Problem, Judged]:
+    """Fit of the modes, once more as to a noisy frame where what it leaves over is rough and the second fit is right.
+
+    Whether a fit is right is asked of the second: noise throws the first off by more than it is itself.
+    """
+    first = fit_modes(problem)
+    noisy = problem.as_noisy_as(first.posed)
+    if noisy is None:
+        return problem, first
+    again = fit_modes(noisy)
+    return (noisy, again) if noisy.leaves_noise(again.posed) else (problem, first)
 
 
 def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:

@@ -98,17 +98,21 @@ class Problem:
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
         return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
 
-    def as_noisy_as(self, posed: Posed) -> "Problem | None":
-        """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that.
+    def offsets(self, posed: Posed) -> Float[np.ndarray, " n"]:
+        """Signed distance of each observed point from the facing surface of a state, negative behind it."""
+        return Surface.of(self.model, posed).offsets(self.evidence.points)
 
-        None as well where what is left over is the fit's own error.
-        """
-        offset = Surface.of(self.model, posed).offsets(self.evidence.points)
-        noise = noise_of(offset, self.evidence.around)
-        config = constants_for(noise, self.config)
-        if config is self.config or not is_noise(offset, noise):
+    def as_noisy_as(self, posed: Posed) -> "Problem | None":
+        """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that."""
+        config = constants_for(noise_of(self.offsets(posed), self.evidence.around), self.config)
+        if config is self.config:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_partners)
+
+    def leaves_noise(self, posed: Posed) -> bool:
+        """Whether what a fit leaves over is noise, and not its own error."""
+        offset = self.offsets(posed)
+        return is_noise(offset, noise_of(offset, self.evidence.around))
 
     @cached_property
     def samples(self) -> SampledSurface:

@@ -127,7 +127,11 @@ def load_state(path: str | Path, model: StatisticalModel, scene: Scene | None = 
 
     Raises as ``read_state`` and ``restored`` do.
     """
-    return restored(read_state(path), model, scene)
+    state = read_state(path)
+    try:
+        return restored(state, model, scene)
+    except ValueError as error:
+        raise ValueError(f"{path} does not lead to a registration: {error}") from None
 
 
 def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | None = None) -> Registration:

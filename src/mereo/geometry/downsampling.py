@@ -1,4 +1,4 @@
-"""Fewer points of a cloud: at random, or evenly in space."""
+"""Fewer points of a cloud: at random, evenly in space, or means of neighbours."""
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
@@ -9,6 +9,12 @@ MAX_POINTS = 50_000
 
 SPACING_SAMPLE = 1000
 """Points whose nearest neighbour is looked up for the spacing; its median is then good to a few percent."""
+
+STEEPEST = 4.0
+"""Gap in range, in widths of a cell there, from which on there are two surfaces: one would be seen at 76 degrees."""
+
+SMALLEST_EXTENT = 1e-6
+"""Extent across lines of sight, as a slope, that counts as none: a tenth of a millimetre in a hundred metres."""
 
 
 def random_subset(rows: Shaped[np.ndarray, "n *r"], limit: int) -> Shaped[np.ndarray, "m *r"]:
@@ -42,6 +48,47 @@ def thin_to_grid(points: Float[np.ndarray, "n 3"], limit: int) -> Int[np.ndarray
         if len(found) > limit:
             return rows
         cell, rows = finer, found
+
+
+def means_along_sight(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.ndarray, "m 3"]:
+    """At most ``limit`` points, each the mean of neighbours on one surface; the cloud itself where it has no more.
+
+    Neighbours are seen from the origin within one cell of a grid of lines of sight, the smallest cells that suffice; a
+    gap in range parts surfaces. So the noise of a dense cloud averages out, and no mean lies between two surfaces.
+
+    Args:
+        points: seen from the origin (camera frame), any unit, within 90 degrees of their middle.
+        limit: number of points, and about that of the cells.
+    """
+    if len(points) <= limit:
+        return points
+    points = random_subset(points, max(limit, MAX_POINTS))
+    distance = np.linalg.norm(points, axis=1)
+    sight = points / distance[:, None]
+    ahead = sight.mean(axis=0)
+    across = np.linalg.svd(ahead[None])[2][1:]
+    flat = sight @ across.T * (np.linalg.norm(ahead) / (sight @ ahead))[:, None]
+    flat -= flat.min(axis=0)
+    cell = max(float(np.ptp(flat, axis=0).max()), SMALLEST_EXTENT) / np.sqrt(limit)
+    while (count := (group := _surfaces_in_cells(flat, distance, cell)).max() + 1) > limit:
+        cell *= np.sqrt(count / limit) * 1.02
+    total = np.stack([np.bincount(group, points[:, axis]) for axis in range(3)], axis=1)
+    return total / np.bincount(group)[:, None]
+
+
+def _surfaces_in_cells(
+    flat: Float[np.ndarray, "n 2"], distance: Float[np.ndarray, " n"], cell: float
+) -> Int[np.ndarray, " n"]:
+    """Number of the group of each point: those of one cell without a gap in distance."""
+    index = np.floor(flat / cell).astype(np.int64)
+    key = index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]
+    order = np.lexsort((distance, key))
+    starts = np.ones(len(flat), dtype=bool)
+    gap = np.diff(distance[order]) > STEEPEST * cell * distance[order][:-1]
+    starts[1:] = (np.diff(key[order]) != 0) | gap
+    group = np.empty(len(flat), dtype=np.int64)
+    group[order] = np.cumsum(starts) - 1
+    return group
 
 
 def first_in_cell(offsets: Float[np.ndarray, "n 3"], cell: float) -> Int[np.ndarray, " m"]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mereo.io.scratch_folders import check_place, scratch_folder
+from mereo.io.scratch_folders import check_place, remove_abandoned, scratch_folder
 
 
 @contextmanager
@@ -46,11 +46,15 @@ EXISTS = "exists; it is not overwritten: choose another name or pass --force"
 
 
 def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Iterable[str | Path] = ()) -> None:
-    """Raise as ``atomic_file`` does for a place where no file can be put: before the work, not after. None is none."""
+    """Raise as ``atomic_file`` does for a place where no file can be put: before the work, not after. None is none.
+
+    What killed processes left for the file is removed, also where it is refused because it is whole.
+    """
     if path is None:
         return
     path = Path(path)
     check_place(path)
+    remove_abandoned(path)
     if path.is_dir():
         raise FileExistsError(f"{path} is a directory; a file is written there: choose another name")
     if path.exists() and not force:

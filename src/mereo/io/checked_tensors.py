@@ -14,6 +14,8 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from mereo.io.errors import reason
+
 HEADER, CHECKSUM = "mereo", "sha256"
 
 Tensors = Mapping[str, np.ndarray]
@@ -39,7 +41,7 @@ def read_tensors(path: Path, dataset: str | None = None) -> tuple[dict[str, np.n
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         expected = facts.pop(CHECKSUM, None)
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
-        raise ValueError(str(error)) from None
+        raise ValueError(reason(error)) from None
     if expected is not None and expected != _digest(tensors, facts):
         raise ValueError("its checksum is another: its bytes have changed")
     if dataset is not None and facts.get("dataset") not in (None, dataset):

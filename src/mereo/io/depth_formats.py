@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Real
 
-from mereo.io.errors import readable
+from mereo.io.errors import quiet, readable, without_output
 from mereo.io.size_limits import check_arrays, check_bytes, open_image
 
 MILLIMETRES, METRES = 1000.0, 1.0
@@ -42,7 +42,8 @@ def is_depth_image(path: Path) -> bool:
     if path.suffix.lower() != ".npy":
         return path.suffix.lower() in DEPTH_READERS
     try:
-        array = np.lib.format.open_memmap(path, mode="r")
+        with quiet():
+            array = np.lib.format.open_memmap(path, mode="r")
     except Exception:  # a damaged header raises what Python's own parser does, too
         return False  # the reader of clouds says what is wrong
     return array.ndim == 2 and array.shape[1] >= NARROWEST
@@ -64,7 +65,8 @@ def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:
         raise ValueError(
             f"the depth scale is {depth_scale}; it must be positive, in units per metre: 1000 for millimetres"
         )
-    values = raw.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a NaN may be of the kind that signals
+        values = raw.astype(np.float64)
     return np.where(np.isfinite(values) & (values < NOTHING_M), values, 0.0) / depth_scale
 
 
@@ -76,7 +78,7 @@ def _png(path: Path) -> Raw:
 
 
 def _tiff(path: Path) -> Raw:
-    with open_image(path, path) as image:
+    with without_output(), open_image(path, path) as image:  # libtiff prints what Pillow says again
         if image.format != "TIFF" or image.mode not in ("I;16", "I;16B", "I", "F"):
             raise ValueError(f"it is {image.format} of mode {image.mode}, not a grey TIFF of 16-bit or float values")
         if getattr(image, "n_frames", 1) != 1:
@@ -101,11 +103,11 @@ def _exr(path: Path) -> Raw:
         raise ImportError(f"{path} needs OpenEXR, which is not installed: pip install 'mereo[sensors]'")
     import OpenEXR
 
-    with OpenEXR.File(str(path), header_only=True) as file:
+    with without_output(), OpenEXR.File(str(path), header_only=True) as file:  # it prints what it raises
         low, high = file.header()["dataWindow"]
         width, height = (int(side) for side in np.asarray(high, dtype=np.int64) - low + 1)
         check_bytes(path, width * height * 4 * len(file.header()["channels"]))
-    with OpenEXR.File(str(path), separate_channels=True) as file:
+    with without_output(), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {str(name): np.array(channel.pixels) for name, channel in file.channels().items()}
     found = [name for last in EXR_CHANNELS for name in channels if name.lower().split(".")[-1] == last]
     if not found and len(channels) == 1:

@@ -1,10 +1,24 @@
-"""Errors of reading: whatever a parsing library raises becomes one sentence."""
+"""Errors of reading: whatever a parsing library raises becomes one sentence, and what else it says is not shown."""
 
+import ctypes
+import io
+import logging
+import os
+import sys
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import numpy as np
+
 from mereo.io.size_limits import SizeError, check_bytes
+
+MOST_CHARACTERS = 300
+"""Length of a library's text in a sentence, which may quote all that it has read."""
+
+for _name in ("trimesh", "nibabel.global"):  # they log tracebacks and repairs, which Python shows where nobody listens
+    logging.getLogger(_name).setLevel(logging.CRITICAL + 1)
 
 
 @contextmanager
@@ -25,13 +39,57 @@ def readable(path: Path, kind: str) -> Iterator[None]:
         raise ValueError(f"{path} is empty (0 bytes); a {kind} is needed: export or download it again")
     check_bytes(path, path.stat().st_size)
     try:
-        yield
+        with quiet():
+            yield
     except (MemoryError, ImportError, SizeError):
         raise
     except Exception as error:
         raise ValueError(f"{path} cannot be read as a {kind} ({reason(error)}): export or download it again") from error
 
 
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Let libraries warn of nothing: of damage the sentence is enough, and lost values are checked where they matter.
+
+    mereo's own warnings pass.
+    """
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.filterwarnings("ignore", category=UserWarning, module=r"(PIL|nibabel|nrrd|trimesh|numpy|tifffile)\b")
+        warnings.filterwarnings("ignore", "Reading `.npy` or `.npz` file required additional header parsing")
+        warnings.filterwarnings("ignore", category=RuntimeWarning)
+        yield
+
+
+@contextmanager
+def without_output() -> Iterator[None]:
+    """Drop what compiled libraries print in the block, to Python's streams or to the process's.
+
+    What other threads print at that moment is lost too.
+    """
+    _flush()
+    kept = [os.dup(stream) for stream in (1, 2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in (1, 2):
+            os.dup2(nowhere, stream)
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            yield
+    finally:
+        _flush()
+        for stream, place in zip((1, 2), kept, strict=True):
+            os.dup2(place, stream)
+            os.close(place)
+        os.close(nowhere)
+
+
+def _flush() -> None:
+    """Write out what Python and C still hold of the process's streams."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    ctypes.CDLL(None).fflush(None)
+
+
 def reason(error: Exception) -> str:
     """First line of a library's text, which may be several sentences; the error's type where there is none."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
+    text = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
+    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."

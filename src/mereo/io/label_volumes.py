@@ -91,7 +91,10 @@ Content = tuple[np.ndarray, Float[np.ndarray, "4 4"], dict[int, str]]
 
 
 def _nifti(nibabel: Any, path: Path) -> Content:
-    image = nibabel.load(path)
+    try:
+        image = nibabel.load(path)
+    except MemoryError:  # nibabel asks for what an extension states, before it is read
+        raise ValueError("an extension of its header is larger than the memory") from None
     _check_voxels(path, image.shape)
     values = np.asarray(image.dataobj)
     return values[..., 0] if values.ndim == 4 and values.shape[3] == 1 else values, np.asarray(image.affine, float), {}

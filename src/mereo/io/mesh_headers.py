@@ -6,6 +6,7 @@ short of. Each check raises ``ValueError`` with its reason only, or ``SizeError`
 
 import json
 import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -55,19 +56,38 @@ def _check_stl(path: Path) -> None:
         raise ValueError("it is truncated: it does not end in endsolid")
 
 
+XML_FACTOR = 22
+"""Bytes of memory for each byte of 3MF's XML, which lxml keeps as a tree (measured on vertices and triangles)."""
+
+
+def _check_3mf(path: Path) -> None:
+    check_archive(path)
+    with zipfile.ZipFile(path) as archive:
+        models = [member.file_size for member in archive.infolist() if member.filename.lower().endswith(".model")]
+    check_bytes(path, XML_FACTOR * sum(models))
+
+
 def _check_gltf(path: Path) -> None:
     if path.suffix.lower() == ".gltf":
         document = json.loads(path.read_text("utf-8"))
     else:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(20)[12:16], "little")
-            document = json.loads(file.read(min(length, path.stat().st_size)))
+        document = json.loads(_glb_text(path.read_bytes()))
     views = document.get("bufferViews", [])
     for view in views:
         room = document["buffers"][view["buffer"]]["byteLength"] - view.get("byteOffset", 0)
         check_count(view["byteLength"], room, "bytes")
     for accessor in document.get("accessors", []):
         _check_accessor(path, accessor, views)
+
+
+def _glb_text(content: bytes) -> bytes:
+    """First chunk of a GLB file, JSON; none may state more bytes than follow, for which trimesh asks at once."""
+    at = 12
+    while at + 8 <= len(content):
+        length = int.from_bytes(content[at : at + 4], "little")
+        check_count(length, len(content) - at - 8, "bytes")
+        at += 8 + length
+    return content[20 : 20 + int.from_bytes(content[12:16], "little")]
 
 
 def _check_accessor(path: Path, accessor: dict[str, Any], views: list[dict[str, Any]]) -> None:
@@ -89,6 +109,6 @@ CHECKS: dict[str, Callable[[Path], None]] = {
     ".stl": _check_stl,
     ".glb": _check_gltf,
     ".gltf": _check_gltf,
-    ".3mf": check_archive,
+    ".3mf": _check_3mf,
 }
 """Check of each suffix; OBJ has no counts."""

@@ -14,7 +14,15 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from mereo.io.atomic_files import write_json
-from mereo.io.scratch_folders import ASIDE, abandoned, check_place, is_being_written, scratch_folder
+from mereo.io.scratch_folders import (
+    ASIDE,
+    abandoned,
+    check_place,
+    is_being_written,
+    remove_abandoned,
+    remove_all_abandoned,
+    scratch_folder,
+)
 
 MARKER = ".mereo.json"
 """Name of the list in each folder of results."""
@@ -171,6 +179,7 @@ def _put_back(path: Path) -> None:
             os.rename(old, path)
         elif old.is_dir() and not strangers(old):
             _remove_written(old)
+    remove_abandoned(path)
 
 
 def _remove_written(folder: Path) -> None:
@@ -181,9 +190,10 @@ def _remove_written(folder: Path) -> None:
         for place in places:
             if place.relative_to(folder).as_posix() in written:
                 place.unlink()
-        (folder / MARKER).unlink()  # the last one, for whoever must go on with this
-        for place in (*folders, folder):
+        for place in folders:
             place.rmdir()
+        (folder / MARKER).unlink(missing_ok=True)  # the last one, for whoever must go on with this
+        folder.rmdir()
 
 
 # --- folders in which work is continued -------------------------------------------------------------------------------
@@ -192,8 +202,8 @@ def _remove_written(folder: Path) -> None:
 def claim_directory(directory: Path, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
     """Settings that a directory of earlier work holds, or None where it was made with ``settings`` just now.
 
-    Hidden files do not count: a process that was killed while writing leaves them. It may be a link to a directory,
-    because nothing is put in its place.
+    Hidden files do not count: a process that was killed while writing leaves them, and they are removed here. It may
+    be a link to a directory, because nothing is put in its place.
 
     Args:
         directory: where work is done that may be stopped and continued; made when it is missing.
@@ -209,6 +219,7 @@ def claim_directory(directory: Path, name: str, settings: dict[str, Any], kind: 
     path = directory / name
     if directory.exists() and not directory.is_dir():
         raise FileExistsError(f"{directory} is a file; {kind} is a directory: choose another --output")
+    remove_all_abandoned(directory)
     if path.is_file():
         return _read_settings(path)
     if directory.is_dir() and any(not file.name.startswith(".") for file in directory.iterdir()):

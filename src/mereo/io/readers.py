@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.io.depth_formats import DEPTH_READERS, metres, read_raw_depth
+from mereo.io.depth_formats import DEPTH_READERS, Raw, metres, read_raw_depth
 from mereo.io.errors import readable
 from mereo.io.point_cloud_formats import CLOUD_READERS
 from mereo.io.size_limits import open_image
@@ -103,7 +103,15 @@ def read_depth_image(
         raise ValueError(
             f"{path} has the suffix {path.suffix!r}; a depth image is one of {known}: convert or rename it"
         )
-    return usable_depth(DepthImage(metres(read_raw_depth(path), depth_scale), camera), path, mask_path, plausible_m)
+    return usable_depth(depth_of(path, read_raw_depth(path), depth_scale, camera), path, mask_path, plausible_m)
+
+
+def depth_of(path: Path, raw: Raw, depth_scale: float | None, camera: Camera) -> DepthImage:
+    """Depth image of stored values; ``ValueError`` names the file where they are negative or of another size."""
+    try:
+        return DepthImage(metres(raw, depth_scale), camera)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be used: {error}") from None
 
 
 def usable_depth(

@@ -22,7 +22,8 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.io.depth_formats import metres
 from mereo.io.errors import reason
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
-from mereo.io.size_limits import check_count, open_image
+from mereo.io.recording_limits import bound_chunks
+from mereo.io.size_limits import SizeError, check_count, open_image
 
 IMAGE, CLOUD, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -137,7 +138,10 @@ def _open(path: Path) -> Any:
     try:
         # older ROS 2 bags do not hold their message definitions; those used here are the same in all distributions
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        bound_chunks()
         reader.open()
+    except SizeError:
+        raise
     except Exception as error:  # a damaged bag raises whatever its storage format does
         raise ValueError(f"{path} cannot be read as a ROS bag ({reason(error)}): record or copy it again") from error
     return reader

@@ -71,8 +71,7 @@ def scratch_folder(path: Path) -> Iterator[Path]:
     try:
         with _writable(path):
             made = _make_parents(path.parent)
-            for leftover in abandoned(path):
-                _remove(leftover)
+            remove_abandoned(path)
             scratch, lock = _lock_new(path)
         try:
             yield scratch
@@ -111,8 +110,11 @@ def _lock_new(path: Path) -> tuple[Path, int]:
     while True:
         scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
         scratch.mkdir()
-        lock = os.open(scratch / LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL)
-        # between these lines another process may have found it unlocked and taken it for a leftover
+        # between these lines another process may have found it without a lock, or with one that nobody holds
+        try:
+            lock = os.open(scratch / LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+        except FileNotFoundError:
+            continue
         if _try_lock(lock) is not False and os.fstat(lock).st_nlink:
             return scratch, lock
         os.close(lock)
@@ -136,14 +138,27 @@ def abandoned(path: Path) -> Iterator[Path]:
     return (scratch for scratch, ours in _scratches(path) if ours)
 
 
+def remove_abandoned(path: Path) -> None:
+    """Remove what killed processes left for ``path``; an output that waits there to be put back stays."""
+    for scratch in abandoned(path):
+        _remove(scratch)
+
+
+def remove_all_abandoned(directory: Path) -> None:
+    """Remove what killed processes left for any file of a directory in which work is continued."""
+    for scratch, ours in _scratches(directory / "any", ".+"):
+        if ours:
+            _remove(scratch)
+
+
 def is_being_written(path: Path) -> bool:
     """Whether a process that lives, this one too, has a scratch folder for ``path``."""
     return any(ours is False for _, ours in _scratches(path))
 
 
-def _scratches(path: Path) -> Iterator[tuple[Path, bool | None]]:
-    """All scratch folders for ``path``, with what ``_try_lock`` says of each."""
-    name = re.compile(re.escape(f".{path.name}.") + r"[0-9a-f]{8}\.partial")
+def _scratches(path: Path, names: str = "") -> Iterator[tuple[Path, bool | None]]:
+    """All scratch folders for ``path``, or beside it for ``names``, a pattern; with what ``_try_lock`` says of each."""
+    name = re.compile(rf"\.(?:{names or re.escape(path.name)})\.[0-9a-f]{{8}}\.partial")
     found: list[Path] = []
     with suppress(OSError), os.scandir(path.parent) as entries:  # it may be missing, or be no one's to list
         found = [Path(entry) for entry in entries if name.fullmatch(entry.name) and not entry.is_symlink()]
@@ -151,6 +166,8 @@ def _scratches(path: Path) -> Iterator[tuple[Path, bool | None]]:
         try:
             lock = os.open(scratch / LOCK, os.O_RDWR)
         except OSError:  # not made by mereo, or by another user, or gone by now
+            with suppress(OSError):  # where it is empty, a process was killed before it made the lock, or without it
+                scratch.rmdir()
             continue
         try:
             yield scratch, _try_lock(lock)
@@ -159,6 +176,14 @@ def _scratches(path: Path) -> Iterator[tuple[Path, bool | None]]:
 
 
 def _remove(scratch: Path) -> None:
-    """Remove a scratch folder, unless an output waits in it."""
-    if not (scratch / ASIDE).exists():
-        shutil.rmtree(scratch, ignore_errors=True)
+    """Remove a scratch folder, unless an output waits in it; the lock last, by which the next one knows it for ours."""
+    if (scratch / ASIDE).exists():
+        return
+    with suppress(OSError):  # the next one tries again
+        for place in scratch.iterdir():
+            if place.is_dir() and not place.is_symlink():
+                shutil.rmtree(place, ignore_errors=True)
+            elif place.name != LOCK:
+                place.unlink()
+        (scratch / LOCK).unlink()
+        scratch.rmdir()

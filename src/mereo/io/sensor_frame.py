@@ -17,9 +17,9 @@ import numpy as np
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
-from mereo.io.depth_formats import is_depth_image, metres, read_raw_depth
+from mereo.io.depth_formats import is_depth_image, read_raw_depth
 from mereo.io.intrinsics import read_intrinsics
-from mereo.io.readers import read_point_cloud, usable_depth, valid_points
+from mereo.io.readers import depth_of, read_point_cloud, usable_depth, valid_points
 from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frame, recorded_frames
 
 FORMAT_UNITS_M = {".zdf": 0.001}
@@ -121,7 +121,7 @@ def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
     found = read_intrinsics(reading.intrinsics, (raw.shape[1], raw.shape[0]), path, reading.frame_index)
     stated = None if raw.dtype.kind == "f" else found.depth_scale
     scale = stated if reading.depth_scale is None else reading.depth_scale
-    image = usable_depth(DepthImage(metres(raw, scale), found.camera), path, reading.mask)
+    image = usable_depth(depth_of(path, raw, scale, found.camera), path, reading.mask)
     return SensorFrame(path, image.to_points(), 1.0, "camera", image)
 
 

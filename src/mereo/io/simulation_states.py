@@ -13,7 +13,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from mereo.io.errors import readable
-from mereo.io.size_limits import check_arrays
+from mereo.io.size_limits import read_arrays
 
 FRAME_SUFFIXES = (".npz", ".ply", ".obj", ".stl", ".off")
 """Suffixes of files that hold a state each."""
@@ -82,9 +82,7 @@ def read_states(path: Path, names: tuple[str, ...]) -> TetrahedralRecord | Surfa
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     with readable(path, "NPZ file"):
-        check_arrays(path)
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
+        return read_arrays(path)
 
 
 def _archive(path: Path, names: tuple[str, ...]) -> TetrahedralRecord | SurfaceRecord:
@@ -108,8 +106,8 @@ def _tetrahedral(path: Path, arrays: dict[str, np.ndarray]) -> TetrahedralRecord
         )
     if "rest_nodes" not in arrays or ("nodes" in arrays) == ("displacements" in arrays):
         raise ValueError(
-            f"{path} has the arrays {', '.join(sorted(arrays))}; tetrahedral states need rest_nodes, tetrahedra and "
-            "one of nodes or displacements: add or remove what differs"
+            f"{path} has the arrays {', '.join(map(repr, sorted(arrays)))}; tetrahedral states need rest_nodes, "
+            "tetrahedra and one of nodes or displacements: add or remove what differs"
         )
     rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(np.float64)
     key = "nodes" if "nodes" in arrays else "displacements"
@@ -149,8 +147,8 @@ def _floats(path: Path, key: str, array: np.ndarray, axes: int) -> np.ndarray:
 def _check_names(path: Path, found: set[str], names: tuple[str, ...]) -> None:
     if missing := [name for name in names if name not in found]:
         raise ValueError(
-            f"{path} has states of {', '.join(sorted(found)) or 'nothing'} but not of segment {missing[0]!r}; every "
-            "segment needs its own: name each array or folder after its segment"
+            f"{path} has states of {', '.join(map(repr, sorted(found))) or 'nothing'} but not of segment "
+            f"{missing[0]!r}; every segment needs its own: name each array or folder after its segment"
         )
     if unknown := sorted(found - set(names)):
         raise ValueError(

@@ -93,14 +93,29 @@ def check_arrays(path: Path) -> None:
                 _check_array(entry, member.file_size)
 
 
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an NPZ file, checked as ``check_arrays`` does; raises whatever damage makes of the parser."""
+    check_arrays(path)
+    with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a damaged file open
+        arrays = {key: file[key] for key in file.files}
+    if strange := [key for key, value in arrays.items() if not isinstance(value, np.ndarray)]:
+        raise ValueError(f"its entry {strange[0]!r} is no array")
+    return arrays
+
+
 def _check_array(file: Any, size: int) -> None:
     """Compare the shape in an NPY header with the ``size`` bytes of the file; numpy would take the memory first."""
     start = file.read(len(np.lib.format.MAGIC_PREFIX) + 2)
-    if not start.startswith(np.lib.format.MAGIC_PREFIX):
+    if not start.startswith(np.lib.format.MAGIC_PREFIX) or start[-2] not in (1, 2, 3):
         return  # numpy says what it is instead
+    if start[-2] > 1:
+        length = file.read(4)
+        check_count(int.from_bytes(length, "little"), size, "bytes of its header")
+        file.seek(-len(length), os.SEEK_CUR)
     read: Any = np.lib.format.read_array_header_1_0 if start[-2] == 1 else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(file)
-    if any(side < 0 for side in shape) or math.prod(shape) * dtype.itemsize > size:
+    # no side of an array without values may be longer either: sums along the others would be as long
+    if any(not 0 <= side <= size for side in shape) or math.prod(shape) * dtype.itemsize > size:
         raise ValueError(f"its header states an array of shape {list(shape)}, which its {size} bytes cannot hold")
 
 

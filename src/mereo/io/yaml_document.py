@@ -13,6 +13,8 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
+from mereo.io.errors import reason
+
 Model = TypeVar("Model", bound=BaseModel)
 
 Place = Sequence[int | str]
@@ -58,7 +60,7 @@ class Document:
             place = f"{path}:{mark.line + 1}" if mark else str(path)
             raise ValueError(f"{place}: this is not YAML ({error.problem}): correct the line, or its indent") from None
         except yaml.YAMLError as error:
-            raise ValueError(f"{path}: this is not YAML ({error}): save it as plain text") from None
+            raise ValueError(f"{path}: this is not YAML ({reason(error)}): save it as plain text") from None
         except RecursionError:
             raise ValueError(f"{path} is nested too deeply; a scene file has lists in blocks: write it anew") from None
         except _TooMuch:

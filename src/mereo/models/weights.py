@@ -12,6 +12,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from mereo.io.atomic_files import atomic_file
+from mereo.io.errors import reason
 from mereo.models.config import InferenceConfig
 from mereo.models.device import find_device
 from mereo.models.encoders.autodecoder import CODES
@@ -139,7 +140,7 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
         raise ValueError(
-            f"{path} is not a safetensors file ({error}); give the weights written by mereo train"
+            f"{path} is not a safetensors file ({reason(error)}); give the weights written by mereo train"
         ) from None
     header = read_header(path, metadata)
     states = {key.removeprefix(STATES): tensors.pop(key).numpy() for key in list(tensors) if key.startswith(STATES)}
@@ -168,4 +169,6 @@ def _unpacked(path: Path, states: dict[str, np.ndarray], header: Header) -> Stat
         return unpack_model(states, header.states or {})
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         kind = "nothing is called " if isinstance(error, KeyError) else ""
-        raise ValueError(f"{path} has a statistical model that cannot be read ({kind}{error}); {CURE}") from None
+        raise ValueError(
+            f"{path} has a statistical model that cannot be read ({kind}{reason(error)}); {CURE}"
+        ) from None

@@ -10,12 +10,14 @@ import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float16
+from pydantic import BaseModel, Field, ValidationError
 
 from mereo.io.checked_tensors import check_tensors, read_tensors
+from mereo.io.errors import reason
 from mereo.scenes.rest_pose import TEMPLATE_NODES
 
 DECISIVE = ("scene", "segments", "nested", "any_roll", "workspace", "settings", "seed", "rest_sha256")
@@ -36,6 +38,60 @@ SHARD = {
 
 OBSERVED = {"seen": "e k p 3", "seen_count": "e k"}
 """Tensors that a dataset with k further observations has besides."""
+
+
+class _Segment(BaseModel):
+    """Segment in a manifest."""
+
+    name: str
+    color: tuple[int, int, int]
+
+
+class _Sampling(BaseModel):
+    """What training reads of the settings of sampling."""
+
+    per_segment: Annotated[int, Field(ge=0)]
+
+
+class _Settings(BaseModel):
+    """What training reads of the settings."""
+
+    sampling: _Sampling
+
+
+class _Manifest(BaseModel):
+    """What programs read of a manifest; the rest decides the dataset's key, or is for people."""
+
+    scene: str
+    seed: int
+    examples: Annotated[int, Field(ge=1)]
+    settings: _Settings
+    segments: Annotated[tuple[_Segment, ...], Field(min_length=1, max_length=254)]
+    nested: tuple[tuple[str, str], ...] = ()
+    any_roll: bool
+    version: str
+    shard_size: Annotated[int, Field(ge=1)] | None = None
+    unit_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    source: str | None = None
+
+
+def read_manifest(directory: Path) -> dict[str, Any]:
+    """Manifest of a dataset; ``FileNotFoundError`` or ``ValueError`` with one sentence on what is wrong otherwise."""
+    path = directory / "manifest.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{directory} has no manifest.json; a dataset is a directory made by mereo generate")
+    try:
+        manifest: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        _Manifest.model_validate(manifest)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "content"
+        raise ValueError(
+            f"{path} is not the manifest of a dataset (its {place!r}: {first['msg']}); generate the dataset again"
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not valid JSON ({reason(error)}); generate the dataset again") from None
+    return manifest
 
 
 def dataset_key(manifest: Mapping[str, Any]) -> str:

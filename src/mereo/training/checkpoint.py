@@ -9,6 +9,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from mereo.io.atomic_files import atomic_file
+from mereo.io.errors import reason
 
 NAME = "checkpoint.safetensors"
 
@@ -43,17 +44,32 @@ def load_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> int | None:
         with safe_open(path, framework="pt") as file:
             step = int((file.metadata() or {})["step"])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, OSError, KeyError) as error:
-        raise ValueError(f"{path} cannot be read ({error}); delete it to train from the start") from None
+        _fill(checkpoint, tensors)
+    except (SafetensorError, OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise ValueError(f"{path} cannot be read ({reason(error)}); delete it to train from the start") from None
+    return step
+
+
+def _fill(checkpoint: Checkpoint, tensors: dict[str, Tensor]) -> None:
+    """Give a checkpoint's objects their state; raises whatever torch does for one that is not theirs."""
     for prefix, module in (("network", checkpoint.network), ("average", checkpoint.average)):
         module.load_state_dict(_below(tensors, prefix + "/"))
     states: dict[int, dict[str, Tensor]] = {}
     for name, value in _below(tensors, "optimizer/").items():
         index, key = name.split("/")
         states.setdefault(int(index), {})[key] = value
+    _check_optimizer(checkpoint.optimizer, states)
     groups = checkpoint.optimizer.state_dict()["param_groups"]
     checkpoint.optimizer.load_state_dict({"state": states, "param_groups": groups})
-    return step
+
+
+def _check_optimizer(optimizer: torch.optim.Optimizer, states: dict[int, dict[str, Tensor]]) -> None:
+    """Raise ``ValueError`` for states that the optimizer would take now and fail over at its next step."""
+    parameters = [value for group in optimizer.param_groups for value in group["params"]]
+    for index, state in states.items():
+        shapes = {"step": torch.Size(()), "exp_avg": parameters[index].shape, "exp_avg_sq": parameters[index].shape}
+        if {name: value.shape for name, value in state.items()} != shapes:
+            raise ValueError(f"the optimizer's state {index} is of another network")
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

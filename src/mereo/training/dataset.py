@@ -3,7 +3,6 @@
 Notation: e examples, b of them in a batch, p stored points, n points that the network sees, q queries, k observations.
 """
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from mereo.geometry.conventions import MIN_POINTS
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.scenes.statistical_model_file import load_statistical_model
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE
-from mereo.synthesis.dataset_files import OBSERVED, dataset_key, read_shard, read_template
+from mereo.synthesis.dataset_files import OBSERVED, dataset_key, read_manifest, read_shard, read_template
 from mereo.training.config import AugmentConfig
 
 
@@ -185,20 +184,6 @@ def draw_observations(count: int, further: int, probability: float, rng: torch.G
         return torch.zeros(count, dtype=torch.long)
     chosen = torch.rand(count, generator=rng) < probability
     return chosen * torch.randint(1, further + 1, (count,), generator=rng)
-
-
-def read_manifest(directory: Path) -> dict[str, Any]:
-    """Manifest of a dataset; ``FileNotFoundError`` or ``ValueError`` with one sentence on what is wrong otherwise."""
-    path = directory / "manifest.json"
-    if not path.is_file():
-        raise FileNotFoundError(f"{directory} has no manifest.json; a dataset is a directory made by mereo generate")
-    try:
-        manifest = json.loads(path.read_text("utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is not valid JSON ({error}); generate the dataset again") from None
-    if not isinstance(manifest, dict) or not {"scene", "segments", "settings", "seed", "examples"} <= manifest.keys():
-        raise ValueError(f"{path} is not the manifest of a dataset; generate the dataset again")
-    return manifest
 
 
 def _read_part(path: Path, key: str, size: int | None) -> dict[str, Tensor]:

@@ -1,14 +1,12 @@
-"""Processes, settings and directory of a training run, the network it starts from and the model it ends with."""
+"""Settings and directory of a training run, the network it starts from and the model it ends with."""
 
 import copy
 import json
-import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,19 +19,7 @@ from mereo.models.weights import load_model
 from mereo.synthesis.config import TEMPLATE
 from mereo.training.config import AugmentConfig, TrainConfig
 from mereo.training.dataset import Dataset
-
-
-@dataclass(frozen=True)
-class Process:
-    """Place of this process among those that train together."""
-
-    rank: int = 0
-    world: int = 1
-
-    @property
-    def is_main(self) -> bool:
-        """Whether this process is the one that writes and prints."""
-        return self.rank == 0
+from mereo.training.processes import Process, meeting
 
 
 def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
@@ -161,31 +147,21 @@ def _without_segments(given: dict[str, Tensor], network: Network) -> dict[str, T
     return kept
 
 
-def join_processes() -> Process:
-    """Join the group that torchrun started, if any; returns this process's place."""
-    world = int(os.environ.get("WORLD_SIZE", "1"))
-    if world == 1:
-        return Process()
-    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
-    return Process(dist.get_rank(), world)
-
-
 def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Process) -> None:
     """Create the run directory, or check that it belongs to the same settings and dataset.
 
     Process 0 does so alone: another one would find the directory that it is just creating, without its settings yet.
-    The others wait; where process 0 refuses, torchrun ends them.
+    The others wait, and end where process 0 refuses.
     """
     if config.batch % process.world:
         raise ValueError(
             f"the batch of {config.batch} cannot be shared by {process.world} processes; it must be a multiple: "
             "change --batch or the number of processes"
         )
-    if process.is_main:
-        dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
-        _claim(run_dir, json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()})))
-    if process.world > 1:
-        dist.barrier()
+    with meeting(process):
+        if process.is_main:
+            dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
+            _claim(run_dir, json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()})))
 
 
 def _claim(run_dir: Path, settings: dict[str, Any]) -> None:

@@ -28,7 +28,8 @@ from mereo.training.dataset import Batch, Dataset
 from mereo.training.losses import supervised_loss
 from mereo.training.metrics_log import MetricsLog
 from mereo.training.optimization import clip_gradients, parameter_groups, rate_share, update_average
-from mereo.training.run_directory import Process, claim_run, fit_config, join_processes, start_network, trained_model
+from mereo.training.processes import Process, join_processes, meeting
+from mereo.training.run_directory import claim_run, fit_config, start_network, trained_model
 from mereo.training.validation import choose_offsets, held_out, validate
 
 WEIGHTS = "weights.safetensors"
@@ -231,15 +232,18 @@ class Trainer:
         if not (due and self.config.holdout):
             return
         self._read_losses()
-        if self.log is not None:
-            self._update_codes()
-            scores = validate(self.average, self.data, self.config)
-            self.log.add_validation(self.step, scores.iou, scores.miou)
-            if self.data.further:
-                scores = validate(self.average, self.data, self.config, further=True)
-                self.log.add_validation(self.step, scores.iou, scores.miou, "sensor")
-            self.say(f"held-out examples at step {self.step}: {self.log.summary()}{self.log.doubt(self.total)}")
-        self._wait()
+        with meeting(self.process):
+            if self.log is not None:
+                self._validate(self.log)
+
+    def _validate(self, log: MetricsLog) -> None:
+        self._update_codes()
+        scores = validate(self.average, self.data, self.config)
+        log.add_validation(self.step, scores.iou, scores.miou)
+        if self.data.further:
+            scores = validate(self.average, self.data, self.config, further=True)
+            log.add_validation(self.step, scores.iou, scores.miou, "sensor")
+        self.say(f"held-out examples at step {self.step}: {log.summary()}{log.doubt(self.total)}")
 
     def save(self, finished: bool = False) -> None:
         """Write metrics, curves, the weights and the checkpoint; every file atomically.
@@ -247,15 +251,18 @@ class Trainer:
         The checkpoint is the last, so whatever stops this leaves one from which the others are written again.
         """
         self._read_losses()
-        if self.log is not None:
-            self._update_codes()
-            self.log.write()
-            offsets = choose_offsets(self.average, self.data, self.config) if finished else None
-            save_model(trained_model(self.average, self.data, self.config, self.step, offsets), self.run_dir / WEIGHTS)
-            save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
-            self.say(f"saved at step {self.step}: {self.log.summary()}")
+        with meeting(self.process):
+            if self.log is not None:
+                self._save(self.log, finished)
         self.saved_step = self.step
-        self._wait()
+
+    def _save(self, log: MetricsLog, finished: bool) -> None:
+        self._update_codes()
+        log.write()
+        offsets = choose_offsets(self.average, self.data, self.config) if finished else None
+        save_model(trained_model(self.average, self.data, self.config, self.step, offsets), self.run_dir / WEIGHTS)
+        save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
+        self.say(f"saved at step {self.step}: {log.summary()}{log.doubt(self.total)}")
 
     def finish(self) -> None:
         """Write all that a run leaves at its end, unless an earlier process has, which may have been killed before."""
@@ -270,11 +277,6 @@ class Trainer:
         if isinstance(self.average.encoder, Autodecoder):
             self.average.encoder.update_mean()
 
-    def _wait(self) -> None:
-        """Let the processes meet: the first one alone validates and writes."""
-        if self.process.world > 1:
-            dist.barrier()
-
     def resume(self) -> bool:
         """Load the checkpoint when there is one; returns whether there was."""
         step = load_checkpoint(self.run_dir, Checkpoint(0, self.network, self.average, self.optimizer))
@@ -286,8 +288,9 @@ class Trainer:
                 "diverged; it cannot be continued: choose another --output with a lower --learning-rate"
             )
         self.step = self.first_step = self.saved_step = step
-        if self.log is not None:
-            self.log.read_until(step)
+        with meeting(self.process):
+            if self.log is not None:
+                self.log.read_until(step)
         return True
 
 

@@ -74,6 +74,7 @@ def evaluate_weights(
             "weights": str(weights),
             "scene": scene or trained_scene(model),
             "seed": seed,
+            "image_size": settings.image_size,
             "noise_std": settings.noise_std,
             "sensor": asdict(settings.sensor),
             "device": model.device.type,

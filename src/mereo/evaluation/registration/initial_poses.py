@@ -67,9 +67,9 @@ def read_start(path: str | Path, rest: SegmentedMesh, scale: float | None = None
             f"{path} gives a start of the segment {unknown[0]!r}; the segments are {', '.join(rest.names)}: correct "
             "the name"
         )
-    poses = {name: _pose(entry, f"segment {name!r}", rest, scale) for name, entry in segments.items()}
+    poses = {name: _stated(path, entry, f"segment {name!r}", rest, scale) for name, entry in segments.items()}
     if "object" in stated:
-        common = _pose(stated["object"], "the object", rest, scale)
+        common = _stated(path, stated["object"], "the object", rest, scale)
     elif missing := [name for name in rest.names if name not in poses]:
         raise ValueError(
             f'{path} has no start for the segment {missing[0]!r} and none of the object; add it, or add "object", '
@@ -82,6 +82,15 @@ def read_start(path: str | Path, rest: SegmentedMesh, scale: float | None = None
         np.array([name in poses for name in rest.names]),
         "; ".join([*(["object"] if "object" in stated else []), *poses]) + f" from {path.name}",
     )
+
+
+def _stated(path: Path, *entry: Any) -> Float[np.ndarray, "4 4"]:
+    """Pose of an entry; ``ValueError`` names the file before what is wrong with it."""
+    try:
+        with np.errstate(all="ignore"):
+            return _pose(*entry)
+    except ValueError as error:  # numpy's LinAlgError too
+        raise ValueError(f"{path} cannot be used: {error}") from None
 
 
 def _pose(entry: Any, of: str, rest: SegmentedMesh, scale: float | None) -> Float[np.ndarray, "4 4"]:

@@ -27,7 +27,7 @@ def run_experiment(name: str, scale: str, root: Path, workers: int = 1) -> Path:
     if scale not in SCALES:
         raise ValueError(f"scale {scale!r} is unknown; it must be one of {', '.join(SCALES)}: correct it")
     directory = root / "results" / f"{name}-{scale}"
-    check_new_directory(directory, force=True)  # before hours of work
+    _check_results(directory)  # before hours of work
     module = import_module(f"mereo.experiments.paper.{name.replace('-', '_')}")
     run: Callable[[Store, ExperimentScale], Result] = module.run
     result = run(Store(root, workers), SCALES[scale])
@@ -36,3 +36,15 @@ def run_experiment(name: str, scale: str, root: Path, workers: int = 1) -> Path:
         result = replace(result, claims=untried, notes=(*result.notes, "It only shows that the experiment runs."))
     write_result(result, directory)
     return directory
+
+
+def _check_results(directory: Path) -> None:
+    """Refuse a folder of results that is not, or not only, of this version; another --output would lose the work."""
+    try:
+        check_new_directory(directory, force=True)
+    except FileExistsError as error:
+        found = str(error).rpartition(": ")[0]
+        raise FileExistsError(
+            f"{found}: move it away or delete it, and run the same command again, which keeps the datasets, runs and "
+            "scores and writes these results anew"
+        ) from None

@@ -13,7 +13,8 @@ from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, examine, likely_unit
 from mereo.geometry.mesh_repair import repaired, without_overlaps
 from mereo.geometry.overlap import Overlap, grid_volume, overlaps
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, check_file_place
+from mereo.io.scratch_folders import remove_abandoned
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read
 from mereo.scenes.files.rewrite import with_segment_files
@@ -168,13 +169,28 @@ def _write(document: Document, mesh: SegmentedMesh, changed: set[str]) -> Path:
     """The repaired meshes and a scene file that names them, beside the original."""
     path = document.path.with_name(f"{document.path.stem}-repaired{document.path.suffix}")
     text, files = with_segment_files(document, mesh, changed)
-    for place in (path, *(document.path.parent / file for file in files.values())):
+    meshes = {document.path.parent / file: _ply(mesh, name) for name, file in files.items()}
+    # a mesh of the same bytes is one that this wrote before it was killed
+    missing = {place: content for place, content in meshes.items() if not _holds(place, content)}
+    for place in (path, *missing):
+        check_file_place(place)
         if place.exists():
             raise FileExistsError(f"{place} exists; it is not overwritten: move or remove it")
-    for name, file in files.items():
-        segment = mesh.segments[mesh.names.index(name)]
-        with atomic_file(document.path.parent / file, force=False) as temporary:
-            trimesh.Trimesh(segment.vertices, segment.faces, process=False).export(temporary, file_type="ply")
+    for place, content in missing.items():
+        with atomic_file(place, force=False) as temporary:
+            temporary.write_bytes(content)
     with atomic_file(path, force=False) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
+
+
+def _ply(mesh: SegmentedMesh, name: str) -> bytes:
+    segment = mesh.segments[mesh.names.index(name)]
+    content = trimesh.Trimesh(segment.vertices, segment.faces, process=False).export(file_type="ply")
+    assert isinstance(content, bytes)
+    return content
+
+
+def _holds(place: Path, content: bytes) -> bool:
+    remove_abandoned(place)
+    return place.is_file() and not place.is_symlink() and place.read_bytes() == content

@@ -16,7 +16,7 @@ from mereo.deformation import samplers
 from mereo.deformation.samplers import DeformationSampler
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.normalizer import Normalizer
-from mereo.scenes.files.fields import Block, Direction, Name, Point, Positive, PositiveRange, Range
+from mereo.scenes.files.fields import Block, Direction, Name, Number, Point, Positive, PositiveRange, Range
 
 
 class Misfit(ValueError):
@@ -184,7 +184,7 @@ class JointBlock(DeformationBlock):
     axis: Direction
     angle: Range = (0.0, 0.0)
     slide: Range = (0.0, 0.0)
-    shift: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = Field(default=(0.0, 0.0, 0.0), min_length=3, max_length=3)
+    shift: tuple[Annotated[Number, Field(ge=0)], ...] = Field(default=(0.0, 0.0, 0.0), min_length=3, max_length=3)
 
     def sampler(self, target: Target) -> DeformationSampler:
         """Sampler of rigid motions about the pivot, in scene units and radians."""
@@ -204,7 +204,7 @@ class PushBlock(DeformationBlock):
 
     type: Literal["push"]
     distance: Range
-    tip: Annotated[FiniteFloat, Field(ge=0)]
+    tip: Annotated[Number, Field(ge=0)]
     reach: Positive
 
     @model_validator(mode="after")

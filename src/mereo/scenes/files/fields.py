@@ -17,12 +17,16 @@ def _pointing(value: tuple[float, float, float]) -> tuple[float, float, float]:
     return value
 
 
+MOST = 1e12
+"""Largest number of a scene file: products of a few remain finite."""
+
+Number = Annotated[FiniteFloat, Field(ge=-MOST, le=MOST)]
 Byte = Annotated[int, Field(ge=0, le=255)]
-Positive = Annotated[FiniteFloat, Field(gt=0)]
+Positive = Annotated[FiniteFloat, Field(gt=0, le=MOST)]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\\\x00-\x1f]+$")]
-Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Point = tuple[Number, Number, Number]
 Direction = Annotated[Point, AfterValidator(_pointing)]
-Range = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_ascending)]
+Range = Annotated[tuple[Number, Number], AfterValidator(_ascending)]
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ascending)]
 
 

@@ -3,29 +3,84 @@
 Any page that a browser shows may open a websocket to 127.0.0.1, and a name that is made to mean 127.0.0.1 (DNS
 rebinding) makes the answers readable too. Browsers say in ``Host`` which name they asked for and in ``Origin`` whose
 page asks. Programs other than browsers may leave ``Origin`` out, as browsers do when a person opens the page.
+
+Bound to another address than this machine's own, whoever reaches that address could ask. There a request needs the
+token of the printed address; a browser gives it once and then as a cookie, since the page's websocket has no query.
 """
 
 import re
+import secrets
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
 """Names of this machine, with any port: a tunnel (``ssh -L``) may end at another one."""
 
 
-def refusal(hosts: Sequence[str], origins: Sequence[str]) -> str:
-    """Reason to refuse a request by its ``Host`` and ``Origin`` headers; empty where it may be answered."""
-    if len(hosts) != 1 or not OWN_HOST.fullmatch(hosts[0]):
+LOOPBACK = "127.0.0.1"
+"""Address that only programs of this machine reach."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Address that a server listens at, and the token that its requests need; "" for none."""
+
+    host: str = LOOPBACK
+    token: str = ""
+
+    @classmethod
+    def of(cls, host: str) -> "Entry":
+        """Entry with a random token, unless the host is this machine's own."""
+        return cls(host, "" if host in (LOOPBACK, "localhost", "::1") else secrets.token_urlsafe(24))
+
+    def address(self, port: int) -> str:
+        """What to open in a browser."""
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host  # all of this machine's addresses
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{port}" + (f"/?token={self.token}" if self.token else "")
+
+    def is_token(self, given: str) -> bool:
+        """Whether this is the token, in a time that does not depend on where it differs."""
+        return secrets.compare_digest(given.encode(errors="replace"), self.token.encode())
+
+
+def refusal(hosts: Sequence[str], origins: Sequence[str], entry: Entry | None = None, given: Sequence[str] = ()) -> str:
+    """Reason to refuse a request by its ``Host`` and ``Origin`` headers; empty where it may be answered.
+
+    With an ``entry`` that has a token, any name will do, but one of the tokens ``given`` must be it.
+    """
+    if entry is not None and entry.token:
+        if len(hosts) != 1 or not any(map(entry.is_token, given)):
+            return "the address has no token, or another one: open the address that mereo view has printed"
+    elif len(hosts) != 1 or not OWN_HOST.fullmatch(hosts[0]):
         return f"the host is {', '.join(hosts) or 'not given'}; it must be 127.0.0.1 or localhost: open that address"
     if any(origin.lower() != f"http://{hosts[0].lower()}" for origin in origins):
         return f"the page is of {', '.join(origins)}; only pages of http://{hosts[0]} are answered: open that address"
     return ""
 
 
+def _cookie_name(hosts: Sequence[str]) -> str:
+    """Name of the cookie; browsers share cookies between the ports of a host."""
+    return f"mereo_{urlsplit(f'//{hosts[0]}').netloc.rpartition(':')[2]}" if hosts else ""
+
+
+def _tokens(path: str, cookies: Sequence[str], name: str) -> tuple[list[str], list[str]]:
+    """Tokens in a request's query, and in its cookies."""
+    try:
+        found = [SimpleCookie(line).get(name) for line in cookies]
+    except CookieError:
+        found = []
+    return parse_qs(urlsplit(path).query).get("token", []), [morsel.value for morsel in found if morsel is not None]
+
+
 @contextmanager
-def guarded_servers() -> Iterator[list[str]]:
+def guarded_servers(entry: Entry) -> Iterator[list[str]]:
     """Guard every server of ``websockets`` that is started meanwhile; the list holds a word for each.
 
     viser takes no hook for requests, but starts its server by the public ``websockets.asyncio.server.serve``. A caller
@@ -38,9 +93,15 @@ def guarded_servers() -> Iterator[list[str]]:
     def serve(*arguments: Any, process_request: Callable[[Any, Any], Any] | None = None, **options: Any) -> Any:
         def checked(connection: Any, request: Any) -> Any:
             headers = request.headers
-            if reason := refusal(headers.get_all("Host"), headers.get_all("Origin")):
+            hosts = headers.get_all("Host")
+            queried, kept = _tokens(request.path, headers.get_all("Cookie"), _cookie_name(hosts))
+            if reason := refusal(hosts, headers.get_all("Origin"), entry, [*queried, *kept]):
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
-            return None if process_request is None else process_request(connection, request)
+            answer = None if process_request is None else process_request(connection, request)
+            if answer is not None and entry.token and queried:
+                answer.headers["Set-Cookie"] = f"{_cookie_name(hosts)}={entry.token}; Path=/; HttpOnly; SameSite=Strict"
+                answer.headers["Referrer-Policy"] = "no-referrer"
+            return answer
 
         started.append("guarded")
         return plain(*arguments, process_request=checked, **options)

@@ -25,6 +25,7 @@ from mereo.scenes.scene import Scene
 from mereo.visualization.viewer.display import import_viser, start_server, stop_server
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom, ModeShapes
+from mereo.visualization.viewer.guard import LOOPBACK, Entry
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.probe import Inspection
@@ -59,6 +60,7 @@ def view_frame(
     weights: str | None,
     *,
     port: int = PORT,
+    host: str = LOOPBACK,
     resolution: int = 128,
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
@@ -85,9 +87,10 @@ def view_frame(
     registrar = registrar_for(model, "auto")
     keep_all = isolation is not None and isolation.keep_all
     inspection = Inspection.of(frame.cloud, model, resolution, frame.axes, registrar, frame.unit_m, keep_all)
-    server = start_server(port, "mereo")
+    entry = Entry.of(host)
+    server = start_server(port, "mereo", entry)
     FramePage(server, inspection, frame.title, f"{len(frame.cloud):,} points · weights {weights}", frame.unit)
-    _serve(server)
+    _serve(server, entry)
 
 
 def view_state(
@@ -96,6 +99,7 @@ def view_state(
     weights: str | None,
     *,
     port: int = PORT,
+    host: str = LOOPBACK,
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
     inference: InferenceConfig | None = None,
@@ -114,10 +118,11 @@ def view_state(
     registration = restored(state, statistical_model_of(model))
     cloud = None if frame is None else frame.cloud
     inspection = Inspection.of_registration(registration, model, np.array(state.T_camera_input), cloud)
-    server = start_server(port, "mereo")
+    entry = Entry.of(host)
+    server = start_server(port, "mereo", entry)
     title = str(path) if frame is None else frame.title
     FramePage(server, inspection, title, f"{state.scene} · weights {weights}", "m" if state.unit_m == 1.0 else "")
-    _serve(server)
+    _serve(server, entry)
 
 
 def view_scene(
@@ -126,6 +131,7 @@ def view_scene(
     *,
     state: Path | None = None,
     port: int = PORT,
+    host: str = LOOPBACK,
     inference: InferenceConfig | None = None,
 ) -> None:
     """Show the laboratory of a scene, in a state where one is given.
@@ -140,9 +146,10 @@ def view_scene(
     model = None if known is None else load_for(known, inference or InferenceConfig())
     laboratory = Laboratory(scene, model, shapes=None if chosen is None else shapes_of(chosen, scene, model))
     facts = f"weights {known}" if known else "no weights: states and depth images only"
-    server = start_server(port, "mereo")
+    entry = Entry.of(host)
+    server = start_server(port, "mereo", entry)
     page = LabPage(server, laboratory, f"Laboratory: {scene.name}", facts)
-    _serve(server, page)
+    _serve(server, entry, page)
 
 
 def shapes_of(state: RegistrationState, scene: Scene, model: Model | None) -> Freedom[Any]:
@@ -174,8 +181,8 @@ def weights_of(state: RegistrationState, weights: str | None) -> str:
     return known
 
 
-def _serve(server: Any, page: LabPage | None = None) -> None:
-    print(f"open http://127.0.0.1:{server.get_port()} in a browser; Ctrl-C ends", flush=True)
+def _serve(server: Any, entry: Entry, page: LabPage | None = None) -> None:
+    print(f"open {entry.address(server.get_port())} in a browser; Ctrl-C ends", flush=True)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

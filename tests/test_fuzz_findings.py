@@ -1,0 +1,146 @@
+"""What the damage of ``test_fuzz`` once got through: each input as small as it can be, and what is said of it now."""
+
+import io
+import json
+import os
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fuzz_rule import fault_of
+from fuzz_targets import TARGETS
+from PIL import Image
+from safetensors.torch import load_file, save_file
+
+from mereo import __main__ as command_line
+from mereo.io.errors import quiet, reason, without_output
+
+
+def npz(**members: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return file.getvalue()
+
+
+def npy(text: str) -> bytes:
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
+
+
+def replaced(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
+    def change(content: bytes) -> bytes:
+        assert old in content
+        return content.replace(old, new, 1)
+
+    return change
+
+
+def at(place: int, piece: bytes) -> Callable[[bytes], bytes]:
+    return lambda content: content[:place] + piece + content[place + len(piece) :]
+
+
+def json_with(**values: object) -> Callable[[bytes], bytes]:
+    return lambda content: json.dumps(json.loads(content) | values).encode()
+
+
+def second_chunk(content: bytes) -> bytes:
+    start = 20 + int.from_bytes(content[12:16], "little")
+    return at(start, struct.pack("<I", 2**32 - 1))(content)
+
+
+def chunk_size(content: bytes) -> bytes:
+    """The first chunk begins where the table of offsets says, and with its line and its size."""
+    starts = (place for place in range(len(content) - 8) if struct.unpack_from("<Q", content, place)[0] == place + 8)
+    return at(next(starts) + 12, struct.pack("<i", -1))(content)
+
+
+EMPTY = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (2147483647, 0, 3), }\n")
+CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
+    "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
+    "a chunk of 4 GB": ("mesh.glb", second_chunk, r"truncated: \d+ of 4294967295 bytes"),
+    "a header of 4 GB": ("cloud.npy", at(6, b"\2\0" + b"\xff" * 4), "of 4294967295 bytes of its header"),
+    "no array": ("surfaces.npz", lambda c: npz(a=b"text"), "its entry 'a' is no array"),
+    "no array in a view": ("view.npz", lambda c: npz(depth=b"text"), "its entry 'depth' is no array"),
+    "no values, and two billion rows": ("tetrahedra.npz", lambda c: npz(**{"nodes.npy": EMPTY}), "cannot"),
+    "a name of two lines": ("surfaces.npz", lambda c: npz(**{"b\n.npy": npy_of(1.0)}), r"states of 'b\\n' but not of"),
+    "an image of another size": ("depth.npy", lambda c: npy_of(np.ones((12, 17), "u2")), "depth.npy cannot be used: "),
+    "negative depth": ("depth.npy", lambda c: npy_of(-np.ones((12, 16))), "depth.npy cannot be used: "),
+    "a zero in YAML": ("bar.yaml", lambda c: c + b"\0", "this is not YAML .unacceptable character"),
+    "a number beyond all": ("bar.yaml", replaced(b"[120, 5, 5]", b"[1e308, 5, 5]"), "`pivot` is .* less than"),
+    "segments that are none": ("manifest.json", json_with(segments=None), "its 'segments': Input should be"),
+    "a unit below zero": ("manifest.json", json_with(unit_m=-1), "its 'unit_m': Input should be"),
+    "another model": ("state.json", json_with(model="0" * 64), "state.json does not lead to a registration: "),
+    "a pose that no rotation fits": ("start.json", json_with(object=np.ones((4, 4)).tolist()), "start.json cannot"),
+    "an extension of 2 GB": ("labels.nii", at(352, struct.pack("<i", 2**31 - 16)), "labels.nii cannot be read"),
+}  # fmt: skip
+
+
+def npy_of(values: object) -> bytes:
+    file = io.BytesIO()
+    np.save(file, np.asarray(values))
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_one_sentence_now(case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    name, change, expected = CASES[case]
+    if name not in TARGETS:
+        pytest.skip(f"nothing is installed that reads {name}")
+    target, path = TARGETS[name], tmp_path / name
+    target.write(path)
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(ValueError, match=expected):
+        target.read(path)
+    assert fault_of(target.read, path, (tmp_path.name,)) == (False, None)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["depth.tif", "text.stl", "labels.nii"])
+def test_libraries_say_nothing_of_their_own(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Pillow warned, trimesh logged a traceback and nibabel what it had changed in the header."""
+    changes = {"depth.tif": lambda c: c[:-7], "text.stl": replaced(b"normal ", b"normal x"), "labels.nii": at(0, b"\0")}
+    target, path = TARGETS[name], tmp_path / name
+    target.write(path)
+    path.write_bytes(changes[name](path.read_bytes()))
+    _, fault = fault_of(target.read, path)
+    assert fault is None and capfd.readouterr() == ("", "")
+
+
+def test_a_checkpoint_of_another_run_is_refused_before_training_begins(tmp_path: Path) -> None:
+    target, path = TARGETS["checkpoint.safetensors"], tmp_path / "checkpoint.safetensors"
+    target.write(path)
+    whole = load_file(path)
+    for name, value in (("optimizer/0/exp_avg", torch.ones(7)), ("optimizer/0", torch.ones(1)), ("network/x", None)):
+        tensors = {**whole, name: torch.ones(2) if value is None else value}
+        save_file(tensors, path, metadata={"step": "3"})
+        with pytest.raises(ValueError, match=r"checkpoint.safetensors cannot be read \(.*\); delete it to train"):
+            target.read(path)
+
+
+def test_a_terminal_obeys_no_file(capsys: pytest.CaptureFixture[str]) -> None:
+    error = ValueError("the segment \x1b[31mred\x07 is unknown;\n\u2028correct it")
+    assert command_line.one_line(error) == r"the segment \x1b[31mred\x07 is unknown; correct it"
+
+
+def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.CaptureFixture[str]) -> None:
+    assert len(reason(ValueError("a" * 5000))) == 303
+    with without_output():
+        print("text")
+        os.write(2, b"text")
+    assert capfd.readouterr() == ("", "")
+    with quiet():
+        assert np.float64(1e308) * 10 == np.inf
+
+
+def test_a_depth_that_signals_is_no_measurement(tmp_path: Path) -> None:
+    path = tmp_path / "depth.tif"
+    TARGETS["depth.tif"].write(path)
+    values = np.full((12, 16), 0.7, "<f4")
+    values.view("<u4")[0, 0] = 0x7F800001
+    Image.fromarray(values).save(path)
+    assert fault_of(TARGETS["depth.tif"].read, path) == (True, None)

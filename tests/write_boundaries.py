@@ -1,0 +1,99 @@
+"""What must be true of a command that was killed at a write boundary, and of the same command after it."""
+
+import re
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from failpoints import Commands
+
+FOREIGN = ("thesis.tex", ".out.mine.partial/mine.txt", ".out.00000000.partial/mine.txt")
+"""Files of somebody else beside an output, two in folders that look like mereo's own."""
+
+TIMES = re.compile(rb'"timings_s": {[^}]*}|"seconds": [0-9.e+-]+')
+"""Durations in JSON, and in pages that hold it: all that differs between two runs of a command."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Command that writes ``out`` (or ``out.SUFFIX``).
+
+    Attributes:
+        arguments: the command line, with INPUTS for the folder of its inputs.
+        again: what is added where the same command refuses because its result, or a part of it, is there; where
+            nothing can be added, what it says of a whole result.
+        timed: files that hold durations.
+        first: a command that writes the result which this one replaces.
+    """
+
+    arguments: str
+    again: str = ""
+    timed: tuple[str, ...] = ()
+    first: str = ""
+
+
+def check_boundaries(
+    commands: Commands, case: Case, inputs: Path, folder: Path, *, every_call: bool, step: int = 1, start: int = 0
+) -> None:
+    """Kill a command before and after each of its calls (every ``step``-th), and demand the whole result of the next.
+
+    The next one succeeds, or refuses in one sentence and succeeds with ``case.again``. The result has the same bytes as
+    one that was never disturbed; nothing is left over, and no file of somebody else has changed.
+    """
+    arguments, before = case.arguments.replace("INPUTS", str(inputs)), _content(inputs, case)
+    whole = folder / "whole"
+    _prepare(commands, case, inputs, whole)
+    undisturbed = commands.run(whole, arguments, every_call=every_call)
+    assert undisturbed.code == 0 and undisturbed.calls, undisturbed.said
+    expected = _content(whole, case)
+    for number in range(start, len(undisturbed.calls), step):
+        for after in (False, True):
+            place = folder / f"{number}-{after}"
+            _prepare(commands, case, inputs, place)
+            killed = commands.run(place, arguments, at=number, after=after, every_call=every_call)
+            where = f"killed {'after' if after else 'before'} call {number}: {killed.calls[-1]}"
+            assert killed.code == -9, f"{where}\n{killed.said}"
+            _go_on(commands, case, arguments, place, where)
+            assert _names(place) == _names(whole), where
+            assert _content(place, case) == expected, where
+            shutil.rmtree(place)
+    assert _content(inputs, case) == before
+
+
+def _prepare(commands: Commands, case: Case, inputs: Path, place: Path) -> None:
+    for name in FOREIGN:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_text("precious")
+    if case.first:
+        first = commands.run(place, case.first.replace("INPUTS", str(inputs)))
+        assert first.code == 0, first.said
+
+
+def _go_on(commands: Commands, case: Case, arguments: str, place: Path, where: str) -> None:
+    """The same command again, as a person would give it."""
+    done = commands.run(place, arguments)
+    if done.code:
+        assert (done.code, done.said.count("mereo: error: ")) == (2, 1), f"{where}\n{done.said}"
+        assert case.again and case.again in done.said, f"{where}\n{done.said}"
+        if not case.again.startswith("--"):
+            return
+        done = commands.run(place, f"{arguments} {case.again}")
+    assert done.code == 0, f"{where}\n{done.said}"
+
+
+def _names(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+
+
+def _content(folder: Path, case: Case) -> dict[str, bytes]:
+    """Bytes of all files, without durations; the list of digests, which differs with them, says no more."""
+    return {
+        name: TIMES.sub(b"", path.read_bytes()) if path.name in case.timed else path.read_bytes()
+        for name, path in _files(folder)
+        if not (case.timed and path.name == ".mereo.json")
+    }
+
+
+def _files(folder: Path) -> Iterable[tuple[str, Path]]:
+    return ((path.relative_to(folder).as_posix(), path) for path in sorted(folder.rglob("*")) if path.is_file())
