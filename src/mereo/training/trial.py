@@ -12,7 +12,8 @@ from mereo.models.device import keep_freed_memory, pick_device
 from mereo.models.weights import shipped_names
 from mereo.training.config import TrainConfig
 from mereo.training.dataset import Batch, Dataset
-from mereo.training.run_directory import Process, fit_config, start_network
+from mereo.training.processes import Process
+from mereo.training.run_directory import fit_config, start_network
 from mereo.training.trainer import Trainer
 from mereo.training.validation import validate
 
