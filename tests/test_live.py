@@ -138,14 +138,11 @@ def test_no_damaged_frame_ends_a_stream(
     assert all("\n" not in one["error"] for one in lines if "error" in one)
 
 
-def test_a_place_that_takes_no_surfaces_is_each_frames_error(
-    sequence: tuple[Path, list[SegmentedMesh]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.save(tmp_path / "0.npy", sequence[1][0].segments[0].vertices)
+def test_a_file_is_no_place_for_surfaces(tmp_path: Path) -> None:
+    """Which is said before the weights are loaded and any frame is answered."""
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match="none of the 1 frames could be answered"):
-        stream_reconstructions(str(tmp_path), "rope", resolution=24, surfaces=tmp_path / "file")
-    assert "error" in json.loads(capsys.readouterr().out)
+    with pytest.raises(FileExistsError, match="file is a file; surfaces are written into a folder: choose another"):
+        stream_reconstructions(str(tmp_path), "no such weights", surfaces=tmp_path / "file")
 
 
 def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(

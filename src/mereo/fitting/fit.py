@@ -4,6 +4,8 @@ code -correspondences-> pose and state of the model -deform-> SegmentedMesh, and
 """
 
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,7 +18,7 @@ from mereo.fitting.correspondences import Correspondences, find_correspondences
 from mereo.fitting.draws_fit import fit_draws
 from mereo.fitting.draws_problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws_problem import narrowing as draws_narrowing
-from mereo.fitting.evidence import Evidence
+from mereo.fitting.evidence import MOST_POINTS, Evidence
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.modes_fit import Judged, fit_modes
 from mereo.fitting.playback import DrawnStates
@@ -26,6 +28,8 @@ from mereo.fitting.residuals import Surface
 from mereo.fitting.rest_fit import fit_rest, is_at_rest
 from mereo.fitting.rest_fit import narrowing as modes_narrowing
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.downsampling import means_along_sight
+from mereo.geometry.smoothing import smoothed
 from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -37,6 +41,11 @@ UNIT_TOLERANCE = 0.15
 
 SCALE_PAIRS = 4000
 """Pairs of correspondences whose distances, there and at rest, tell an unknown unit."""
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Hold BLAS to one thread: products this small are slower on two, 20 times on busy cores."""
+    return threadpool_limits(1, "blas")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +77,40 @@ class ModesFit:
         scene_unit: float | None = None,
         config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
         doubtful: Float[np.ndarray, "d 3"] | None = None,
+        ask_again: Callable[[], Correspondences] | None = None,
     ) -> "ModesFit":
         """Fit of the modes to a cloud, seen from the origin, with correspondences in its unit.
 
-        ``doubtful`` points are none of the cloud: along their lines of sight nothing is known (``Evidence.of``).
+        Where what the fit leaves over is noise, the frame is fitted once more as a noisy one. Whether that is so is
+        asked of the second fit: noise throws the first off by more than it is itself.
+
+        Args:
+            points: the cloud.
+            found: correspondences.
+            model: the statistical model.
+            scene_unit: length of a scene unit in the cloud's unit, where it is known.
+            config: constants.
+            doubtful: points that are none of the cloud: along their lines of sight nothing is known (``Evidence.of``).
+            ask_again: gives better correspondences of a noisy frame, in the cloud's unit.
         """
         started = time.perf_counter()
         unit = estimate_unit(found) if scene_unit is None else scene_unit
         scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD
         found = found.scaled(1 / unit)
-        with threadpool_limits(1, "blas"):  # products this small are slower on two threads, 20 times on busy cores
+        with one_thread():
             evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit)
             problem = Problem.of(model, found, evidence, scale_std, config)
-            problem, modes = fit_as_noisy(problem)
+            modes = fit_modes(problem)
+            noisy = problem.as_noisy_as(modes.posed)
+        if noisy is not None:
+            others = [] if ask_again is None else [ask_again().scaled(1 / unit)]
+            with one_thread():
+                candidates = [(found, noisy), *((other, noisy.with_network(other)) for other in others)]
+                fits = [(*candidate, fit_modes(candidate[1])) for candidate in candidates]
+                other, noisy, again = min(fits, key=lambda fit: fit[2].misfit.without_network)
+                if noisy.leaves_noise(again.posed):
+                    problem, found, modes = noisy, other, again
+        with one_thread():
             rest = fit_rest(problem, found, modes.posed)
             at_rest = is_at_rest(problem, modes, rest)
         return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
@@ -117,7 +147,7 @@ class ModesFit:
         if self.rest is not None:
             return self.registration()
         started = time.perf_counter()
-        with threadpool_limits(1, "blas"):
+        with one_thread():
             problem = DrawsProblem.of(self.problem, states, self.found)
             drawn = fit_draws(problem, self.posed)
             taken = drawn is not None and is_drawn(problem, drawn, self.posed)
@@ -149,19 +179,6 @@ class ModesFit:
             seconds=seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
         )
-
-
-def fit_as_noisy(problem: Problem) -> tuple[Problem, Judged]:
-    """Fit of the modes, once more as to a noisy frame where what it leaves over is rough and the second fit is right.
-
-    Whether a fit is right is asked of the second: noise throws the first off by more than it is itself.
-    """
-    first = fit_modes(problem)
-    noisy = problem.as_noisy_as(first.posed)
-    if noisy is None:
-        return problem, first
-    again = fit_modes(noisy)
-    return (noisy, again) if noisy.leaves_noise(again.posed) else (problem, first)
 
 
 def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:
@@ -201,17 +218,27 @@ def fit_frame(
             f"{', '.join(model.rest.names)}; they must be of one object: build the model from the weights' own scene"
         )
     code = network.encode(cloud) if code is None else code
+    found = _asked(network, model, code)
+    if scene_unit is None and stated_unit is not None and agree(estimate_unit(found), stated_unit):
+        scene_unit = stated_unit
+    asked = time.perf_counter() - started
+
+    def ask_again() -> Correspondences:
+        calm = smoothed(means_along_sight(cloud.points, MOST_POINTS))
+        return _asked(network, model, network.encode(PointCloud(calm)))
+
+    fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask_again)
+    return replace(fitted, seconds=fitted.seconds + asked)
+
+
+def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
+    """Correspondences that the network states for a cloud, evenly."""
     found = find_correspondences(network, code, model.rest_center, model.half)
     if found is None:
         raise ValueError(
             "the weights predict no rest coordinates, from which a fit starts; train with a dataset that has a template"
         )
-    found = found.evenly()
-    if scene_unit is None and stated_unit is not None and agree(estimate_unit(found), stated_unit):
-        scene_unit = stated_unit
-    asked = time.perf_counter() - started
-    fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful)
-    return replace(fitted, seconds=fitted.seconds + asked)
+    return found.evenly()
 
 
 def fit(

@@ -52,6 +52,11 @@ class Misfit:
     pairs: float
     total: float
 
+    @property
+    def without_network(self) -> float:
+        """The total without the correspondences, for states that were found from different ones."""
+        return self.total - self.network
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -108,6 +113,10 @@ class Problem:
         if config is self.config:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_partners)
+
+    def with_network(self, found: Correspondences) -> "Problem":
+        """The problem with other correspondences."""
+        return replace(self, network=NetworkTerm.of(self.model, found))
 
     def leaves_noise(self, posed: Posed) -> bool:
         """Whether what a fit leaves over is noise, and not its own error."""
