@@ -101,6 +101,18 @@ def test_another_object_is_not_believed(model: StatisticalModel, view: View) -> 
     assert not stretched.accepted
 
 
+def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, registration: Registration) -> None:
+    """Nothing of a right fit; half of a cloud leaves the model's other half where nothing of it was seen."""
+    assert registration.ruled_out == 0.0 and registration.doubt is None
+    points = view.depth.to_points().points
+    half = fit_correspondences(points[points[:, 0] < np.median(points[:, 0])], told(model, view), model, 1.0)
+    assert half.ruled_out is not None and half.ruled_out > 0.1
+    assert half.doubt is not None and "lies where the frame shows none of it" in half.doubt
+    few = replace(registration, explained=0.9)
+    assert few.doubt is not None and few.doubt.startswith("doubtful: 10% of the points are not the model's")
+    assert replace(few, explained=0.93, ruled_out=None).doubt is None
+
+
 def test_to_rest_undoes_to_camera(registration: Registration) -> None:
     points = np.random.default_rng(0).uniform([-17, -5, -4], [17, 5, 4], size=(200, 3))
     labels = registration.rest_solids.label(points)

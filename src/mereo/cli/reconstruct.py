@@ -143,6 +143,8 @@ def facts_of(found: Answer) -> dict[str, object]:
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
         print("that is too little to believe it: --fit auto keeps the network's answer")
+    elif found.taken and registration.doubt is not None:
+        print(registration.doubt)
     return {"answer": source, **describe(registration)}
 
 

@@ -178,6 +178,7 @@ class ModesFit:
             accepted=explained >= self.problem.config.accepted,
             seconds=seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
+            ruled_out=self.problem.ruled_out(surface),
         )
 
 

@@ -31,6 +31,9 @@ COARSE = 3
 BESIDE = 1.0
 """Share of the samples' spacing: a partner so far beside one is still on its plane."""
 
+FAR = 1.0
+"""Scene units beyond its slack by which a vertex is ruled out for good."""
+
 
 @dataclass(frozen=True)
 class Misfit:
@@ -178,6 +181,11 @@ class Problem:
         amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * sigma)[1]
         outside = float(robust_square(amount, sigma, 4 * ROBUST).mean())
         return self.total(cloud, self.network.energy(posed, self.network_sigma), outside, posed.z)
+
+    def ruled_out(self, surface: Surface) -> float:
+        """Share of a surface's vertices that the frame rules out by more than ``FAR``."""
+        amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * self.config.cloud_sigma)[1]
+        return float((amount > FAR).mean())
 
     def total(self, cloud: float, network: float, witnesses: float, z: Float[np.ndarray, " k"]) -> Misfit:
         """Misfit from the mean squares of one partner, one correspondence and one witness."""

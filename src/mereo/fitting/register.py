@@ -177,6 +177,8 @@ def describe(registration: Registration) -> dict[str, object]:
         "explained": registration.explained,
         "accepted": registration.accepted,
         "residual": registration.residual,
+        "ruled_out": registration.ruled_out,
+        "doubt": registration.doubt,
         "beyond_states": registration.beyond_states,
         "scene_unit": registration.scene_unit,
         "unit": "known" if registration.unit_known else "found",

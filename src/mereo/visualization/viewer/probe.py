@@ -147,7 +147,8 @@ def source_of(found: FrameAnswer, registrar: Registrar | None) -> str:
 
 def explained(registration: Registration) -> str:
     """How well a registration explains its frame, in a phrase for people."""
-    return f"registered model ({registration.method}) explains {registration.explained:.1%} of the observed points"
+    told = f"registered model ({registration.method}) explains {registration.explained:.1%} of the observed points"
+    return told if registration.doubt is None or not registration.accepted else f"{told}; {registration.doubt}"
 
 
 def first_hit(
