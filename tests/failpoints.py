@@ -74,14 +74,17 @@ def _serve() -> None:
 
     import mereo.__main__ as command_line
     from mereo.io import output_folders  # noqa: F401 (loaded before the forks, as all below)
+    from mereo.models.export import onnx_export  # noqa: F401
     from mereo.training import model_card, trainer
-    from mereo.visualization import result_files  # noqa: F401
+    from mereo.visualization import result_files
 
     del model_card
     torch.set_num_threads(1)
     make_small_datasets(_Patch())  # type: ignore[arg-type]
     assert trainer.train.__kwdefaults__ is not None
     trainer.train.__kwdefaults__["checkpoint_every_s"] = 0.0
+    assert result_files.evaluate_weights.__kwdefaults__ is not None
+    result_files.evaluate_weights.__kwdefaults__["cells"] = 16
     for line in sys.stdin:
         print(json.dumps(_forked(json.loads(line), command_line.main)), flush=True)
 

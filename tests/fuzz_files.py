@@ -184,11 +184,7 @@ def statistical_model() -> Any:
 
 
 def weights(path: Path) -> None:
-    torch.manual_seed(0)
-    network = Network(PRESETS["tiny"].network, 4).eval()
-    names = statistical_model().rest.names
-    model = Model(network, names, tuple((i, 2, 3) for i in range(4)), statistical_model=statistical_model())
-    save_model(model, path, torch.float16)
+    save_model(tiny_model(), path, torch.float16)
 
 
 def dataset(path: Path) -> None:
@@ -197,6 +193,14 @@ def dataset(path: Path) -> None:
         file.rename(path.parent / file.name)
     (path.parent / "toy").rmdir()
     save_statistical_model(statistical_model(), path.parent / "states.safetensors")
+
+
+@lru_cache(1)
+def tiny_model() -> Model:
+    torch.manual_seed(0)
+    network = Network(PRESETS["tiny"].network, 4).eval()
+    names = statistical_model().rest.names
+    return Model(network, names, tuple((i, 2, 3) for i in range(4)), statistical_model=statistical_model())
 
 
 def checkpoint() -> Checkpoint:

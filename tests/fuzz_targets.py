@@ -49,6 +49,7 @@ from fuzz_files import (
     weights,
     zdf,
 )
+from fuzz_folders import claimed, placed, replaced, result, run, scored, scores, truth
 from written_results import COLORS, grid, segments
 
 from mereo.evaluation.registration.initial_poses import read_start
@@ -158,6 +159,10 @@ ALL: tuple[Target, ...] = (
     Target("state.json", state, read_registration),
     Target("start.json", start, lambda p: read_start(p, rest(), 1.0)),
     Target("view.npz", view, load_view),
+    Target("out/.mereo.json", result, replaced, folder=True),
+    Target("config.json", run, claimed, folder=True),
+    Target("metrics.json", scores, scored),
+    Target("truth.json", truth, placed, folder=True),
 )
 TARGETS = {target.name: target for target in ALL if find_spec(target.library) is not None}
 

@@ -59,6 +59,12 @@ def chunk_size(content: bytes) -> bytes:
     return at(next(starts) + 12, struct.pack("<i", -1))(content)
 
 
+def changed_box(content: bytes) -> bytes:
+    facts = json.loads(content)
+    facts["segments"]["left"]["rest_box"] = [[0, 0, 0], [1e308, 1, 1]]
+    return json.dumps(facts).encode()
+
+
 EMPTY = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (2147483647, 0, 3), }\n")
 CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
@@ -76,6 +82,13 @@ CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "a unit below zero": ("manifest.json", json_with(unit_m=-1), "its 'unit_m': Input should be"),
     "another model": ("state.json", json_with(model="0" * 64), "state.json does not lead to a registration: "),
     "a pose that no rotation fits": ("start.json", json_with(object=np.ones((4, 4)).tolist()), "start.json cannot"),
+    "a run whose recipe is a number": ("config.json", json_with(train=3), "holds no settings of a training"),
+    "a score that is a word": ("metrics.json", json_with(iou="high"), "metrics.json is not what .*'iou': Input should"),
+    "scores of nothing": ("metrics.json", lambda c: c.replace(b"examples", b"e"), "says neither its scans nor its"),
+    "a unit that is none": ("truth.json", json_with(unit="ell"), "its unit is 'ell'"),
+    "a scan of two lines": ("truth.json", json_with(scan="\u2028"), r"the name of its scan is '.u2028'"),
+    "a scan of a long name": ("truth.json", json_with(scan="a" * 5000), "the name of its scan is 'aaa"),
+    "a box that has no size": ("truth.json", changed_box, "is not 2 x 3 numbers up to 1e.12"),
     "an extension of 2 GB": ("labels.nii", at(352, struct.pack("<i", 2**31 - 16)), "labels.nii cannot be read"),
 }  # fmt: skip
 

@@ -232,7 +232,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_no_half_file(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match=rf"the disk is full while writing .*{victim}\.safetensors; free space or"):
+    with pytest.raises(OSError, match=rf"the disk is full while writing .*{victim}\.safetensors: free space or"):
         generate(TOY, tmp_path / "data", SMALL, examples=4, seed=1)
     order = ["manifest.json", "template.safetensors", "statistical_model.safetensors", "shard-00000.safetensors"]
     assert set(contents(tmp_path / "data")) == set(order[: order.index(f"{victim}.safetensors")])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mereo import __main__ as command_line
 from mereo.io.atomic_files import atomic_file, write_json
 from mereo.io.output_folders import claim_directory, new_directory
 
@@ -52,12 +53,14 @@ def test_an_interruption_leaves_everything_as_it_was(tmp_path: Path, interruptio
 
 
 def test_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path: Path) -> None:
-    for place in (atomic_file(tmp_path / "a.bin"), new_directory(tmp_path / "d")):
+    for name, place in (("a.bin", atomic_file(tmp_path / "a.bin")), ("d", new_directory(tmp_path / "d"))):
         with pytest.raises(OSError, match=r"disk is full while writing .*free space") as caught, place as partial:
             (partial / "f" if partial.is_dir() else partial).write_bytes(b"half")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         assert caught.value.errno == errno.ENOSPC
-        assert "\n" not in str(caught.value)
+        assert command_line.one_line(caught.value) == (
+            f"the disk is full while writing {tmp_path / name}: free space or choose another place"
+        )
     assert contents(tmp_path) == {}
 
 

@@ -199,7 +199,7 @@ def test_what_a_killed_process_left_is_removed_by_the_next_one(tmp_path: Path) -
     assert set(os.listdir(tmp_path)) == expected and (own / "mine.txt").exists() and (lockless / "mine.txt").exists()
 
 
-@pytest.mark.parametrize("moment", ["_place", "_remove_written"])
+@pytest.mark.parametrize("moment", ["_place", "_remove_old"])
 def test_a_process_killed_while_it_replaces_loses_neither_result(moment: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     write(out, "first")
@@ -213,6 +213,28 @@ def test_a_process_killed_while_it_replaces_loses_neither_result(moment: str, tm
     assert (out / "deep/a.txt").exists() == (moment == "_place") and (out / MARKER).exists()
     write(out, "second", force=True)
     assert read(out) == "second" and os.listdir(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize("unlinked", range(4))
+def test_a_result_that_was_being_removed_is_not_put_back(unlinked: int, tmp_path: Path) -> None:
+    """Not even where the user has deleted the new one meanwhile: it lacks files. The next run removes what is left."""
+    out = tmp_path / "out"
+    with new_directory(out) as folder:
+        for name in "abc":
+            (folder / name).write_text("first")
+    killed(
+        f"plain, left = Path.unlink, iter(range({unlinked}))\n"
+        "def unlink(path, *more, **options):\n"
+        " if path.parent.name.startswith('.mereo'): next(left, None) is not None or die()\n"
+        " plain(path, *more, **options)\n"
+        "Path.unlink = unlink\n"
+        f"with output_folders.new_directory({str(out)!r}, force=True) as folder:\n (folder / 'n').touch()"
+    )
+    assert {path.name for path in out.iterdir()} == {"n", MARKER}
+    shutil.rmtree(out)
+    write(out, "second")
+    assert read(out) == "second" and {path.name for path in out.iterdir()} == {"deep", MARKER}
+    assert os.listdir(tmp_path) == ["out"]
 
 
 def test_without_locks_leftovers_stay_and_are_in_nobodys_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,13 +6,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from failpoints import Commands
+from failpoints import MOVES, Commands
 
 FOREIGN = ("thesis.tex", ".out.mine.partial/mine.txt", ".out.00000000.partial/mine.txt")
 """Files of somebody else beside an output, two in folders that look like mereo's own."""
 
 TIMES = re.compile(rb'"timings_s": {[^}]*}|"seconds": [0-9.e+-]+')
 """Durations in JSON, and in pages that hold it: all that differs between two runs of a command."""
+
+RARELY = 3
+"""Of calls that give a file its name, of a kind that was tried already, one in so many is tried."""
 
 
 @dataclass(frozen=True)
@@ -25,39 +28,54 @@ class Case:
             nothing can be added, what it says of a whole result.
         timed: files that hold durations.
         first: a command that writes the result which this one replaces.
+        dear: it takes seconds, so it is killed less often.
     """
 
     arguments: str
     again: str = ""
     timed: tuple[str, ...] = ()
     first: str = ""
+    dear: bool = False
 
 
-def check_boundaries(
-    commands: Commands, case: Case, inputs: Path, folder: Path, *, every_call: bool, step: int = 1, start: int = 0
-) -> None:
-    """Kill a command before and after each of its calls (every ``step``-th), and demand the whole result of the next.
+def boundaries(calls: list[str], every_call: bool) -> list[tuple[int, bool]]:
+    """Sample of the moments at which a command is killed: the number of a call, and whether just after it.
+
+    With ``every_call`` before and after the first call of each kind (function and name, but for the numbers in it), and
+    after every third (``RARELY``) of the others that give a file its name; otherwise just after each of ``calls``.
+    """
+    if not every_call:
+        return [(number, True) for number in range(len(calls))]
+    first: dict[str, int] = {}
+    for number, call in enumerate(calls):
+        function, place = call.split(" ", 1)
+        first.setdefault(f"{function} {re.sub('[0-9a-f]{8}|[0-9]+', '0', Path(place).name)}", number)
+    moves = [n for n, call in enumerate(calls) if n not in first.values() and call.split(" ", 1)[0] in MOVES]
+    return [(n, after) for n in first.values() for after in (False, True)] + [(n, True) for n in moves[::RARELY]]
+
+
+def check_boundaries(commands: Commands, case: Case, inputs: Path, folder: Path, *, every_call: bool) -> None:
+    """Kill a command at each of its ``boundaries``, and demand the whole result of the next one.
 
     The next one succeeds, or refuses in one sentence and succeeds with ``case.again``. The result has the same bytes as
     one that was never disturbed; nothing is left over, and no file of somebody else has changed.
     """
     arguments, before = case.arguments.replace("INPUTS", str(inputs)), _content(inputs, case)
-    whole = folder / "whole"
-    _prepare(commands, case, inputs, whole)
+    fresh, whole, place = folder / "fresh", folder / "whole", folder / "place"
+    _prepare(commands, case, inputs, fresh)
+    shutil.copytree(fresh, whole)
     undisturbed = commands.run(whole, arguments, every_call=every_call)
     assert undisturbed.code == 0 and undisturbed.calls, undisturbed.said
     expected = _content(whole, case)
-    for number in range(start, len(undisturbed.calls), step):
-        for after in (False, True):
-            place = folder / f"{number}-{after}"
-            _prepare(commands, case, inputs, place)
-            killed = commands.run(place, arguments, at=number, after=after, every_call=every_call)
-            where = f"killed {'after' if after else 'before'} call {number}: {killed.calls[-1]}"
-            assert killed.code == -9, f"{where}\n{killed.said}"
-            _go_on(commands, case, arguments, place, where)
-            assert _names(place) == _names(whole), where
-            assert _content(place, case) == expected, where
-            shutil.rmtree(place)
+    for number, after in boundaries(undisturbed.calls, every_call):
+        shutil.copytree(fresh, place)
+        killed = commands.run(place, arguments, at=number, after=after, every_call=every_call)
+        where = f"killed {'after' if after else 'before'} call {number}: {killed.calls[-1]}"
+        assert killed.code == -9, f"{where}\n{killed.said}"
+        _go_on(commands, case, arguments, place, where)
+        assert _names(place) == _names(whole), where
+        assert _content(place, case) == expected, where
+        shutil.rmtree(place)
     assert _content(inputs, case) == before
 
 

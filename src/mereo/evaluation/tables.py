@@ -1,12 +1,16 @@
 """Results of an evaluation as ``metrics.json`` and as a table."""
 
-from typing import Any
+import json
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from mereo.evaluation.metrics import Scores, format_score, intersection_over_union
 from mereo.evaluation.results import AnswerScores, Evaluation
 from mereo.evaluation.scoring import CELLS
+from mereo.io.errors import readable
 
 CLEARLY = 0.01
 """Least difference in mIoU (in IoU where there is no mIoU) by which another answer counts as clearly better."""
@@ -88,3 +92,53 @@ def _answer_rows(evaluation: Evaluation, blank: str) -> str:
         title = f"{name} alone, {each['seconds']:.2f} s"
         rows += f"| {title} | {format_score(each['iou'])} | {format_score(each['miou'])} | {blank} |\n"
     return rows
+
+
+# --- read again -------------------------------------------------------------------------------------------------------
+
+Score = Annotated[float, Field(ge=0, le=1)] | None
+"""Null stands for NaN, the score of what is not there."""
+
+
+class _Mean(BaseModel):
+    model_config = ConfigDict(strict=True)
+    iou: Score
+    miou: Score
+
+
+class _Timed(_Mean):
+    seconds: FiniteFloat
+
+
+class _Written(_Mean):
+    """What is read of a file, as any version has written it."""
+
+    per_segment: dict[str, Score]
+    examples: int = 0
+    seed: int = 0
+    noise_std: FiniteFloat = 0.0
+    scans: list[str] = []
+    example_mean: _Mean | None = None
+    network: _Timed | None = None
+    modes: _Timed | None = None
+    full: _Timed | None = None
+
+
+def read_metrics(path: Path) -> dict[str, Any]:
+    """Content of a ``metrics.json``, with None where a score is undefined.
+
+    Raises ``FileNotFoundError``, and ``ValueError`` where it is not what ``mereo evaluate`` writes.
+    """
+    with readable(path, "table of scores"):
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        given = _Written.model_validate(found).model_fields_set
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "content"
+        raise ValueError(
+            f"{path} is not what mereo evaluate writes (its {place!r}: {first['msg']}): evaluate again"
+        ) from None
+    if not {"scans"} <= given and not {"examples", "seed"} <= given:
+        raise ValueError(f"{path} says neither its scans nor its examples and their seed: evaluate again")
+    return found

@@ -16,6 +16,7 @@ from typing import Any
 from mereo.io.atomic_files import write_json
 from mereo.io.scratch_folders import (
     ASIDE,
+    REMOVED,
     abandoned,
     check_place,
     is_being_written,
@@ -168,7 +169,7 @@ def _replace(content: Path, path: Path, replaced: bytes, old: Path) -> None:
         with suppress(OSError):  # there is something again: the old one waits until that has gone
             os.rename(old, path)
         raise
-    _remove_written(old)
+    _remove_old(old)
 
 
 def _put_back(path: Path) -> None:
@@ -178,8 +179,17 @@ def _put_back(path: Path) -> None:
         if old.is_dir() and not path.exists():
             os.rename(old, path)
         elif old.is_dir() and not strangers(old):
-            _remove_written(old)
+            _remove_old(old)
+        _remove_written(scratch / REMOVED)
     remove_abandoned(path)
+
+
+def _remove_old(old: Path) -> None:
+    """Remove an output that waits in a scratch folder, first of all its name, so that no part of it is put back."""
+    removed = old.with_name(REMOVED)
+    with suppress(OSError):  # it is in nobody's way
+        os.rename(old, removed)
+        _remove_written(removed)
 
 
 def _remove_written(folder: Path) -> None:

@@ -26,6 +26,9 @@ LOCK = ".mereo-lock"
 ASIDE = ".mereo-old"
 """Name under which an output that is being replaced waits there; whoever put it there takes it out again."""
 
+REMOVED = ".mereo-removed"
+"""Name of such an output from when its files are being removed: it may lack some, so it is never put back."""
+
 MOST_BYTES = 255 - len("..1a2b3c4d.partial")
 """Length of a name in bytes that leaves room for that of its scratch folder on every usual file system."""
 
@@ -83,9 +86,15 @@ def scratch_folder(path: Path) -> Iterator[Path]:
             with suppress(OSError):  # another process may have written there meanwhile
                 directory.rmdir()
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-            text = f"the disk is full while writing {path}; free space or choose another place"
-            raise OSError(errno.ENOSPC, text) from error
+            raise _full_disk(path) from error
         raise
+
+
+def _full_disk(path: Path) -> OSError:
+    """Error whose text is the whole sentence: the command line adds a cure to texts of the operating system."""
+    error = OSError(f"the disk is full while writing {path}: free space or choose another place")
+    error.errno = errno.ENOSPC
+    return error
 
 
 @contextmanager
@@ -177,7 +186,7 @@ def _scratches(path: Path, names: str = "") -> Iterator[tuple[Path, bool | None]
 
 def _remove(scratch: Path) -> None:
     """Remove a scratch folder, unless an output waits in it; the lock last, by which the next one knows it for ours."""
-    if (scratch / ASIDE).exists():
+    if any((scratch / name).exists() for name in (ASIDE, REMOVED)):  # it may hold what is not ours
         return
     with suppress(OSError):  # the next one tries again
         for place in scratch.iterdir():

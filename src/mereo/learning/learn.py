@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mereo.evaluation.scoring import evaluate
+from mereo.evaluation.tables import read_metrics
 from mereo.io.atomic_files import atomic_file, write_json
 from mereo.io.output_folders import MARKER, claim_directory
 from mereo.io.scratch_folders import scratch_folder
@@ -121,7 +122,7 @@ def learn(
     if not (output / TEST / MARKER).is_file():
         _evaluate(output, scene, max(clock.left_s, plan.evaluation_s))
     text = write_example_frame(loaded, output / FRAME)
-    metrics: dict[str, Any] = json.loads((output / TEST / "metrics.json").read_text("utf-8"))
+    metrics = read_metrics(output / TEST / "metrics.json")
     show_outcome(metrics, output, scene, text, minutes, (time.monotonic() - clock.started) / 60)
     return metrics
 

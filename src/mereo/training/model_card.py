@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from mereo.evaluation.metrics import format_score
+from mereo.evaluation.tables import read_metrics
 from mereo.io.output_folders import new_directory
 from mereo.models.config import NetworkConfig
 from mereo.models.model import Model
@@ -187,7 +188,7 @@ def _metrics(folder: Path, model: Model) -> dict[str, Any]:
     path = folder / "metrics.json"
     if not path.is_file():
         raise FileNotFoundError(f"{folder} has no metrics.json; --tests takes folders that mereo evaluate has written")
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    found = read_metrics(path)
     if tuple(found["per_segment"]) != model.names:
         raise ValueError(
             f"{folder} is a test of {', '.join(found['per_segment'])}, but the weights know {', '.join(model.names)}; "

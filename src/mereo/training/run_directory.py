@@ -166,7 +166,7 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
 
 def _claim(run_dir: Path, settings: dict[str, Any]) -> None:
     found = claim_directory(run_dir, "config.json", settings, "a training run")
-    before = settings if found is None else _with_defaults(found)
+    before = settings if found is None else _with_defaults(run_dir, found)
     if before != settings:
         odd = _first_difference(before, settings)
         raise ValueError(
@@ -174,10 +174,13 @@ def _claim(run_dir: Path, settings: dict[str, Any]) -> None:
         )
 
 
-def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
+def _with_defaults(run_dir: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """A run's settings; those that an older mereo did not have are as they were then, which is their default."""
     default = json.loads(json.dumps(TrainConfig().to_dict()))
-    train = default | settings.get("train", {})
+    groups = [settings.get("dataset", {}), given := settings.get("train", {})]
+    if not all(isinstance(group, dict) for group in groups) or not isinstance(given.get("network", {}), dict):
+        raise ValueError(f"{run_dir / 'config.json'} holds no settings of a training run: choose another --output")
+    train = default | given
     return settings | {"train": train | {"network": default["network"] | train["network"]}}
 
 
@@ -185,5 +188,5 @@ def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:
     for group in now:
         for key, value in now[group].items():
             if before.get(group, {}).get(key) != value:
-                return f"{group} setting {key} ({before.get(group, {}).get(key)!r} instead of {value!r})"
+                return f"{group} setting {key} ({before.get(group, {}).get(key)!r:.80} instead of {value!r})"
     return "format"

@@ -5,7 +5,7 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -22,6 +22,12 @@ from mereo.scenes.scene import SCENES, Scene
 
 TRUTH = "truth.json"
 """Name of the file."""
+
+LARGEST = 1e12
+"""Number in any unit that is beyond every scan; products of larger ones may be infinite."""
+
+MOST_CHARACTERS = 1000
+"""Length of the scan's name."""
 
 FORMAT = 1
 """Version of the file's format; others are not read."""
@@ -104,12 +110,16 @@ def read_truth(path: str | Path, scene: Scene | None = None) -> PosedScan:
         poses = {name: _array(entry["T_scan_segment"], (4, 4)) for name, entry in facts["segments"].items()}
         boxes = {name: _array(entry["rest_box"], (2, 3)) for name, entry in facts["segments"].items()}
         scan = ScanFile(path.parent / facts["scan"], facts["unit"], facts["frame"], facts["drop_invalid"])
+        if not str(scan.path).isprintable() or len(facts["scan"]) > MOST_CHARACTERS:
+            raise ValueError(f"the name of its scan is {facts['scan']!r:.40}")
+        if scan.unit not in UNITS_M or scan.frame not in get_args(CloudAxes):
+            raise ValueError(f"its unit is {scan.unit!r:.40} and its frame {scan.frame!r:.40}, which are unknown")
         name, scan_sha256 = str(facts["scene"]), facts["scan_sha256"]
     loaded = scene_named_in(path, name) if scene is None else scene
     rest, unit_m = loaded.rest, loaded.unit_m
     if rest.names != tuple(poses) or not _same_place(rest, boxes):
         raise ValueError(f"the meshes of the scene {name!r} are not those that {path} was made with: align again")
-    if not scan.path.exists():
+    if not scan.path.is_file():
         raise FileNotFoundError(f"{scan.path}, the scan of {path}, does not exist: put it there, or align again")
     if sha256_of(scan.path) != scan_sha256:
         raise ValueError(f"{scan.path} is not the file that {path} was made from (another SHA-256): align it again")
@@ -121,8 +131,8 @@ def read_truth(path: str | Path, scene: Scene | None = None) -> PosedScan:
 
 def _array(value: Any, shape: tuple[int, int]) -> np.ndarray:
     array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"an array in it is not {shape[0]} x {shape[1]} numbers")
+    if array.shape != shape or not (np.abs(array) <= LARGEST).all():
+        raise ValueError(f"an array in it is not {shape[0]} x {shape[1]} numbers up to {LARGEST:g}")
     return array
 
 

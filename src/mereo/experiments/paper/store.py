@@ -13,6 +13,7 @@ from typing import Any
 
 from mereo.evaluation.results import EvaluatedView
 from mereo.evaluation.scoring import evaluate
+from mereo.evaluation.tables import read_metrics
 from mereo.experiments.paper.scales import TRAINING_SEED
 from mereo.io.atomic_files import write_json
 from mereo.models.weights import load_model
@@ -98,12 +99,13 @@ def example_view(weights: Path, settings: GenerateConfig, cells: int) -> Evaluat
 
 def read_score(path: Path) -> Score:
     """Score from the ``metrics.json`` of an evaluation, in which null stands for NaN."""
-    metrics = json.loads(path.read_text("utf-8"), object_hook=_with_nan)
-    mean = metrics["example_mean"]
-    return Score(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"], metrics["per_segment"])
+    metrics = read_metrics(path)
+    mean, segments = _with_nan(metrics["example_mean"]), _with_nan(metrics["per_segment"])
+    scores = _with_nan({name: metrics[name] for name in ("iou", "miou")})
+    return Score(scores["iou"], scores["miou"], mean["iou"], mean["miou"], segments)
 
 
-def _with_nan(read: dict[str, Any]) -> dict[str, Any]:
+def _with_nan(read: dict[str, float | None]) -> dict[str, float]:
     return {key: float("nan") if value is None else value for key, value in read.items()}
 
 
