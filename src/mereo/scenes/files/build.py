@@ -18,6 +18,7 @@ from mereo.geometry.mesh_check import examine
 from mereo.geometry.normalizer import Normalizer
 from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.deformation_blocks import AnyDeformation, LatticeBlock, Misfit, Target
+from mereo.scenes.files.refinement import refined
 from mereo.scenes.files.schema import CameraBlock, SceneFile
 from mereo.scenes.files.segments import read_segments
 from mereo.scenes.recorded_states import load_states
@@ -85,7 +86,8 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
         definition += _digest(document.path.parent / file.states)
     else:
         motions = _random_motion(document, placement, rest, file.deformations)
-        scene = Scene(file.name, rest, motions, workspace, file.source)
+        rest = refined(rest, motions)
+        scene = Scene(file.name, rest, replace(motions, rest=rest), workspace, file.source)
     return replace(scene, unit_m=unit_m, T_scene_source=placement.matrix, definition=definition)
 
 
