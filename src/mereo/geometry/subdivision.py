@@ -20,7 +20,9 @@ def split_long_edges(
     more than ``most`` faces.
     """
     try:
-        return split_edges(vertices, faces, lambda ends: np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > longest, most)
+        return split_edges(
+            vertices, faces, lambda ends: np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > longest, most
+        )
     except TooManyFaces:
         raise ValueError(
             f"a mesh would take {most:,} triangles or more to have no edge over {longest:.3g}; it is too large, or "

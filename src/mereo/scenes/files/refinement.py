@@ -51,9 +51,7 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
             tolerance *= 2
 
 
-def _refined(
-    rest: SegmentedMesh, states: list[tuple[Deformation, ...]], tolerance: float, most: int
-) -> SegmentedMesh:
+def _refined(rest: SegmentedMesh, states: list[tuple[Deformation, ...]], tolerance: float, most: int) -> SegmentedMesh:
     segments = []
     for index, segment in enumerate(rest.segments):
         maps = [state[index] for state in states]
@@ -63,7 +61,9 @@ def _refined(
 
         vertices, faces = split_edges(segment.vertices, segment.faces, bent, most)
         most -= len(faces)
-        segments.append(segment if len(faces) == len(segment.faces) else replace(segment, vertices=vertices, faces=faces))
+        segments.append(
+            segment if len(faces) == len(segment.faces) else replace(segment, vertices=vertices, faces=faces)
+        )
     return replace(rest, segments=tuple(segments))
 
 
