@@ -33,7 +33,8 @@ def report_states(scene: Scene) -> int:
     print(f"motion: {moved.mean:.1%} of the longest side in a typical state, {moved.largest:.1%} where it moves most")
     print(f"up: {_direction(scene.workspace)}")
     worst: dict[frozenset[str], Overlap] = {}
-    seen, pixels = 1.0, []
+    seen = 1.0
+    pixels: list[int] = []
     for index in range(STATES):
         rng = example_rng(0, index)
         mesh = scene.sample_state(rng).mesh
@@ -41,7 +42,8 @@ def report_states(scene: Scene) -> int:
             pair = frozenset((found.small, found.large))
             worst[pair] = max(worst.get(pair, found), found, key=lambda overlap: overlap.share)
         share, count = _view(scene.workspace, mesh, rng)
-        seen, pixels = min(seen, share), [*pixels, count]
+        seen = min(seen, share)
+        pixels.append(count)
     middle = np.median(pixels)
     print(f"picture: a typical view shows it in {middle:.0f} of {WIDTH**2:,} pixels ({middle / WIDTH**2:.1%})")
     for overlap in worst.values():

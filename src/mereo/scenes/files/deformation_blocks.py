@@ -5,12 +5,13 @@ units and radians.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, FiniteFloat, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, FiniteFloat, model_serializer, model_validator
 
 from mereo.deformation import samplers
 from mereo.deformation.samplers import DeformationSampler
@@ -95,9 +96,9 @@ class LatticeBlock(DeformationBlock):
         return self
 
     @model_serializer(mode="wrap")
-    def _without_absent_spacing(self, serialize: SerializerFunctionWrapHandler) -> dict[str, object]:
+    def _without_absent_spacing(self, serialize: Callable[["LatticeBlock"], dict[str, object]]) -> dict[str, object]:
         # datasets keep a digest of what their scene file says, and most are from before there was a spacing
-        written: dict[str, object] = serialize(self)
+        written = serialize(self)
         if self.spacing is None:
             del written["spacing"]
         return written
