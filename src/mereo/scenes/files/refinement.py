@@ -11,16 +11,16 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.scenes.seeds import example_rng
 
-TOLERANCE = 0.02
-"""How far, in scene units, a straight edge may leave the curve that the map makes of it: a fifth of the noise."""
+TOLERANCE = 0.05
+"""How far, in scene units, a straight edge may leave the curve that the map makes of it: half of the noise."""
 
-SHORTEST = 0.5
-"""Edges up to this long, in scene units, are not halved: they follow any bend down to a radius of 1.6."""
+SHORTEST = 1.0
+"""Edges up to this long, in scene units, are not halved: they follow any bend down to a radius of 2.5."""
 
 STATES = 8
 """Random states in which every edge is compared with its curve."""
 
-MOST_FACES = 40_000
+MOST_FACES = 20_000
 """Faces of all segments that refinement may lead to; beyond it the tolerance doubles."""
 
 PLACES = ((0.5, 0.5), (0.25, 0.75), (0.75, 0.25))
