@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo.deformation.maps import Deformation
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh, surface_points
 from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.scenes.seeds import example_rng
 
@@ -34,7 +34,7 @@ class Motion:
 
 def motion(rest: SegmentedMesh, draw: Draw, states: int = STATES) -> Motion:
     """Motion of an object in ``states`` random states, which are the same in every call."""
-    points, owner = surface_points(rest, POINTS)
+    points, owner = material_points(rest, POINTS)
     length = float((rest.bounds[1] - rest.bounds[0]).max())
     means, most = [], []
     for index in range(states):
@@ -56,17 +56,8 @@ def move(
     return result
 
 
-def surface_points(mesh: SegmentedMesh, count: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Points evenly spread over the surface of all segments, and the index of the segment of each.
-
-    Vertices would not do: a CAD program's are where a surface is round, none where it is flat.
-    """
+def material_points(mesh: SegmentedMesh, count: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """Points evenly spread over the surface of all segments, and the index of the segment of each."""
     vertices, faces, owner = mesh.merged()
-    rng = np.random.default_rng(0)
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    chosen = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
-    u, v = rng.random((2, count, 1))
-    folded = u + v > 1
-    u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
-    return a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen], owner[chosen]
+    points, face = surface_points(vertices, faces, count)
+    return points, owner[face]

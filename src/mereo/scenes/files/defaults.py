@@ -15,7 +15,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.scenes.files.deformation_blocks import BendBlock, DeformationBlock, LatticeBlock, Target
-from mereo.scenes.motion import Draw, motion, move, surface_points
+from mereo.scenes.motion import Draw, material_points, motion, move
 from mereo.scenes.scene import Workspace
 from mereo.scenes.seeds import example_rng
 
@@ -139,7 +139,7 @@ def default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> View:
 
 def _states(rest: SegmentedMesh, draw: Draw) -> list[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "3"]]]:
     """Places of the surface in random states, and the middle of their box, at which the camera aims."""
-    points, owner = surface_points(rest, FRAMED)
+    points, owner = material_points(rest, FRAMED)
     corners = [segment.vertices[:: 1 + len(segment.vertices) // FRAMED] for segment in rest.segments]
     owner = np.concatenate([owner, np.repeat(np.arange(len(corners)), [len(part) for part in corners])])
     points = np.concatenate([points, *corners])

@@ -18,6 +18,7 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.files.build import placed
 from mereo.scenes.files.defaults import default_deformations, default_view, random_motion, rounded
 from mereo.scenes.files.deformation_blocks import BendBlock, LatticeBlock
+from mereo.scenes.files.joints import proposed_joints
 from mereo.scenes.scene import SCENES, Workspace
 
 SIZE = 20.0
@@ -39,14 +40,16 @@ class _Source:
         reason: why.
         up: the axis that likely points upwards, 1 for y or 2 for z.
         up_reason: why.
+        assembly: whether the segments are parts, which may be jointed, and not regions of one body.
     """
 
     block: str
     mesh: SegmentedMesh
     unit: str
     reason: str
-    up: int = 2
-    up_reason: str = "as CAD programs and medical volumes mostly have it"
+    up: int
+    up_reason: str
+    assembly: bool = True
 
 
 def write_scene_file(
@@ -134,7 +137,7 @@ def _from_volume(file: Path, relative: str) -> _Source:
     lines = [f"labels: {quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
     lines += [f"  {value}: {quoted(name)}" for value, name in names.items()]
     lines.append(f"cells: {LABEL_CELLS}  # of the grid along the longest side on which surfaces are found")
-    return _Source("\n".join(lines), mesh, "mm", "the convention of NIfTI and NRRD", 2, "z is to the head")
+    return _Source("\n".join(lines), mesh, "mm", "the convention of NIfTI and NRRD", 2, "z is to the head", False)
 
 
 def _unit_of(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str]:
@@ -159,8 +162,7 @@ def _up_of(file: Path) -> tuple[int, str]:
 
 
 def _text(name: str, source: _Source, units: str | None) -> str:
-    low, high = source.mesh.bounds
-    sides = high - low
+    sides = np.ptp(source.mesh.bounds, axis=0)
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
     blocks = default_deformations(source.mesh)
@@ -184,15 +186,35 @@ def _text(name: str, source: _Source, units: str | None) -> str:
         view=view.field_of_view,
         spacing=f"{lattice.spacing:g}",
         strength=f"{lattice.strength:g}",
-        center=_numbers((low + high) / 2),
         end=_numbers(np.array(bend.origin)),
         axis=[int(value) for value in bend.axis],
         length=f"{bend.length:g}",
         angle=f"{bend.angle[1]:g}",
-        part=quoted(source.mesh.names[-1]),
+        joints=_joints(source.mesh, source.assembly),
         push=f"{0.1 * sides.min():.3g}",
         reach=f"{0.5 * sides.min():.3g}",
     )
+
+
+def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
+    """Comments: the joints that the parts seem to have, and what each was found from; else an example."""
+    lines = []
+    for joint in proposed_joints(mesh) if assembly else ():
+        contact = joint.contact
+        round_one = f"the round contact, radius {contact.radius:.3g},"
+        found = f"{round_one if joint.hinge else 'the flat contact'} of {{}} and {{}}".format(
+            *(mesh.names[index] for index in (contact.first, contact.second))
+        )
+        lines += [
+            f"#  - type: joint  # {'turns on' if joint.hinge else 'slides along'} {found}",
+            f"#    segments: [{', '.join(quoted(mesh.names[index]) for index in joint.moved)}]",
+            f"#    pivot: {_numbers(contact.point)}",
+            f"#    axis: {_numbers(joint.axis)}",
+            f"#    {'angle' if joint.hinge else 'slide'}: [{joint.most[0]:.4g}, {joint.most[1]:.4g}]",
+        ]
+    if not lines:
+        return EXAMPLE_JOINT.format(part=quoted(mesh.names[-1]), center=_numbers(mesh.bounds.mean(axis=0)))
+    return "".join(line + "\n" for line in (JOINTS, *lines))
 
 
 def _color(number: int) -> str:
@@ -207,8 +229,43 @@ def quoted(text: str) -> str:
 
 
 def _numbers(values: Float[np.ndarray, "3"]) -> str:
-    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+    largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing beside it is rounding
+    return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
 
+
+JOINTS = "# Joints that the contacts suggest, in ranges without collisions, to be had without the '#'; the tip comes first:"
+
+EXAMPLE_JOINT.format(part=quoted(mesh.names[-1]), center=_numbers(mesh.bounds.mean(axis=0)))
+    return "".join(line + "\n" for line in (JOINTS, *lines))
+
+
+def _color(number: int) -> str:
+    return str(list(PALETTE[number % len(PALETTE)]))
+
+
+def quoted(text: str) -> str:
+    """Text as a YAML value on one line: quoted unless it is a plain word."""
+    plain = re.fullmatch(r"[A-Za-z_./][\w./ -]*", text) and not text.endswith(" ")
+    reserved = text.lower() in ("yes", "no", "on", "off", "true", "false", "null", "y", "n")
+    return text if plain and not reserved else "'" + text.replace("'", "''") + "'"
+
+
+def _numbers(values: Float[np.ndarray, "3"]) -> str:
+    largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing beside it is rounding
+    return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
+
+
+JOINTS = """\
+# Joints that the contacts of the parts suggest, in ranges without collisions; remove the '#'. They come before what bends
+# the whole, and in a chain the one at the tip comes first."""
+
+EXAMPLE_JOINT = """\
+#  - type: joint  # rigid, and before what bends the whole; in a chain, the joint at the tip comes first
+#    segments: [{part}]
+#    pivot: {center}
+#    axis: [0, 0, 1]
+#    angle: [-30, 30]
+"""
 
 TEMPLATE = """\
 # A scene for mereo: what the object is, how it may deform, and from where it is seen.
@@ -236,7 +293,7 @@ camera:
 # Segments that touch should move by the same deformations, so that they stay in contact. These bend the object as if it
 # were of rubber, as far as suits soft things: for what has joints, drop them and say how its parts move.
 deformations:
-  - type: bend  # along the longest side, to any side
+{joints}  - type: bend  # along the longest side, to any side
     origin: {end}
     axis: {axis}
     length: {length}
@@ -261,11 +318,6 @@ deformations:
 #    distance: [-{push}, {push}]
 #    tip: {push}
 #    reach: {reach}
-#  - type: joint  # rigid; in a chain, the joint at the tip comes first
-#    segments: [{part}]
-#    pivot: {center}
-#    axis: [0, 0, 1]
-#    angle: [-30, 30]
 # Recorded frames of a simulator take the place of all deformations:
 #states: states.npz
 """
