@@ -233,31 +233,7 @@ def _numbers(values: Float[np.ndarray, "3"]) -> str:
     return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
 
 
-JOINTS = "# Joints that the contacts suggest, in ranges without collisions, to be had without the '#'; the tip comes first:"
-
-EXAMPLE_JOINT.format(part=quoted(mesh.names[-1]), center=_numbers(mesh.bounds.mean(axis=0)))
-    return "".join(line + "\n" for line in (JOINTS, *lines))
-
-
-def _color(number: int) -> str:
-    return str(list(PALETTE[number % len(PALETTE)]))
-
-
-def quoted(text: str) -> str:
-    """Text as a YAML value on one line: quoted unless it is a plain word."""
-    plain = re.fullmatch(r"[A-Za-z_./][\w./ -]*", text) and not text.endswith(" ")
-    reserved = text.lower() in ("yes", "no", "on", "off", "true", "false", "null", "y", "n")
-    return text if plain and not reserved else "'" + text.replace("'", "''") + "'"
-
-
-def _numbers(values: Float[np.ndarray, "3"]) -> str:
-    largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing beside it is rounding
-    return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
-
-
-JOINTS = """\
-# Joints that the contacts of the parts suggest, in ranges without collisions; remove the '#'. They come before what bends
-# the whole, and in a chain the one at the tip comes first."""
+JOINTS = "# Joints that the contacts suggest, in ranges without collisions; remove the '#'. The tip comes first:"
 
 EXAMPLE_JOINT = """\
 #  - type: joint  # rigid, and before what bends the whole; in a chain, the joint at the tip comes first
