@@ -8,15 +8,17 @@ from typing import get_args
 import numpy as np
 import pytest
 import trimesh
+from overlapping import check_overlap
 from scene_files import HEAD, write_bar, write_mesh
 from shapes import ball, box
 
 from mereo.deformation.maps import jacobian_determinant
 from mereo.deformation.samplers import RandomMotion
-from mereo.deformation.warps import FreeFormLattice
+from mereo.deformation.warps import Bend, FreeFormLattice
 from mereo.geometry.mesh import PALETTE
 from mereo.scenes.files.deformation_blocks import AnyDeformation
 from mereo.scenes.files.schema import SceneFile
+from mereo.scenes.motion import motion
 from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES
@@ -46,13 +48,13 @@ def test_the_scene_has_the_files_segments_in_scene_units(tmp_path: Path) -> None
     scene.rest.check()
 
 
-def test_without_deformations_there_is_a_lattice_sized_to_the_object(tmp_path: Path) -> None:
+def test_without_deformations_it_bends_as_much_as_the_default_should(tmp_path: Path) -> None:
     scene = load_scene(write_bar(tmp_path))
     maps = scene.sample_deformations(np.random.default_rng(0))
-    (lattice,) = maps[0].parts  # type: ignore[attr-defined]
-    assert isinstance(lattice, FreeFormLattice)
-    assert lattice.displacements.shape == (6 + 3, 2 + 3, 2 + 3, 3)
+    assert [type(part) for part in maps[0].parts] == [Bend, FreeFormLattice, FreeFormLattice]  # type: ignore[attr-defined]
     assert maps[0] is maps[1]
+    assert motion(scene.rest, scene.sample_deformations).mean == pytest.approx(0.05, rel=0.1)
+    assert scene.definition != load_scene(write_bar(tmp_path, "deformations: [{type: lattice}]\n")).definition
 
 
 def test_every_deformation_keeps_space_from_folding(tmp_path: Path) -> None:
@@ -62,9 +64,10 @@ def test_every_deformation_keeps_space_from_folding(tmp_path: Path) -> None:
     moved = 0.0
     for _ in range(40):
         for segment, deformation in zip(scene.rest.segments, scene.sample_deformations(rng), strict=True):
-            weights = rng.dirichlet([1, 1], size=len(segment.vertices))
-            inner = weights[:, :1] * segment.vertices + weights[:, 1:] * segment.bounds.mean(axis=0)
-            assert jacobian_determinant(deformation, np.concatenate([inner, segment.vertices])).min() > 0
+            vertices = rng.choice(segment.vertices, 200)
+            weights = rng.dirichlet([1, 1], size=len(vertices))
+            inner = weights[:, :1] * vertices + weights[:, 1:] * segment.bounds.mean(axis=0)
+            assert jacobian_determinant(deformation, np.concatenate([inner, vertices])).min() > 0
             moved = max(moved, float(np.abs(deformation(inner) - inner).max()))
     assert moved > 10
 
@@ -93,15 +96,15 @@ def test_a_joint_turns_about_the_place_that_the_file_names(tmp_path: Path) -> No
 def test_segments_with_the_same_deformations_stay_in_contact(tmp_path: Path) -> None:
     tail = "deformations:\n  - {type: waves, wavelength: [20, 60], strength: 0.8}\n  - {type: lattice}\n"
     scene = load_scene(write_bar(tmp_path, tail))
-    before = [segment.vertices[np.isclose(segment.vertices[:, 0], 0)] for segment in scene.rest.segments]
+    given = len(trimesh.load_mesh(tmp_path / "left.stl").vertices)  # others divide long edges, to each side its own
+    touching = [np.isclose(s.vertices[:, 0], 0) & (np.arange(len(s.vertices)) < given) for s in scene.rest.segments]
+    before = [s.vertices[rows] for s, rows in zip(scene.rest.segments, touching, strict=True)]
     mesh = scene.sample_state(np.random.default_rng(0)).mesh
-    faces = [
-        moved.vertices[np.isclose(rest.vertices[:, 0], 0)]
-        for moved, rest in zip(mesh.segments, scene.rest.segments, strict=True)
-    ]
+    faces = [moved.vertices[rows] for moved, rows in zip(mesh.segments, touching, strict=True)]
     order = [np.lexsort(np.round(points, 5).T) for points in before]
     assert len(order[0]) > 20
     np.testing.assert_allclose(faces[0][order[0]], faces[1][order[1]], atol=1e-9)
+    check_overlap(mesh)
 
 
 def test_a_scene_file_can_be_sent_to_workers(tmp_path: Path) -> None:

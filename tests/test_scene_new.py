@@ -51,7 +51,7 @@ def test_every_example_in_the_comments_is_valid(tmp_path: Path) -> None:
     path.write_text(uncommented(path.read_text()))
     scene = load_scene(path)
     assert isinstance(scene.sample_deformations, RandomMotion)
-    assert len(scene.sample_deformations.steps) == 7
+    assert len(scene.sample_deformations.steps) == 8
     scene.sample_state(np.random.default_rng(0)).mesh.check()
 
 

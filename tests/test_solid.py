@@ -225,5 +225,5 @@ def test_touching_and_distant_segments_do_not_overlap() -> None:
 
 def test_overlap_up_to_the_tolerance_is_allowed() -> None:
     mesh = SegmentedMesh((box((0, 0, 0), (4, 4, 4), "a"), box((3.96, 0, 0), (7.96, 4, 4), "b", 1)))
-    assert overlaps(mesh, tolerance=0.02, cells=64) == ()
-    assert len(overlaps(mesh, tolerance=0.005, cells=64)) == 1
+    assert overlaps(mesh, tolerance=0.02) == ()
+    assert len(overlaps(mesh, tolerance=0.005)) == 1

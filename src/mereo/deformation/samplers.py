@@ -145,6 +145,11 @@ class JointSampler:
         slide = axis * named(rng, "slide").uniform(*self.slide)
         return Rigid(rotation, slide + named(rng, "shift").uniform(-self.shift, self.shift), self.pivot)
 
+    def narrowed(self, share: float) -> "JointSampler":
+        """Joint with ``share`` of each of its ranges."""
+        (a, b), (c, d) = self.angle_rad, self.slide
+        return replace(self, angle_rad=(share * a, share * b), slide=(share * c, share * d), shift=share * self.shift)
+
 
 @dataclass(frozen=True)
 class PushSampler:
@@ -188,15 +193,15 @@ class RandomMotion:
             def surface(members: tuple[int, ...] = members) -> tuple[np.ndarray, np.ndarray]:
                 return _surface(self.rest, chains, members)
 
-            with part(rng, self._title(number, sampler, members)):
+            with part(rng, self.title(number, sampler, members)):
                 drawn = sampler(rng, surface)
             for index in members:
                 chains[index] = (*chains[index], drawn)
         shared: dict[tuple[int, ...], Compose] = {}
         return tuple(shared.setdefault(tuple(id(part) for part in chain), Compose(chain)) for chain in chains)
 
-    def _title(self, number: int, sampler: DeformationSampler, members: tuple[int, ...]) -> str:
-        """A step as people know it from their file, for example "2 joint of hand, arm"."""
+    def title(self, number: int, sampler: DeformationSampler, members: tuple[int, ...]) -> str:
+        """Step ``number``, counted from 1, as people know it from their file, for example "2 joint of hand, arm"."""
         kind = type(sampler).__name__.removesuffix("Sampler").lower()
         whole = len(members) == len(self.rest.names)
         return f"{number} {kind}" + ("" if whole else f" of {', '.join(self.rest.names[i] for i in members)}")
@@ -230,3 +235,12 @@ def default_cells(bounds: Float[np.ndarray, "2 3"]) -> tuple[int, int, int]:
     sides = bounds[1] - bounds[0]
     x, y, z = np.clip(np.rint(2 * sides / sides.min()), 2, 6).astype(int)
     return int(x), int(y), int(z)
+
+
+def cubic_cells(
+    bounds: Float[np.ndarray, "2 3"], spacing: float
+) -> tuple[Float[np.ndarray, "2 3"], tuple[int, int, int]]:
+    """Box around a box, with its middle, that whole cubes fill, and how many of them go along each side."""
+    x, y, z = np.maximum(np.ceil((bounds[1] - bounds[0]) / spacing - 1e-6), 1).astype(int)
+    half = np.array([x, y, z]) * spacing / 2
+    return bounds.mean(axis=0) + np.stack([-half, half]), (int(x), int(y), int(z))

@@ -212,6 +212,21 @@ def check_segment(segment: Segment) -> None:
         )
 
 
+def surface_points(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """Points evenly spread over a surface, the same in every call, and the face of each.
+
+    Vertices are not: a CAD program's are where a surface is round, none where it is flat.
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    face = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
+    u, v = np.random.default_rng(0).random((2, count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return a[face] + u * (b - a)[face] + v * (c - a)[face], face
+
+
 def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Barycentric coordinates of points in the planes of their triangles."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]

@@ -17,7 +17,9 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.mesh_check import examine
 from mereo.geometry.normalizer import Normalizer
 from mereo.io.yaml_document import Document, similar
-from mereo.scenes.files.deformation_blocks import AnyDeformation, LatticeBlock, Misfit, Target
+from mereo.scenes.files.defaults import default_deformations
+from mereo.scenes.files.deformation_blocks import AnyDeformation, Misfit, Target
+from mereo.scenes.files.refinement import refined
 from mereo.scenes.files.schema import CameraBlock, SceneFile
 from mereo.scenes.files.segments import read_segments
 from mereo.scenes.recorded_states import load_states
@@ -84,8 +86,13 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
         scene = _recorded(document, file, rest, placement, workspace)
         definition += _digest(document.path.parent / file.states)
     else:
-        motions = _random_motion(document, placement, rest, file.deformations)
-        scene = Scene(file.name, rest, motions, workspace, file.source)
+        blocks = file.deformations
+        if blocks is None:
+            blocks = list(default_deformations(mesh))
+            definition += str([block.model_dump() for block in blocks])
+        motions = _random_motion(document, placement, rest, blocks)
+        rest = refined(rest, motions)
+        scene = Scene(file.name, rest, replace(motions, rest=rest), workspace, file.source)
     return replace(scene, unit_m=unit_m, T_scene_source=placement.matrix, definition=definition)
 
 
@@ -132,11 +139,11 @@ def _workspace(document: Document, camera: CameraBlock, bounds: Float[np.ndarray
 
 
 def _random_motion(
-    document: Document, placement: Normalizer, rest: SegmentedMesh, blocks: Sequence[AnyDeformation] | None
+    document: Document, placement: Normalizer, rest: SegmentedMesh, blocks: Sequence[AnyDeformation]
 ) -> RandomMotion:
-    """All deformations of the file in their order; a lattice sized to the object where it has none."""
+    """All deformations of the file in their order; ``default_deformations`` where it has none."""
     steps = []
-    for index, block in enumerate([LatticeBlock(type="lattice")] if blocks is None else blocks):
+    for index, block in enumerate(blocks):
         members = _members(document, rest, index, block)
         moved = SegmentedMesh(tuple(rest.segments[i] for i in members))
         try:

@@ -6,28 +6,20 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, examine, likely_unit
 from mereo.geometry.mesh_repair import repaired, without_overlaps
-from mereo.geometry.overlap import Overlap, grid_volume, overlaps
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.overlap import grid_volume, overlaps
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.scratch_folders import remove_abandoned
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read
+from mereo.scenes.files.check_states import report_states
 from mereo.scenes.files.rewrite import with_segment_files
 from mereo.scenes.files.segments import read_segments
 from mereo.scenes.registry import is_yaml, load_scene
-from mereo.scenes.scene import SCENES, Scene
-from mereo.scenes.seeds import example_rng
-
-STATES = 6
-"""Random states in which segments of a user's scene are tested for overlap, and for being in view."""
-
-STATE_TOLERANCE = 0.02
-"""Share of a segment that another one may overlap in a random state."""
+from mereo.scenes.scene import SCENES
 
 
 def check_scene(name: str, repair: bool = False) -> None:
@@ -57,22 +49,32 @@ def check_scene(name: str, repair: bool = False) -> None:
             _check_repaired(document, mesh, health)
             return
         if repair:
-            print("nothing to repair")
+            print("no mesh needs a repair")
         if any(found.hopeless for found in health):
             raise _refusal(name, faults)
         scene = build(document, file, _marked(mesh, health))
-    if name not in SCENES:
-        faults += _report_states(scene)
-    if faults:
-        raise _refusal(name, faults)
+        _report_refinement(mesh, scene.rest)
+    collisions = report_states(scene) if name not in SCENES else 0
+    if faults + collisions:
+        raise _refusal(name, faults, collisions)
     nested = "".join(f", {inner} nested in {outer}" for inner, outer in scene.rest.nested)
     print(f"{scene.name}: {len(scene.rest.segments)} segments, closed, outward oriented, without overlap{nested}")
     print(f"source: {scene.source}")
 
 
-def _refusal(name: str, faults: int) -> ValueError:
-    cure = "repair the meshes with --repair, or adapt the file" if is_yaml(name) else "correct its meshes"
-    return ValueError(f"{name} has {faults} {'fault' if faults == 1 else 'faults'}, listed above: {cure}")
+def _refusal(name: str, faults: int, collisions: int = 0) -> ValueError:
+    """Error about faults of meshes and collisions in random states, which no repair of a mesh mends."""
+    count = faults + collisions
+    cures = ["repair the meshes with --repair" if is_yaml(name) else "correct its meshes"] if faults else []
+    cures += ["correct its deformations"] if collisions else []
+    return ValueError(f"{name} has {count} {'fault' if count == 1 else 'faults'}, listed above: {', and '.join(cures)}")
+
+
+def _report_refinement(mesh: SegmentedMesh, rest: SegmentedMesh) -> None:
+    """Print how many faces a scene has more than its files."""
+    before, now = (sum(len(segment.faces) for segment in each.segments) for each in (mesh, rest))
+    if now > before:
+        print(f"faces: {before:,} in the files, {now:,} after dividing long ones, so that they bend")
 
 
 def _examined(mesh: SegmentedMesh) -> list[Health]:
@@ -110,31 +112,6 @@ def _report_size(mesh: SegmentedMesh, unit_m: float, unit: str) -> None:
     print(f"size: {' x '.join(f'{side:.4g}' for side in sides)} {unit}; the longest side is {longest_m:.3g} m")
     if not PLAUSIBLE_M[0] <= longest_m <= PLAUSIBLE_M[1]:
         print(f"  note: that is unlikely for a depth camera's object; the unit may be {likely_unit(mesh.bounds)}")
-
-
-# --- random states ----------------------------------------------------------------------------------------------------
-
-
-def _report_states(scene: Scene) -> int:
-    """Print what goes wrong in random states; returns the number of faults."""
-    camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
-    worst: dict[frozenset[str], Overlap] = {}
-    seen = 1.0
-    for index in range(STATES):
-        rng = example_rng(0, index)
-        mesh = scene.sample_state(rng).mesh
-        for found in overlaps(mesh, STATE_TOLERANCE):
-            pair = frozenset((found.small, found.large))
-            worst[pair] = max(worst.get(pair, found), found, key=lambda overlap: overlap.share)
-        pose = scene.workspace.sample(rng, mesh.bounds.mean(axis=0))
-        local = transform_points(inverse_rigid(pose), mesh.merged()[0])
-        pixels = camera.project(local)
-        seen = min(seen, float(((pixels > 0) & (pixels < 96)).all(axis=1).mean()))
-    for overlap in worst.values():
-        print(f"  fault: in random states {overlap}: narrow the deformations, or let both move by the same ones")
-    if seen < 0.98:
-        print(f"  note: in a random view only {seen:.0%} of the object is in the picture: widen `field_of_view`")
-    return len(worst)
 
 
 # --- repairs ----------------------------------------------------------------------------------------------------------

@@ -5,12 +5,13 @@ units and radians.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, model_serializer, model_validator
 
 from mereo.deformation import samplers
 from mereo.deformation.samplers import DeformationSampler
@@ -67,23 +68,54 @@ class DeformationBlock(Block, ABC):
         """Sampler of this block's maps for an object. Raises ``Misfit`` where a value does not fit it."""
 
 
+MOST_CELLS = 20
+"""Of a lattice along each side."""
+
+Cells = Annotated[int, Field(ge=1, le=MOST_CELLS)]
+
+
 class LatticeBlock(DeformationBlock):
     """Free-form deformation: random control points over the box of the segments.
 
     Attributes:
         cells: along x, y and z; where absent, roughly cubes, two of them along the shortest side.
+        spacing: of control points that form cubes, instead of ``cells``: the box is enlarged to a multiple of it, so
+            that a thin object moves across as far as along.
         strength: largest move of a control point, as a share of what keeps the map injective.
     """
 
     type: Literal["lattice"]
-    cells: tuple[Annotated[int, Field(ge=1, le=20)], ...] | None = Field(default=None, min_length=3, max_length=3)
+    cells: tuple[Cells, Cells, Cells] | None = None
+    spacing: Positive | None = None
     strength: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5
 
+    @model_validator(mode="after")
+    def _has_one_grid(self) -> "LatticeBlock":
+        if self.cells is not None and self.spacing is not None:
+            raise ValueError("it has both cells and spacing; one of them says where the control points are: drop one")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_absent_spacing(self, serialize: Callable[["LatticeBlock"], dict[str, object]]) -> dict[str, object]:
+        # datasets keep a digest of what their scene file says, and most are from before there was a spacing
+        written = serialize(self)
+        if self.spacing is None:
+            del written["spacing"]
+        return written
+
     def sampler(self, target: Target) -> DeformationSampler:
-        """Sampler of lattices over the box of what is moved."""
+        """Sampler of lattices over the box of what is moved; ``Misfit`` where ``spacing`` is too small for it."""
         bounds = target.moved.bounds
-        x, y, z = self.cells or samplers.default_cells(bounds)
-        return samplers.LatticeSampler(bounds, (x, y, z), self.strength)
+        if self.spacing is None:
+            return samplers.LatticeSampler(bounds, self.cells or samplers.default_cells(bounds), self.strength)
+        longest = float((bounds[1] - bounds[0]).max()) / target.unit
+        if longest > MOST_CELLS * self.spacing:
+            raise Misfit(
+                "spacing",
+                f"`spacing` is {self.spacing:g}, and the object is {longest:.4g} long; it takes at most {MOST_CELLS} "
+                f"cells along a side: make it {longest / MOST_CELLS:.3g} or more",
+            )
+        return samplers.LatticeSampler(*samplers.cubic_cells(bounds, self.spacing * target.unit), self.strength)
 
 
 class WavesBlock(DeformationBlock):

@@ -9,24 +9,22 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mereo.deformation.samplers import default_cells
 from mereo.geometry.conventions import UNITS_M
-from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.mesh_check import likely_unit
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.label_volumes import is_volume, read_label_volume, segment_surfaces
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.scenes.scene import SCENES
+from mereo.scenes.files.build import placed
+from mereo.scenes.files.defaults import default_deformations, default_view, random_motion, rounded
+from mereo.scenes.files.deformation_blocks import BendBlock, LatticeBlock
+from mereo.scenes.files.joints import proposed_joints
+from mereo.scenes.scene import SCENES, Workspace
 
 SIZE = 20.0
 """Shortest side in scene units, as in the paper, unless the object is longer than ``LONGEST`` then."""
 
 LONGEST = 80.0
-
-ROOM = 1.15
-"""How much larger than at rest the object may become in the picture."""
-
-MOST_VIEW_RAD = float(np.deg2rad(60.0))
 
 LABEL_CELLS = 64
 
@@ -37,17 +35,21 @@ class _Source:
 
     Attributes:
         block: the lines of the scene file that name them.
-        bounds: joint box of the segments, in the files' unit.
-        names: of the segments.
+        mesh: the segments, in the files' unit.
         unit: the likely one.
         reason: why.
+        up: the axis that likely points upwards, 1 for y or 2 for z.
+        up_reason: why.
+        assembly: whether the segments are parts, which may be jointed, and not regions of one body.
     """
 
     block: str
-    bounds: Float[np.ndarray, "2 3"]
-    names: tuple[str, ...]
+    mesh: SegmentedMesh
     unit: str
     reason: str
+    up: int
+    up_reason: str
+    assembly: bool = True
 
 
 def write_scene_file(
@@ -103,13 +105,18 @@ def _from_meshes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
     names = tuple(re.sub(r"[^\w. -]+", "_", file.stem) for file in files)
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"two files are called {repeated[0]!r}; segments are named after them: rename one of them")
-    boxes = np.stack([read_segmented_mesh(file).bounds for file in files])
-    bounds = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+    mesh = SegmentedMesh(tuple(_one_segment(name, file) for name, file in zip(names, files, strict=True)))
     lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
     for number, (name, file) in enumerate(zip(names, relative, strict=True)):
         lines += [f"  - name: {quoted(name)}", f"    file: {quoted(file)}", f"    color: {_color(number)}"]
     lines.append("    # nested_in: NAME  # for a segment that lies inside another one, which has to come after it")
-    return _Source("\n".join(lines), bounds, names, *_unit_of(files[0], bounds))
+    return _Source("\n".join(lines), mesh, *_unit_of(files[0], mesh.bounds), *_up_of(files[0]))
+
+
+def _one_segment(name: str, file: Path) -> Segment:
+    """All parts of a file."""
+    vertices, faces, _ = read_segmented_mesh(file).merged()
+    return Segment(name, PALETTE[0], vertices, faces)
 
 
 def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
@@ -117,7 +124,7 @@ def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
     for number, name in enumerate(mesh.names):
         lines += [f"  - name: {quoted(name)}", f"    color: {_color(number)}"]
     lines.append("    # parts: [A, B]  # parts of the model to join into this segment, instead of the one of its name")
-    return _Source("\n".join(lines), mesh.bounds, mesh.names, *_unit_of(file, mesh.bounds))
+    return _Source("\n".join(lines), mesh, *_unit_of(file, mesh.bounds), *_up_of(file))
 
 
 def _from_volume(file: Path, relative: str) -> _Source:
@@ -126,11 +133,11 @@ def _from_volume(file: Path, relative: str) -> _Source:
     if not values:
         raise ValueError(f"{file} holds only empty space; a label volume has values above 0: export it again")
     names = {value: volume.names.get(value, f"label_{value}") for value in values}
-    bounds = segment_surfaces(volume, names, LABEL_CELLS).bounds
+    mesh = segment_surfaces(volume, names, LABEL_CELLS)
     lines = [f"labels: {quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
     lines += [f"  {value}: {quoted(name)}" for value, name in names.items()]
     lines.append(f"cells: {LABEL_CELLS}  # of the grid along the longest side on which surfaces are found")
-    return _Source("\n".join(lines), bounds, tuple(names.values()), "mm", "the convention of NIfTI and NRRD")
+    return _Source("\n".join(lines), mesh, "mm", "the convention of NIfTI and NRRD", 2, "z is to the head", False)
 
 
 def _unit_of(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str]:
@@ -143,42 +150,71 @@ def _unit_of(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str]:
     return unit, f"guessed: the object would be {longest_m:.3g} m long"
 
 
+def _up_of(file: Path) -> tuple[int, str]:
+    """Axis that points upwards in a mesh file, and why."""
+    kind = file.suffix.lower().lstrip(".")
+    if kind in ("glb", "gltf", "obj"):
+        return 1, f"y is up, as in most files of the kind .{kind}"
+    return 2, f"z is up, as in most files of the kind .{kind}"
+
+
 # --- the text ---------------------------------------------------------------------------------------------------------
 
 
 def _text(name: str, source: _Source, units: str | None) -> str:
-    low, high = source.bounds
-    sides = high - low
-    size = min(SIZE, LONGEST * float(sides.min() / sides.max()))
-    radius = ROOM * size * float(np.linalg.norm(sides) / sides.min()) / 2
-    near = max(100.0, float(np.ceil(radius / np.sin(MOST_VIEW_RAD / 2))))
-    view = int(np.clip(np.ceil(np.rad2deg(2 * np.arcsin(radius / near))), 10, 90))
+    sides = np.ptp(source.mesh.bounds, axis=0)
+    size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
+    placement = placed(source.mesh, size)
+    blocks = default_deformations(source.mesh)
+    rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
+    x, y, z = np.eye(3)[source.up].tolist()
+    view = default_view(rest, random_motion(rest, blocks, placement), Workspace(axis=(x, y, z)))
     unit, reason = (units, "as you said") if units else (source.unit, source.reason)
-    x, y, z = default_cells(source.bounds)
-    center, longest = (low + high) / 2, int(sides.argmax())
-    ends = center.copy()
-    ends[longest] = low[longest]
+    bend, lattice = blocks[0], blocks[-1]
+    assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
     return TEMPLATE.format(
         name=name,
         block=source.block,
         unit=unit,
         reason=reason,
         sides=" x ".join(f"{side:.4g}" for side in sides),
-        size=f"{size:.3g}",
-        near=f"{near:g}",
-        far=f"{2 * near:g}",
-        view=view,
-        cells=[x, y, z],
-        center=_numbers(center),
-        end=_numbers(ends),
-        axis=[float(k == longest) for k in range(3)],
-        length=f"{sides[longest]:.4g}",
-        # half of the angle at which a straight bar of this thickness would fold over
-        angle=int(min(90, np.rad2deg(0.45 * sides[longest] / np.linalg.norm(np.delete(sides, longest) / 2)))),
-        part=quoted(source.names[-1]),
+        size=f"{size:g}",
+        up=[int(k == source.up) for k in range(3)],
+        up_reason=source.up_reason,
+        near=f"{view.near:g}",
+        far=f"{view.far:g}",
+        view=view.field_of_view,
+        spacing=f"{lattice.spacing:g}",
+        strength=f"{lattice.strength:g}",
+        end=_numbers(np.array(bend.origin)),
+        axis=[int(value) for value in bend.axis],
+        length=f"{bend.length:g}",
+        angle=f"{bend.angle[1]:g}",
+        joints=_joints(source.mesh, source.assembly),
         push=f"{0.1 * sides.min():.3g}",
         reach=f"{0.5 * sides.min():.3g}",
     )
+
+
+def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
+    """Comments: the joints that the parts seem to have, and what each was found from; else an example."""
+    lines = []
+    for joint in proposed_joints(mesh) if assembly else ():
+        contact = joint.contact
+        round_one = f"the round contact, radius {contact.radius:.3g},"
+        found = f"{round_one if joint.hinge else 'the flat contact'} of {{}} and {{}}".format(
+            *(mesh.names[index] for index in (contact.first, contact.second))
+        )
+        lines += [
+            f"#  - type: joint  # {'turns on' if joint.hinge else 'slides along'} {found}",
+            f"#    segments: [{', '.join(quoted(mesh.names[index]) for index in joint.moved)}]",
+            f"#    pivot: {_numbers(contact.point)}",
+            f"#    axis: {_numbers(joint.axis)}",
+            f"#    {'angle' if joint.hinge else 'slide'}: [{joint.most[0]:.4g}, {joint.most[1]:.4g}]",
+        ]
+    if not lines:
+        return EXAMPLE_JOINT.format(part=quoted(mesh.names[-1]), center=_numbers(mesh.bounds.mean(axis=0)))
+    return "".join(line + "\n" for line in (JOINTS, *lines))
 
 
 def _color(number: int) -> str:
@@ -193,8 +229,19 @@ def quoted(text: str) -> str:
 
 
 def _numbers(values: Float[np.ndarray, "3"]) -> str:
-    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+    largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing beside it is rounding
+    return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
 
+
+JOINTS = "# Joints that the contacts suggest, in ranges without collisions; remove the '#'. The tip comes first:"
+
+EXAMPLE_JOINT = """\
+#  - type: joint  # rigid, and before what bends the whole; in a chain, the joint at the tip comes first
+#    segments: [{part}]
+#    pivot: {center}
+#    axis: [0, 0, 1]
+#    angle: [-30, 30]
+"""
 
 TEMPLATE = """\
 # A scene for mereo: what the object is, how it may deform, and from where it is seen.
@@ -213,22 +260,26 @@ size: {size}
 
 camera:
   aperture: 140  # of the cone of directions from which the camera looks; 360 is all around
-  axis: [0, 0, 1]  # the middle of that cone, as seen from the object
+  axis: {up}  # the middle of that cone, as seen from the object: above it, where {up_reason}
   distance: [{near}, {far}]  # from the object's centre, in scene units
   roll: false  # whether the camera may be rolled about its line of sight
-  field_of_view: {view}  # wide enough for the object at the nearest distance
+  field_of_view: {view}  # as narrow as still shows all of the object at the nearest distance
 
 # Drawn at random within these bounds for every example, and applied in this order to the segments named, or to all.
-# Segments that touch should move by the same deformations, so that they stay in contact.
+# Segments that touch should move by the same deformations, so that they stay in contact. These bend the object as if it
+# were of rubber, as far as suits soft things: for what has joints, drop them and say how its parts move.
 deformations:
+{joints}  - type: bend  # along the longest side, to any side
+    origin: {end}
+    axis: {axis}
+    length: {length}
+    angle: [-{angle}, {angle}]
   - type: lattice  # smooth and free-form: the object in a box of rubber
-    cells: {cells}
-    strength: 0.5  # from 0 to below 1, at which space might fold over
-#  - type: bend  # along the longest side, to any side
-#    origin: {end}
-#    axis: {axis}
-#    length: {length}
-#    angle: [-{angle}, {angle}]
+    spacing: {spacing}  # of the points that are moved: wider is smoother
+    strength: {strength}  # from 0 to below 1, at which space might fold over
+  - type: lattice  # once more, for one alone is stiffer than rubber
+    spacing: {spacing}
+    strength: {strength}
 #  - type: twist
 #    origin: {end}
 #    axis: {axis}
@@ -243,11 +294,6 @@ deformations:
 #    distance: [-{push}, {push}]
 #    tip: {push}
 #    reach: {reach}
-#  - type: joint  # rigid; in a chain, the joint at the tip comes first
-#    segments: [{part}]
-#    pivot: {center}
-#    axis: [0, 0, 1]
-#    angle: [-30, 30]
 # Recorded frames of a simulator take the place of all deformations:
 #states: states.npz
 """

@@ -1,0 +1,296 @@
+"""Parts as CAD programs write them: long faces bend with the object, overlaps are exact and say their cause."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cad_objects import write_pliers
+from manifold3d import Manifold
+from scene_files import write_bar, write_mesh
+from shapes import ball, box
+
+from mereo.deformation.maps import Rigid
+from mereo.deformation.samplers import cubic_cells
+from mereo.deformation.warps import Squash
+from mereo.geometry.camera import Camera
+from mereo.geometry.contacts import contacts
+from mereo.geometry.manifold import mesh_of
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.overlap import overlaps
+from mereo.geometry.subdivision import TooManyFaces, split_edges
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.scenes.files.check import check_scene
+from mereo.scenes.files.defaults import MOTION, UNPLACED, default_deformations, random_motion
+from mereo.scenes.files.refinement import TOLERANCE, refined
+from mereo.scenes.files.template import write_scene_file
+from mereo.scenes.motion import material_points, motion
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scene file of the pliers, as ``mereo scene new`` writes it."""
+    folder = tmp_path_factory.mktemp("pliers")
+    return write_scene_file(write_pliers(folder), folder / "pliers.yaml")
+
+
+@pytest.fixture(scope="module")
+def pliers(written: Path) -> Scene:
+    return load_scene(written)
+
+
+# --- faces ------------------------------------------------------------------------------------------------------------
+
+
+def test_face_to_face_parts_stay_apart_in_random_states(written: Path) -> None:
+    """Maps of space never push solids into each other; faces as they are in the files would."""
+    lattice = "deformations:\n  - {type: lattice, cells: [6, 6, 2], strength: 0.5}\n"
+    path = written.with_name("lattice.yaml")
+    path.write_text(written.read_text().split("deformations:")[0] + lattice)
+    scene = load_scene(path)
+    files = rest_of_files(path.parent, scene)
+    worst = {"files": 0.0, "scene": 0.0}
+    for index in range(6):
+        deform = scene.sample_deformations(example_rng(0, index))[0]
+        for name, rest in (("files", files), ("scene", scene.rest)):
+            mesh = rest.with_vertices([deform(segment.vertices) for segment in rest.segments])
+            worst[name] = max(worst[name], *(found.share for found in overlaps(mesh, -1.0)))
+    assert worst["scene"] < 0.003 and worst["files"] > 0.04, worst
+
+
+def rest_of_files(folder: Path, scene: Scene) -> SegmentedMesh:
+    """The meshes as they are in the files, in the scene's frame."""
+    files = read_segmented_mesh(*[folder / f"{name}.stl" for name in scene.rest.names])
+    return files.transformed(scene.T_scene_source)
+
+
+def test_refined_parts_are_the_same_solids(written: Path, pliers: Scene) -> None:
+    files = rest_of_files(written.parent, pliers)
+    pliers.rest.check()
+    for before, after in zip(files.segments, pliers.rest.segments, strict=True):
+        assert after.name == before.name and len(after.faces) > len(before.faces)
+        assert after.volume == pytest.approx(before.volume, rel=1e-9)
+        np.testing.assert_allclose(after.vertices[: len(before.vertices)], before.vertices, atol=1e-9)
+
+
+def test_every_edge_follows_its_curve(pliers: Scene) -> None:
+    rng = np.random.default_rng(0)
+    away = []
+    for index in range(4):  # the very states that edges are compared in
+        maps = pliers.sample_deformations(example_rng(0, index))
+        for segment, deform in zip(pliers.rest.segments, maps, strict=True):
+            a, b = segment.vertices[segment.faces[:, 0]], segment.vertices[segment.faces[:, 1]]
+            share = rng.uniform(0, 1, (len(a), 1))
+            chord = (1 - share) * deform(a) + share * deform(b)
+            away.append(np.linalg.norm(deform((1 - share) * a + share * b) - chord, axis=1).max())
+    assert max(away) < 1.5 * TOLERANCE
+
+
+def test_rigid_parts_and_fine_meshes_stay_as_they_are(tmp_path: Path, pliers: Scene) -> None:
+    joint = (
+        "deformations:\n  - {type: joint, segments: [right], pivot: [120, 5, 5], axis: [1, 0, 0], angle: [-90, 90]}\n"
+    )
+    scene = load_scene(write_bar(tmp_path, joint))
+    files = read_segmented_mesh(tmp_path / "left.stl", tmp_path / "right.stl")
+    assert [len(s.faces) for s in scene.rest.segments] == [len(s.faces) for s in files.segments]
+    again = refined(pliers.rest, pliers.sample_deformations)
+    assert all(a is b for a, b in zip(again.segments, pliers.rest.segments, strict=True))
+
+
+def test_neighbours_split_a_shared_edge_alike(pliers: Scene) -> None:
+    """The bores' rims on the plane z = 0 are edges of both levers, and have the same vertices afterwards."""
+    middle, radius = pliers.T_scene_source[:3, 3], 5 * pliers.T_scene_source[0, 0]
+    upper, lower, _ = (
+        {
+            tuple(np.round(place, 9))
+            for place in segment.vertices
+            if abs(np.hypot(*(place - middle)[:2]) - radius) < 1e-6 and abs(place[2] - middle[2]) < 1e-9
+        }
+        for segment in pliers.rest.segments
+    )
+    assert upper == lower and len(upper) >= 40
+
+
+def test_edges_are_asked_once_and_faces_are_bounded() -> None:
+    part = box((0, 0, 0), (4, 4, 4))
+    asked: list[int] = []
+
+    def longer(ends: np.ndarray) -> np.ndarray:
+        asked.append(len(ends))
+        return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > 3.0
+
+    vertices, faces = split_edges(part.vertices, part.faces, longer, 1000)
+    assert replace(part, vertices=vertices, faces=faces).edge_imbalance() == (0, 0)
+    assert asked[0] == 18 and sum(asked) == 18 + 2 * 18 + 3 * 12  # each once: halves, and those across the faces
+    with pytest.raises(TooManyFaces, match="1,000 triangles or more"):
+        split_edges(part.vertices, part.faces, lambda ends: np.ones(len(ends), dtype=bool), 1000)
+
+
+# --- overlaps ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("depth", [1e-4, 0.01, 0.5])
+def test_overlaps_of_solids_are_exact(depth: float) -> None:
+    """However thin: a grid of 40 cells sees none of the first two."""
+    mesh = SegmentedMesh((box((0, 0, 0), (1, 2, 3), "a"), box((1 - depth, 0, 0), (3, 2, 3), "b")))
+    (found,) = overlaps(mesh, tolerance=0.0)
+    assert (found.small, found.share) == ("a", pytest.approx(depth, rel=1e-9))
+
+
+def test_meshes_that_are_no_solids_are_measured_on_a_grid() -> None:
+    whole = ball((0, 0, 0), 1.0, "a")
+    holed = replace(whole, faces=whole.faces[3:], solid=False)
+    (found,) = overlaps(SegmentedMesh((holed, ball((1, 0, 0), 1.0, "b"))))
+    assert found.share == pytest.approx(5 / 16, abs=0.01)
+
+
+def test_an_overlap_in_random_states_is_told_with_its_cause(
+    tmp_path: Path, written: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    head = written.read_text().split("deformations:")[0]
+    away = written.with_name("away.yaml")
+    joint = "{{type: joint, segments: [{}], pivot: [{}, 0, 0], axis: [0, 0, 1], angle: [-{a}, {a}]}}"
+    for block, cause in (
+        (joint.format("lower", 0, a=20), None),
+        (joint.format("lower", 60, a=20), "'1 joint of lower' moves one of the two alone, and they meet at a tenth"),
+        (joint.format("lower, pin", 8, a=4), "'1 joint of lower, pin' moves one of the two alone: 50% of the range"),
+        ("{type: squash, factor: [0.5, 0.5], axis: [1, 0, 0], segments: [pin]}", "leave out its `segments`, so that"),
+    ):
+        away.write_text(f"{head}deformations:\n  - {block}\n")
+        if cause is None:
+            check_scene(str(away))
+        else:
+            with pytest.raises(ValueError, match=r"has \d faults?, listed above: correct its deformations$"):
+                check_scene(str(away), repair=True)
+        printed = capsys.readouterr().out
+        assert ("fault: in random states" in printed) == (cause is not None)
+        assert (cause or "") in printed and "nothing to repair" not in printed
+
+
+# --- defaults ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sides", [(1, 1, 1), (4, 3, 1), (20, 2, 1)])
+def test_the_default_moves_every_object_by_five_percent(sides: tuple[int, ...]) -> None:
+    mesh = SegmentedMesh((box((0, 0, 0), sides),))
+    blocks = default_deformations(mesh)
+    found = motion(mesh, random_motion(mesh, blocks, UNPLACED))
+    assert found.mean == pytest.approx(MOTION, rel=0.15) and found.largest > found.mean
+
+
+def test_a_rigid_motion_is_none_and_a_stretch_is_its_own() -> None:
+    mesh = SegmentedMesh((box((-1, -1, -1), (1, 1, 1)),))
+    turn = Rigid(np.array([0.3, 0.2, 0.1]), np.array([5.0, 0, 0]), np.zeros(3))
+    assert motion(mesh, lambda rng: (turn,)).largest < 1e-12
+    squash = Squash(np.zeros(3), np.array([0, 0, 1.0]), 1.1)
+    points, _ = material_points(mesh, 800)
+    way = np.linalg.norm(squash(points) - points, axis=1) / 2
+    found = motion(mesh, lambda rng: (squash,))
+    assert found.mean == pytest.approx(np.sqrt(np.mean(way**2)), rel=0.02)
+    assert found.largest == pytest.approx(way.max(), rel=0.1)
+
+
+def test_surface_points_lie_evenly_on_the_surface() -> None:
+    points, owner = material_points(SegmentedMesh((box((0, 0, 0), (8, 1, 1)), box((9, 0, 0), (10, 1, 1), "b"))), 4000)
+    assert (owner == 1).mean() == pytest.approx(6 / 40, abs=0.001)
+    first = points[owner == 0]
+    ends = np.isclose(first[:, 0], 0) | np.isclose(first[:, 0], 8)
+    assert ends.mean() == pytest.approx(2 / 34, abs=0.001) and first[:, 0].mean() == pytest.approx(4, abs=0.1)
+    assert np.isclose(np.abs(first[~ends, 1:] - 0.5).max(axis=1), 0.5).all()
+
+
+def test_cubes_fill_the_box_around_a_box() -> None:
+    bounds, cells = cubic_cells(np.array([[0.0, 0, 0], [10, 4, 1]]), 5.0)
+    assert cells == (2, 1, 1)
+    np.testing.assert_allclose(bounds, [[0, -0.5, -2], [10, 4.5, 3]])
+
+
+def test_the_picture_is_filled_and_nothing_is_cut(pliers: Scene) -> None:
+    camera = Camera.from_fov(96, 96, pliers.workspace.fov_rad)
+    near, far = pliers.workspace.distance
+    assert far == pytest.approx(1.25 * near, abs=1)
+    widest, inside = 0.0, []
+    for index in range(40):
+        rng = example_rng(3, index)
+        mesh = pliers.sample_state(rng).mesh
+        pose = pliers.workspace.sample(rng, mesh.bounds.mean(axis=0))
+        places = np.abs(camera.project(transform_points(inverse_rigid(pose), mesh.merged()[0])) - 48) / 48
+        widest = max(widest, float(places.max()))
+        inside.append(float((places < 1).all(axis=1).mean()))
+    assert widest > 0.75 and min(inside) > 0.95 and np.mean(inside) > 0.998
+
+
+def test_up_is_told_by_the_kind_of_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for suffix, axis in (("stl", [0, 0, 1]), ("obj", [0, 1, 0]), ("glb", [0, 1, 0])):
+        file = write_mesh(ball((0, 0, 0), 3.0, level=1), tmp_path / f"a.{suffix}")
+        path = write_scene_file([file], tmp_path / f"{suffix}.yaml")
+        assert f"axis: {axis}  # the middle of that cone" in path.read_text()
+    check_scene(str(path))
+    printed = capsys.readouterr().out
+    assert "up: y, the camera's `axis`" in printed
+    assert re.search(r"motion: [45]\.\d% of the longest side in a typical state, ", printed)
+    pixels = int(re.search(r"shows it in (\d+) of 9,216 pixels", printed)[1])  # type: ignore[index]
+    assert pixels > 2500
+
+
+def test_a_spacing_that_does_not_fit_is_explained(tmp_path: Path) -> None:
+    for keys, message in (
+        (
+            "spacing: 1",
+            r":10: `spacing` is 1, and the object is 40 long; .* at most 20 cells .*make it 2 or more",
+        ),
+        ("spacing: 20, cells: [1, 1, 1]", "both cells and spacing; one of them says .*drop one"),
+        ("spacing: 0", "must be greater than 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            load_scene(write_bar(tmp_path, f"deformations:\n  - {{type: lattice, {keys}}}\n"))
+
+
+# --- joints -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_pliers_hinge_is_proposed_and_valid(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = written.read_text()
+    assert (
+        "#  - type: joint  # turns on the round contact, radius 4.98, of pin and lower\n#    segments: [lower]" in text
+    )
+    head, tail = text.split("deformations:")
+    path = written.with_name("hinges.yaml")
+    path.write_text(head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: bend")[0], flags=re.MULTILINE))
+    check_scene(str(path))
+    assert "fault" not in capsys.readouterr().out
+    scene = load_scene(path)
+    scale, middle = scene.T_scene_source[0, 0], scene.T_scene_source[:3, 3]
+    for _, deform in zip(range(2), scene.sample_deformations(np.random.default_rng(0)), strict=False):
+        assert np.linalg.norm((deform(middle[None]) - middle)[0, :2]) < 0.05 * scale  # the pin's axis stays
+
+
+def test_planes_cylinders_and_other_contacts() -> None:
+    """A lid on a box is a plane, a shaft in it a cylinder, a ball in a socket neither."""
+    turn = Rigid(np.array([0.3, -0.5, 0.2]), np.zeros(3), np.zeros(3))
+    shaft = Manifold.cylinder(6, 1, 1, 32)
+    body = Manifold.cube((8, 4, 4), True) - shaft.translate((2, 0, -1))
+    lid = Manifold.cube((2, 4, 1), True).translate((-3, 0, 2.5))
+    pit = Manifold.cube((4, 4, 4), True).translate((-6, 0, 0)) - Manifold.sphere(1.5, 48).translate((-8, 0, 0))
+    parts = (body, shaft.translate((2, 0, -1)), lid, pit, Manifold.sphere(1.5, 48).translate((-8, 0, 0)))
+    meshes = [mesh_of(part) for part in parts]
+    names = ("body", "shaft", "lid", "pit", "ball")
+    mesh = SegmentedMesh(tuple(Segment(n, (0, 0, 0), turn(v), f) for n, (v, f) in zip(names, meshes, strict=True)))
+    found = {frozenset((names[c.first], names[c.second])): c for c in contacts(mesh)}
+    assert {key: c.kind for key, c in found.items()} == {
+        frozenset(("body", "shaft")): "cylinder",
+        frozenset(("body", "lid")): "plane",
+        frozenset(("body", "pit")): "plane",
+        frozenset(("pit", "ball")): "other",
+    }
+    round_one = found[frozenset(("body", "shaft"))]
+    axis = turn(np.array([[0.0, 0, 1]]))[0]
+    assert abs(round_one.axis @ axis) > 0.9999 and round_one.radius == pytest.approx(1, abs=0.02)
+    away = round_one.point - turn(np.array([[2.0, 0, 0]]))[0]
+    assert np.linalg.norm(away - (away @ axis) * axis) < 0.02
+    assert abs(found[frozenset(("body", "lid"))].axis @ axis) > 0.9999
