@@ -26,7 +26,7 @@ AGAINST = -0.8
 """Largest cosine of two normals of a contact."""
 
 PLANE_SHARE = 0.1
-"""Share of a contact that has one normal before it counts as a plane: one facet of a round face of eleven sides is none."""
+"""Share of a contact that has one normal before it counts as a plane; facets of a round face have less from 11 on."""
 
 SAME_NORMAL = float(np.cos(np.deg2rad(3.0)))
 
