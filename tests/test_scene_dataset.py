@@ -30,7 +30,8 @@ def test_an_edited_scene_is_not_resumed_but_an_edited_comment_is(tmp_path: Path)
     scene.write_text("# a comment\n" + scene.read_text())
     assert made(scene, tmp_path / "data", resume=True) == first
     scene.write_text(scene.read_text().replace("0.5", "0.4"))
-    with pytest.raises(ValueError, match="was made with scene_file_sha256 = .*resuming needs equal settings"):
+    # the deformation decides how long faces are divided, so the rest mesh is another one, too, and is compared first
+    with pytest.raises(ValueError, match="was made with (rest|scene_file)_sha256 = .*resuming needs equal settings"):
         made(scene, tmp_path / "data", resume=True)
 
 

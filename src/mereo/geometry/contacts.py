@@ -25,8 +25,8 @@ LEAST_POINTS = 12
 AGAINST = -0.8
 """Largest cosine of two normals of a contact."""
 
-PLANE_SHARE = 0.15
-"""Share of a contact that has one normal before it counts as a plane: a round face of seven sides or more is none."""
+PLANE_SHARE = 0.1
+"""Share of a contact that has one normal before it counts as a plane; facets of a round face have less from 11 on."""
 
 SAME_NORMAL = float(np.cos(np.deg2rad(3.0)))
 

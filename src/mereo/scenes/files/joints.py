@@ -113,7 +113,7 @@ def _allows(contact: Contact, joint: Contact, hinge: bool, axis: Float[np.ndarra
     if contact.kind == "other":
         return False
     if contact.kind == "plane":
-        return aligned > PARALLEL if hinge else aligned < np.sqrt(1 - PARALLEL**2)
+        return bool(aligned > PARALLEL if hinge else aligned < np.sqrt(1 - PARALLEL**2))
     away = contact.point - joint.point
     coaxial = np.linalg.norm(away - (away @ axis) * axis) < reach
     return bool(aligned > PARALLEL and (coaxial or not hinge))
