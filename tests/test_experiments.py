@@ -72,7 +72,7 @@ def test_results_are_three_files(tmp_path: Path) -> None:
 def test_scores_are_read_back_with_what_they_lack(tmp_path: Path) -> None:
     path = tmp_path / "metrics.json"
     metrics = {"iou": 0.5, "miou": None, "example_mean": {"iou": 0.4, "miou": None}, "per_segment": {"object": 0.5}}
-    path.write_text(json.dumps(metrics))
+    path.write_text(json.dumps({**metrics, "examples": 8, "seed": 1_000_000}))
     found = read_score(path)
     assert (found.iou, found.example_iou, found.per_segment) == (0.5, 0.4, {"object": 0.5})
     assert found.miou != found.miou

@@ -25,7 +25,8 @@ def test_files_in_millimetres_come_to_the_scene(tmp_path: Path) -> None:
     scene = load_scene(write_bar(tmp_path))
     for name, part in zip(("left", "right"), scene.rest.segments, strict=True):
         own = read_segmented_mesh(tmp_path / f"{name}.stl").segments[0].vertices
-        np.testing.assert_allclose(transform_points(scene.T_scene_source, own), part.vertices, atol=1e-9)
+        # long faces are divided, which adds vertices after the file's own
+        np.testing.assert_allclose(transform_points(scene.T_scene_source, own), part.vertices[: len(own)], atol=1e-9)
     assert scene.source_frame.scale == pytest.approx(2.0)  # 10 mm become 20 units
     assert scene.source_frame.source_unit_m == pytest.approx(0.001)
     model = scene_model(scene, 20)
