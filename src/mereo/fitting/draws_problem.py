@@ -93,7 +93,7 @@ class DrawsFit:
         posed: rigid pose; its ``z`` is empty.
         material: material points, unposed.
         surface: the posed surface.
-        distance, face, place: of the nearest point of the facing surface to each observed partner.
+        distance, face, place: of what each observed partner's line of sight meets (``Surface.along_sight``).
         misfit: with the prior of the draws, the cloud by its last sigma.
         motion: of the played points for a standard deviation of each draw, where it is known.
     """
@@ -124,8 +124,8 @@ def played(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], pose
     surface = Surface.through(problem.model, rigid.place(material))
     if len(surface.facing) == 0:
         return None
-    nearest = surface.nearest(problem.base.evidence.partners)
-    fit = DrawsFit(drawn, z, rigid, material, surface, *nearest, np.inf)
+    met = problem.base.met(surface)
+    fit = DrawsFit(drawn, z, rigid, material, surface, *met, np.inf)
     return replace(fit, misfit=misfit(problem, fit, problem.base.config.cloud_sigma))
 
 

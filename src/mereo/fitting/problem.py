@@ -126,6 +126,15 @@ class Problem:
         offset = self.offsets(posed)
         return is_noise(offset, noise_of(offset, self.evidence.around))
 
+    @property
+    def far(self) -> float:
+        """Distance, in scene units, beyond which a place along a line of sight is of another surface than was seen."""
+        return ROBUST * self.config.cloud_sigma
+
+    def met(self, surface: Surface) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """``Surface.along_sight`` of the observed partners."""
+        return surface.along_sight(self.evidence.partners, self.far)
+
     @cached_property
     def samples(self) -> SampledSurface:
         """Samples of the model's surface."""
@@ -167,17 +176,17 @@ class Problem:
         self, normal: NormalEquations, posed: Posed, sigma: float, network_worth: float, exact: bool
     ) -> NormalEquations:
         """Sum with cloud, witnesses and correspondences; ``exact`` asks the faces and not the samples."""
-        samples = self.samples.posed(posed)
-        surface = Surface.of(self.model, posed) if exact else samples
+        samples, partners = self.samples.posed(posed), self.evidence.partners
+        planes = Surface.of(self.model, posed).planes(partners, self.far) if exact else samples.planes(partners)
         normal = self.network.add_to(normal, posed, self.network_sigma, network_worth, robust=True)
-        normal = add_cloud(normal, posed, self.evidence.partners, surface, sigma, self.config.cloud_worth)
+        normal = add_cloud(normal, posed, partners, planes, sigma, self.config.cloud_worth)
         return add_witnesses(normal, posed, samples.few(self.config.witnesses), self.evidence, sigma)
 
     def misfit(self, posed: Posed, sigma: float | None = None) -> Misfit:
         """Misfit of a state; ``sigma`` of the cloud is its last one where not given."""
         sigma = self.config.cloud_sigma if sigma is None else sigma
         surface = Surface.of(self.model, posed)
-        cloud = float(robust_square(surface.nearest(self.evidence.partners)[0], sigma).mean())
+        cloud = float(robust_square(self.met(surface)[0], sigma).mean())
         amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * sigma)[1]
         outside = float(robust_square(amount, sigma, 4 * ROBUST).mean())
         return self.total(cloud, self.network.energy(posed, self.network_sigma), outside, posed.z)

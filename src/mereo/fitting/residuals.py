@@ -9,13 +9,15 @@ from functools import cached_property
 
 import igl
 import numpy as np
+from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float, Float32, Int
 
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed, along, cross, geman_mcclure, in_space
-from mereo.fitting.sampled_surface import PosedSamples
+from mereo.fitting.sampled_surface import Planes, PosedSamples
 from mereo.geometry.mesh import barycentric
+from mereo.geometry.raycasting import first_faces, ray_scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 ROBUST = 2.5
@@ -76,16 +78,44 @@ class Surface:
         squared, face, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         return np.sqrt(squared), face.astype(np.int64), place
 
+    def along_sight(
+        self, points: Float[np.ndarray, "p 3"], far: float
+    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """Like ``nearest``, but of the place that each point's line of sight meets, and of the distance from its plane.
+
+        A depth camera is off along the line of sight. The nearest place is another one: of a surface that bulges, it
+        has a noisy cloud a little in front, and noise across an edge pulls that edge along. Where nothing is met, or
+        only a plane farther than ``far`` from the point, it is the nearest place all the same.
+        """
+        distance, face, place = self.nearest(points)
+        rows, met = first_faces(self._rays, self._center, points)
+        toward, normal = points[rows], self.normals[met]
+        corner = self.material[self.model.faces[self.facing[met], 0]]
+        shares = np.einsum("pi,pi->p", normal, corner) / np.einsum("pi,pi->p", normal, toward)
+        there = toward * shares[:, None]
+        off = np.abs(np.einsum("pi,pi->p", normal, toward - there))
+        near = off <= far
+        rows = rows[near]
+        distance[rows], face[rows], place[rows] = off[near], met[near], there[near]
+        return distance, face, place
+
+    @cached_property
+    def _center(self) -> Float[np.ndarray, "3"]:
+        center: Float[np.ndarray, "3"] = self.material.mean(axis=0)
+        return center
+
+    @cached_property
+    def _rays(self) -> EmbreeScene:
+        return ray_scene(self.material - self._center, self.model.faces[self.facing])
+
     def offsets(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
         """Signed distance of each point from the facing surface, negative behind it."""
         distance, face, place = self.nearest(points)
         return np.copysign(distance, np.einsum("pi,pi->p", points - place, self.normals[face]))
 
-    def planes(
-        self, points: Float[np.ndarray, "p 3"]
-    ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float32[np.ndarray, "p 3 k"]]:
-        """Nearest place of the facing surface to each point, its normal and its modes."""
-        _, face, place = self.nearest(points)
+    def planes(self, points: Float[np.ndarray, "p 3"], far: float) -> Planes:
+        """Place of the facing surface along each point's line of sight, its normal and its modes."""
+        _, face, place = self.along_sight(points, far)
         corners = self.model.faces[self.facing[face]]
         weight = barycentric(self.material[corners], place).astype(np.float32)
         modes = np.matmul(weight[:, None], self.model.modes[corners].reshape(len(points), 3, -1))
@@ -138,12 +168,12 @@ def add_cloud(
     normal: NormalEquations,
     posed: Posed,
     points: Float[np.ndarray, "p 3"],
-    surface: "Surface | PosedSamples",
+    planes: Planes,
     sigma: float,
     worth: float,
 ) -> NormalEquations:
-    """Sum with each point's distance to the plane of the facing surface nearest to it."""
-    place, across, modes = surface.planes(points)
+    """Sum with each point's distance to its plane of the facing surface."""
+    place, across, modes = planes
     residual = np.einsum("pi,pi->p", across, place - points)
     weight = geman_mcclure(residual, ROBUST * sigma) * (worth / len(points) / sigma**2)
     return normal.add(along(posed, place, modes, across), residual, weight)

@@ -16,6 +16,9 @@ from scipy.spatial import cKDTree
 from mereo.fitting.gauss_newton import Posed, cross
 from mereo.scenes.statistical_model import StatisticalModel
 
+Planes = tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float32[np.ndarray, "p 3 k"]]
+"""Planes that observed points are compared with: a place on each, its normal, and the modes there."""
+
 
 @dataclass(frozen=True, eq=False)
 class SampledSurface:
@@ -85,9 +88,7 @@ class PosedSamples:
         step = max(1, len(self.place) // count)
         return PosedSamples(self.surface.every(step), self.place[::step], self.normal[::step], self.facing[::step])
 
-    def planes(
-        self, points: Float[np.ndarray, "p 3"]
-    ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float32[np.ndarray, "p 3 k"]]:
+    def planes(self, points: Float[np.ndarray, "p 3"]) -> Planes:
         """Place, normal and modes of the facing sample nearest to each point."""
         rows = np.flatnonzero(self.facing)
         rows = rows if len(rows) else np.arange(len(self.place))

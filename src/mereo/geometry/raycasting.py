@@ -10,7 +10,7 @@ import numpy as np
 from embreex import rtcore
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 _DEVICE = rtcore.EmbreeDevice()
 
@@ -53,11 +53,26 @@ def first_hits(
     scene: EmbreeScene, center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, " m"], Hits]:
     """Rays that hit a scene whose coordinates are relative to ``center``, and their hits."""
-    single = np.ascontiguousarray(directions, dtype=np.float32)
-    origins = np.broadcast_to(-center.astype(np.float32), single.shape).copy()
-    found = scene.run(origins, single, output=True)
+    found = scene.run(*_rays(center, directions), output=True)
     rows = np.flatnonzero(found["primID"] >= 0)
     return rows, Hits(found["tfar"][rows].astype(np.float64), found["Ng"][rows].astype(np.float64))
+
+
+def first_faces(
+    scene: EmbreeScene, center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Rays that hit a scene whose coordinates are relative to ``center``, and the face that each hits first."""
+    face = scene.run(*_rays(center, directions))
+    rows = np.flatnonzero(face >= 0)
+    return rows, face[rows].astype(np.int64)
+
+
+def _rays(
+    center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+    """Origins and directions in the single precision that Embree wants."""
+    single = np.ascontiguousarray(directions, dtype=np.float32)
+    return np.broadcast_to(-center.astype(np.float32), single.shape).copy(), single
 
 
 def toward(
