@@ -15,7 +15,7 @@ from mereo.models.device import bfloat16_gain, cpu_features, pick_device, pick_p
 PURPOSES: dict[str, str] = {
     "view": "the pages of `mereo view`",
     "track": "training curves in TensorBoard",
-    "vtk": "tests that read written files with VTK",
+    "plots": "curves of training runs, charts of experiments and of modes",
     "onnx": "networks for other runtimes",
     "cad": "3MF files",
     "medical": "NIfTI and NRRD volumes",
