@@ -21,6 +21,7 @@ PURPOSES: dict[str, str] = {
     "medical": "NIfTI and NRRD volumes",
     "sensors": "ROS bags, EXR depth images and Zivid clouds",
     "simulation": "states from finite elements",
+    "hub": "weights on a model hub",
     "cluster": "data generation on several machines",
     "align": "ground truth from scans",
     "docs": "the documentation as pages",
