@@ -1,4 +1,4 @@
-"""Fails unless a tag names the version that pyproject.toml and the changelog state: ``python .ci/version.py v1.2.3``."""
+"""Fails unless a tag is the version that pyproject.toml and the changelog state: ``python .ci/version.py v1.2.3``."""
 
 import re
 import sys
