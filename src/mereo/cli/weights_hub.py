@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -140,10 +141,9 @@ def _hub() -> tuple[Any, Any]:
     """huggingface_hub and a client of it; ``ImportError`` names the extra."""
     try:
         import huggingface_hub
-        from huggingface_hub.utils import disable_progress_bars
     except ImportError:
         raise ImportError("huggingface_hub is needed for model hubs: pip install 'mereo[hub]'") from None
-    disable_progress_bars()
+    import_module("huggingface_hub.utils").disable_progress_bars()
     # by ourselves, because huggingface_hub reads the variable only when it is imported
     return huggingface_hub, huggingface_hub.HfApi(endpoint=_endpoint(), library_name="mereo")
 
@@ -155,8 +155,7 @@ def _endpoint() -> str:
 @contextmanager
 def _explained(place: Place) -> Iterator[None]:
     """Say in one sentence what a hub has against it."""
-    from huggingface_hub import errors
-
+    errors: Any = import_module("huggingface_hub.errors")  # it names errors of its HTTP client that it does not export
     log_in = "log in with `hf auth login` or set HF_TOKEN"
     try:
         yield
