@@ -26,11 +26,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 
 from mereo.evaluation.sample_views import load_view
 from mereo.io.atomic_files import atomic_file, check_file_place
+from mereo.io.plots import pyplot
 
 FRAMES = 8
 """Files in the watched folder; each is another random part of one frame."""
@@ -185,9 +185,7 @@ def write_table(path: Path, both: list[Watched]) -> None:
 
 def draw(path: Path, both: list[Watched]) -> None:
     """Draw memory and latencies against time."""
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
+    plt = pyplot()
     figure, panels = plt.subplots(2, len(both), figsize=(11, 6), sharex=True, layout="constrained", squeeze=False)
     for watched, (memory, latency) in zip(both, panels.T, strict=True):
         minutes, rss, _, median, worst = zip(*watched.rows, strict=True)

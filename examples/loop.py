@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw
@@ -35,6 +34,7 @@ from mereo.scenes.scene import Scene
 from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
 from mereo.visualization.contact_sheets import INK, Picture, depth_to_rgb, fit_font, font
 from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
+from mereo.visualization.viridis import viridis
 
 SCENE, SEED, NOISE_STD = "bunny", 1_000_007, 0.1
 """The last is the sensor's noise in scene units, the paper's."""
@@ -142,7 +142,7 @@ def draw_shell(canvas: Canvas, points: Float[np.ndarray, "n 3"], behind: float =
     """
     z = points[:, 2]
     nearness = 1 - (z - z.min()) / np.ptp(z)
-    colors = np.asarray(matplotlib.colormaps["viridis"](nearness))[:, :3]
+    colors = viridis(nearness) / 255
     slope = -(outward(points) @ canvas.view.T_view_world[2, :3])
     seen = np.clip(0.5 + 2.5 * slope, 0, 1)[:, None]
     shown = seen * colors * (0.72 + 0.28 * np.clip(slope, 0, 1)[:, None]) + (1 - seen) * INNER

@@ -52,6 +52,11 @@ def test_settings_are_light(mereo: Package) -> None:
     assert_none(heavy_settings(mereo))
 
 
+def test_only_charts_ask_for_the_extra_plots(mereo: Package) -> None:
+    asking = {found.source for found in mereo if found.target == "matplotlib"}
+    assert asking == {"io/plots", "experiments/paper/result", "experiments/paper/sampling_figure"}
+
+
 def test_no_module_needs_itself(mereo: Package) -> None:
     assert_none(cycles(mereo))
 

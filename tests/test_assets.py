@@ -12,8 +12,8 @@ from pathlib import Path
 
 import igl
 import numpy as np
+import pooch
 import pytest
-import requests
 import trimesh
 
 from mereo.evaluation.scans import BUNNY_SCAN_POSES
@@ -152,10 +152,10 @@ def test_silent_network_is_given_up_in_time(monkeypatch: pytest.MonkeyPatch) -> 
 
     def hang(*_: object, **__: object) -> None:
         release.wait(30)
-        raise requests.ConnectionError
+        raise ConnectionError
 
     monkeypatch.setattr(assets, "ANSWER_SECONDS", 0.2)
-    monkeypatch.setattr(requests, "head", hang)
+    monkeypatch.setattr(pooch.HTTPDownloader, "__call__", hang)
     start = time.monotonic()
     with pytest.raises(AssetUnavailable, match="cannot be reached"):
         assets.get(asset.name)

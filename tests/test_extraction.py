@@ -116,6 +116,27 @@ def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
     )
 
 
+def test_ambiguous_cells_are_resolved_alike_for_both_neighbours() -> None:
+    """By Lorensen's table of marching cubes 0.70 of the faces are: it joins corners of one sign, whosoever they are."""
+    rng = np.random.default_rng(3)
+    waves, phases = rng.normal(size=(3, 24)) * 22.0, rng.uniform(0, 2 * np.pi, 24)
+
+    def field(points: np.ndarray) -> np.ndarray:
+        first = np.sin(points @ waves + phases).sum(axis=1)
+        return np.stack([np.full(len(points), -99.0), first, -first], axis=1)
+
+    ours, theirs = (_faces_within(segment) for segment in run(field, 2, 24, dense=True).surfaces.segments)
+    assert len(ours) > 5000, "a rough field, full of such cells"
+    assert len(ours & theirs) > 0.95 * len(ours | theirs)
+
+
+def _faces_within(segment: Segment) -> set[tuple[tuple[float, ...], ...]]:
+    """Faces that do not lie at the box, by their corners in any order."""
+    corners = segment.vertices[segment.faces].round(5)
+    within = corners[(np.abs(corners) < 0.95).all(axis=(1, 2))]
+    return {tuple(sorted(map(tuple, face))) for face in within.tolist()}
+
+
 def test_ties_on_nodes_leave_surfaces_closed() -> None:
     """Interface and poles lie exactly on nodes, where two logits are equal."""
     whole = ball((0.0, 0.0, 0.0), 0.5)

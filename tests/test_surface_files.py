@@ -163,7 +163,7 @@ def test_stl_names_are_safe_and_distinct() -> None:
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "stl"])
 def test_vtk_sees_the_surfaces_where_they_are(tmp_path: Path, suffix: str) -> None:
-    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[vtk]'")
+    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
     writers = {"ply": write_segments_ply, "obj": write_segments_obj, "stl": write_segments_stl}
     writers[suffix](tmp_path / f"s.{suffix}", segments())
     found = pyvista.read(tmp_path / (f"s.{suffix}" if suffix != "stl" else "s.stl/3-Öhrchen.stl"))

@@ -21,7 +21,7 @@ from mereo.io.writers.points import write_points_npz
 from mereo.io.writers.volumes import write_labels_npz, write_labels_vti
 
 RAS_OF_INPUT = np.array([-1.0, -1.0, 1.0])
-PYVISTA = "pyvista is not installed: pip install 'mereo[vtk]'"
+PYVISTA = "pyvista is not installed: pip install 'mereo[dev]'"
 
 
 def test_labels_come_back(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo.cli import commands, scene_commands, tool_commands
+from mereo.cli import commands, scene_commands, tool_commands, weights_hub_commands
 from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.learn import LearnCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
@@ -145,6 +145,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         (scene_commands.SceneModes, "modes"),
         (scene_commands.SceneExport, "export"),
     )
+    weights = (weights_hub_commands.WeightsPush, "push"), (weights_hub_commands.WeightsPull, "pull")
     assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")
     return (
         Annotated[commands.Demo, subcommand("demo")]
@@ -152,6 +153,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[LearnCommand, subcommand("learn")]
         | Annotated[_group(scene), subcommand("scene", description="List, write, check, draw or export scenes.")]
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
+        | Annotated[_group(weights), subcommand("weights", description="Put weights on a model hub, or fetch them.")]
         | Annotated[_starting(commands.Generate, settings=GenerateConfig(sensor=sensor)), subcommand("generate")]
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]

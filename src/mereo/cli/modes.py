@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.io.atomic_files import atomic_file, check_file_place
+from mereo.io.plots import CURE, has_plots
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import LEAST_STATES, scene_model
 from mereo.scenes.registry import files_of, load_scene
@@ -42,6 +43,8 @@ def show_modes(scene: str, output: Path | None, states: int, force: bool = False
         with atomic_file(output, force=force, inputs=files_of(scene)) as partial:
             preview_modes(model, partial, name)
         console.print(f"wrote {output}", highlight=False, soft_wrap=True)
+        if not has_plots():
+            console.print(f"its plot is left out, for matplotlib {CURE}", highlight=False, soft_wrap=True)
 
 
 def _model_of(scene: str, states: int) -> tuple[str, StatisticalModel]:

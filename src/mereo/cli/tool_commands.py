@@ -227,6 +227,9 @@ class Experiment:
 
     def run(self) -> None:
         """Run the experiment and print its table."""
+        from mereo.io.plots import pyplot
+
+        pyplot()  # before the hours that it takes
         from mereo.experiments.paper.registry import run_experiment
 
         workers = self.workers or os.cpu_count() or 1

@@ -207,7 +207,6 @@ def _cache() -> Path:
 def _from_cache(asset: Asset) -> Path:
     """The cached file; downloaded first when it is missing or damaged."""
     import pooch
-    import requests
 
     cure = f"put the file from {asset.url} at {asset.name} in a folder and set {MIRROR_VARIABLE} to that folder"
     path = _cache() / asset.name
@@ -219,11 +218,11 @@ def _from_cache(asset: Asset) -> Path:
     try:
         downloader = pooch.HTTPDownloader(timeout=(ANSWER_SECONDS, STALL_SECONDS))
         found = pooch.retrieve(asset.url, f"sha256:{asset.sha256}", asset.name, _cache(), downloader=downloader)
-    except requests.RequestException as error:
-        raise AssetUnavailable(f"the download of {asset.name} failed ({type(error).__name__}): {cure}") from error
     except ValueError as error:  # pooch: another hash; it has deleted the file
         raise AssetUnavailable(f"what {asset.url} delivers is not {asset.name} (another SHA-256): {cure}") from error
     except OSError as error:
+        if error.errno is None:  # a download's; those of the file system have a number
+            raise AssetUnavailable(f"the download of {asset.name} failed ({type(error).__name__}): {cure}") from error
         raise AssetUnavailable(
             f"{asset.name} cannot be stored at {path} ({error.strerror}): free space there, or set XDG_CACHE_HOME"
         ) from error
@@ -235,15 +234,15 @@ def _answers(url: str) -> bool:
 
     In a thread, because the time limit of a connection is per address of the host and name look-up has none at all.
     """
-    import requests
+    import pooch
 
     answered: list[bool] = []
 
     def ask() -> None:
         try:
-            with requests.head(url, timeout=ANSWER_SECONDS):
-                answered.append(True)
-        except requests.RequestException:
+            pooch.HTTPDownloader(timeout=ANSWER_SECONDS)(url, None, None, check_only=True)
+            answered.append(True)
+        except OSError:
             pass
 
     thread = threading.Thread(target=ask, daemon=True)

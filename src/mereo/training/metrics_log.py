@@ -1,4 +1,4 @@
-"""Record of a training run: metrics.csv, curves.png, and TensorBoard events where the extra is installed."""
+"""Record of a training run: metrics.csv; curves.png and TensorBoard events where their extras are installed."""
 
 import csv
 import io
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mereo.io.atomic_files import atomic_file
+from mereo.io.plots import CURE, has_plots, pyplot
 
 FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "code", "val_iou", "val_miou")
 SENSOR_FIELDS = ("sensor_iou", "sensor_miou")
@@ -33,6 +34,9 @@ class MetricsLog:
         self.fields = FIELDS + (SENSOR_FIELDS if sensors else ())
         self.rows: list[Row] = []
         self.board = _tensorboard(run_dir)
+        self.draws = has_plots()
+        if not self.draws:
+            print(f"{CURVES} is left out, for matplotlib, which draws it, {CURE}", flush=True)
 
     def add_step(self, step: int, rate: float, losses: dict[str, float]) -> None:
         """Add the row of a step; ``losses`` are the total under "loss" and its terms."""
@@ -78,19 +82,21 @@ class MetricsLog:
         )
 
     def write(self) -> None:
-        """Write metrics.csv and curves.png, each atomically."""
+        """Write metrics.csv, and curves.png where it can be drawn, each atomically."""
         text = io.StringIO()
         writer = csv.DictWriter(text, self.fields, restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows({k: _exact(k, v) for k, v in row.items()} for row in self.rows)
         with atomic_file(self.run_dir / TABLE) as temporary:
             temporary.write_text(text.getvalue())
-        with atomic_file(self.run_dir / CURVES) as temporary:
-            draw_curves(self.rows, temporary)
+        if self.draws:
+            with atomic_file(self.run_dir / CURVES) as temporary:
+                draw_curves(self.rows, temporary)
 
     def is_written(self, step: int) -> bool:
-        """Whether the rows that were read back end with ``step``, and their curves are there."""
-        return bool(self.rows) and self.rows[-1]["step"] == step and (self.run_dir / CURVES).is_file()
+        """Whether the rows that were read back end with ``step``, and their curves are there or cannot be drawn."""
+        drawn = (self.run_dir / CURVES).is_file() or not self.draws
+        return bool(self.rows) and self.rows[-1]["step"] == step and drawn
 
     def read_until(self, step: int) -> None:
         """Take up the rows of the steps that the checkpoint includes; ``ValueError`` where they cannot be read."""
@@ -120,11 +126,7 @@ def _tensorboard(run_dir: Path) -> Any:
 
 def draw_curves(rows: list[Row], path: Path) -> None:
     """Draw loss terms (running median, logarithmic) and validation scores against the step."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     for name in ("loss", "ce", "l1"):
         points = [(row["step"], row[name]) for row in rows if row.get(name, 0) > 0]

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
@@ -13,6 +12,7 @@ from mereo.geometry.camera import DepthImage
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
 from mereo.visualization.renderer import Canvas, Viewpoint
+from mereo.visualization.viridis import viridis
 
 Picture = UInt8[np.ndarray, "_ _ 3"]
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -77,8 +77,7 @@ def depth_to_rgb(image: DepthImage, limits: tuple[float, float] | None = None) -
     seen = image.depth[image.valid]
     near, far = limits or ((float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0))
     nearness = 1 - (image.depth - near) / max(far - near, 1e-12)
-    rgb = np.asarray(matplotlib.colormaps["viridis"](nearness, bytes=True))[..., :3]
-    return np.where(image.valid[..., None], rgb, np.asarray(MISSING, dtype=np.uint8))
+    return np.where(image.valid[..., None], viridis(nearness), np.asarray(MISSING, dtype=np.uint8))
 
 
 def enlarge(picture: Picture, width: int) -> Picture:
@@ -92,8 +91,7 @@ def _draw_cloud(canvas: Canvas, points: Float[np.ndarray, "n 3"], radius_px: flo
         return
     z = canvas.view.apply(points)[:, 2]
     nearness = 1 - (z - z.min()) / max(float(np.ptp(z)), 1e-12)
-    colors = np.asarray(matplotlib.colormaps["viridis"](0.05 + 0.85 * nearness))[:, :3]
-    canvas.draw_points(points, colors, radius_px)
+    canvas.draw_points(points, viridis(0.05 + 0.85 * nearness) / 255, radius_px)
 
 
 def cloud_picture(points: Float[np.ndarray, "n 3"], view: Viewpoint, size: tuple[int, int]) -> Picture:

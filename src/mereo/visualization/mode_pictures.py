@@ -3,11 +3,11 @@
 import io
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.plots import has_plots, pyplot
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.visualization.contact_sheets import Picture, contact_sheet, save_png
 from mereo.visualization.previews import SCENE_VIEWS, common_viewpoint
@@ -21,7 +21,9 @@ OBLIQUE = ((0.3, -0.4, -1.0), (0.0, 1.0, 0.0))
 
 
 def preview_modes(model: StatisticalModel, path: str | Path, name: str = "", modes: int = 6, size: int = 200) -> None:
-    """Write a sheet of the largest modes, each at -2, 0 and +2 standard deviations, and the residue by their number.
+    """Write a sheet of the largest modes, each at -2, 0 and +2 standard deviations.
+
+    Below them the residue by their number, where the extra `plots` is installed.
 
     Args:
         model: the statistical model.
@@ -37,7 +39,8 @@ def preview_modes(model: StatisticalModel, path: str | Path, name: str = "", mod
     captions = [_caption(model, mode, std) for mode in range(shown) for std in SHOWN_STD] or ["does not deform"]
     title = f"{name}: {model.count} modes leave {model.residue:.3f} units of an unseen state"
     sheet = contact_sheet(images, captions, 2 * len(SHOWN_STD) if shown > 1 else len(images), title)
-    save_png(path, np.concatenate([sheet, _residue_plot(model, sheet.shape[1])]) if model.count else sheet)
+    plotted = model.count and has_plots()
+    save_png(path, np.concatenate([sheet, _residue_plot(model, sheet.shape[1])]) if plotted else sheet)
 
 
 def _at(model: StatisticalModel, mode: int, std: float) -> SegmentedMesh:
@@ -56,6 +59,7 @@ def _caption(model: StatisticalModel, mode: int, std: float) -> str:
 
 def _residue_plot(model: StatisticalModel, width: int, height: int = 260) -> Picture:
     """Distance that is left of a state against the number of modes, as wide as the sheet above it."""
+    plt = pyplot()
     figure, axes = plt.subplots(figsize=(width / 100, height / 100), dpi=100, layout="constrained")
     axes.semilogy(np.arange(model.count + 1), model.residues, color="#2563c9")
     axes.axhline(model.residue, color="#98a2b3", linestyle=":")

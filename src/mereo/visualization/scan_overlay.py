@@ -1,6 +1,5 @@
 """Picture of a model placed on a scan."""
 
-import matplotlib
 import numpy as np
 
 from mereo.evaluation.registration.placement import Placement
@@ -14,6 +13,7 @@ from mereo.geometry.transforms import transform_points
 from mereo.visualization.contact_sheets import Picture, contact_sheet, legend
 from mereo.visualization.previews import CAMERA_VIEWS
 from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
+from mereo.visualization.viridis import viridis
 
 SHOWN_POINTS = 40_000
 """Most points of the scan that a picture shows."""
@@ -34,7 +34,7 @@ def overlay(placement: Placement, cloud: PointCloud, scan: ScanFile) -> Picture:
     distance = Solids(mesh).nearest(points).distance
     views = {name: Viewpoint.along(mesh.bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
     mm = 1000 * UNITS_M[scan.unit] * placement.limit
-    near = np.asarray(matplotlib.colormaps["viridis"](distance / placement.limit))[:, :3]
+    near = viridis(distance / placement.limit) / 255
     colors = np.where((distance > placement.limit)[:, None], TOO_FAR, near)
     ink = np.zeros_like(points)
     top = [_drawn(view, mesh, points, ink) for view in views.values()]

@@ -9,7 +9,6 @@ from math import isnan
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -18,7 +17,9 @@ from mereo.evaluation.results import EvaluatedView
 from mereo.experiments.paper.store import Score
 from mereo.io.atomic_files import atomic_file, write_json
 from mereo.io.output_folders import new_directory
+from mereo.io.plots import pyplot
 from mereo.visualization.error_maps import error_picture
+from mereo.visualization.viridis import viridis
 
 Figures = dict[str, float]
 """Scores published in the paper: ``iou`` and ``miou``, or only one of them."""
@@ -147,13 +148,12 @@ def _plain(result: Result) -> dict[str, Any]:
 
 def draw_bars(result: Result, path: Path) -> None:
     """Draw a group of bars per object: IoU (pale) and mIoU (full) of each variant, and the paper's as black lines."""
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
     from matplotlib.patches import Patch
 
     objects = list(dict.fromkeys(row.object for row in result.rows))
     variants = list(dict.fromkeys(row.variant for row in result.rows))
-    colors = matplotlib.colormaps["viridis"](np.linspace(0.05, 0.9, len(variants)))
+    plt = pyplot()
+    colors = viridis(np.linspace(0.05, 0.9, len(variants))) / 255
     width = 0.8 / len(variants)
     inches = max(6.5, 0.45 * len(result.rows) + 1.5)
     figure, axes = plt.subplots(figsize=(inches, 4.2), layout="constrained")
