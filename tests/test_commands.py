@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import mereo.__main__ as command_line
+from mereo.cli.reconstruct import FrameJob
 from mereo.io.config import InputConfig
 from mereo.training.config import PRESETS
 
@@ -34,9 +35,13 @@ from mereo.training.config import PRESETS
         ),
         (
             "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force",
-            "mereo.cli.reconstruct",
+            "mereo.cli.reconstruct_many",
             "reconstruct_file",
-            {"reading": InputConfig(Path("k.json"), 5000.0, Path("m.png")), "force": True},
+            {
+                "input": Path("a.png"),
+                "output": Path("out"),
+                "job": FrameJob("rope", reading=InputConfig(Path("k.json"), 5000.0, Path("m.png")), force=True),
+            },
         ),
         ("demo --output out", "mereo.cli.demo", "main", {"output": Path("out")}),
     ],

@@ -17,6 +17,7 @@ from tyro.conf import subcommand
 from mereo.cli import commands, scene_commands, tool_commands
 from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.learn import LearnCommand
+from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.io.bounds import check_bounds
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
@@ -155,7 +156,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[_starting(commands.Generate, settings=GenerateConfig(sensor=sensor)), subcommand("generate")]
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
-        | Annotated[commands.Reconstruct, subcommand("reconstruct")]
+        | Annotated[ReconstructCommand, subcommand("reconstruct")]
         | Annotated[tool_commands.Align, subcommand("align")]
         | Annotated[tool_commands.ViewCommand, subcommand("view")]
         | Annotated[tool_commands.StreamCommand, subcommand("stream")]

@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, arg
 
 from mereo.fitting.config import FitChoice
-from mereo.io.bounds import Cells, Count, CountOrNone, ImageSize, NotNegative, Workers
-from mereo.io.config import CarryFrame, FilesConfig, InputConfig
+from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Workers
 from mereo.models.config import EXACT, InferenceConfig
-from mereo.reconstruction.config import IsolationConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.training.config import PresetName, TrainConfig
 
@@ -206,65 +204,6 @@ class Evaluate:
             settings=settings,
             inference=self.inference,
             choice=self.fit,
-        )
-
-
-@dataclass(frozen=True)
-class Reconstruct:
-    """Reconstruct all segments from one frame: a depth image, a point cloud or a ROS recording.
-
-    Attributes:
-        input: depth image (PNG, TIFF, EXR, NPY), point cloud (PLY, PCD, XYZ, NPY, NPZ, ZDF) or ROS recording (bag,
-            MCAP); results are in its frame and units.
-        weights: a shipped name or a file.
-        output: folder to create.
-        resolution: grid cells along the longest side.
-        reading: how the frame is read.
-        isolation: what of the frame is left out.
-        inference: where and how exactly the network computes.
-        files: which files, and in which unit.
-        fit: register the object's own deformation model to the frame: auto takes the registered model where it explains
-            the frame, if the weights carry one; off leaves the network's answer; modes and full take the model in any
-            case, full by fitting the draws of the scene as well.
-        scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
-        carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
-            glTF), points (PLY, PCD, XYZ, NPY) or CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses).
-        carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
-        force: replace an existing output folder that mereo wrote, and nothing else is in.
-    """
-
-    input: Positional[Path]
-    weights: str
-    output: Path
-    resolution: Cells = 128
-    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
-    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
-    files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
-    fit: FitChoice = "auto"
-    scene: str | None = None
-    carry: UseAppendAction[tuple[Path, ...]] = ()
-    carry_frame: CarryFrame = "source"
-    force: bool = False
-
-    def run(self) -> None:
-        """Write the folder of results and print the segments."""
-        from mereo.cli.reconstruct import reconstruct_file
-
-        reconstruct_file(
-            self.input,
-            self.weights,
-            self.output,
-            resolution=self.resolution,
-            reading=self.reading,
-            isolation=self.isolation,
-            inference=self.inference,
-            files=self.files,
-            choice=self.fit,
-            scene=self.scene,
-            carry=self.carry,
-            carry_frame=self.carry_frame,
-            force=self.force,
         )
 
 
