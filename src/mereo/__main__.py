@@ -14,7 +14,7 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo.cli import commands, scene_commands, tool_commands
+from mereo.cli import commands, scene_commands, tool_commands, weights_commands
 from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.learn import LearnCommand
 from mereo.cli.reconstruct_command import ReconstructCommand
@@ -146,6 +146,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         (scene_commands.SceneModes, "modes"),
         (scene_commands.SceneExport, "export"),
     )
+    weights = (weights_commands.WeightsList, "list"), (weights_commands.WeightsShow, "show")
     assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")
     return (
         Annotated[commands.Demo, subcommand("demo")]
@@ -153,6 +154,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         | Annotated[LearnCommand, subcommand("learn")]
         | Annotated[_group(scene), subcommand("scene", description="List, write, check, draw or export scenes.")]
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
+        | Annotated[_group(weights), subcommand("weights", description="List weights, or show what they know.")]
         | Annotated[_starting(commands.Generate, settings=GenerateConfig(sensor=sensor)), subcommand("generate")]
         | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
         | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]

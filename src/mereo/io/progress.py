@@ -74,7 +74,9 @@ class Progress:
             self.paused_s += time.monotonic() - begun
 
     def _text(self, rate: float, left_s: float, note: str) -> str:
-        speed = f"{rate * self.each:.1f} examples/s" if self.each else f"{rate:.{1 if rate >= 0.1 else 3}f} {self.unit}/s"
+        speed = (
+            f"{rate * self.each:.1f} examples/s" if self.each else f"{rate:.{1 if rate >= 0.1 else 3}f} {self.unit}/s"
+        )
         return ", ".join(part for part in (self._count, speed, f"{duration(left_s)} left", note) if part)
 
     @property
@@ -102,7 +104,9 @@ class Progress:
 
 
 @contextmanager
-def progress(stage: str, total: int, unit: str = "examples", *, each: int = 0, quiet: bool = False) -> Iterator[Progress]:
+def progress(
+    stage: str, total: int, unit: str = "examples", *, each: int = 0, quiet: bool = False
+) -> Iterator[Progress]:
     """Context of a stage, which shows its progress; at its end a line with the time it took, unless it failed.
 
     Args:
