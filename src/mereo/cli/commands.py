@@ -3,16 +3,18 @@
 ``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
 """
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from mereo.cli.config_file import ConfigFile, options_of
 from mereo.fitting.config import FitChoice
-from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Workers
-from mereo.models.config import EXACT, InferenceConfig
+from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Threads, Workers
+from mereo.io.config import CONFIG
+from mereo.io.cores import workers_for
+from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.training.config import PresetName, TrainConfig
 
@@ -85,12 +87,14 @@ class Generate:
         examples: how many.
         output: folder to create.
         seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
-        workers: processes; the result does not depend on them. 0 means one per core.
+        workers: processes, each in one thread; the result does not depend on them. 0 means as many as --threads.
         shard: make only part i of n, as i/n from 0/n to (n-1)/n, for example on several machines.
         resume: go on with a run that was stopped.
         test: allow a test seed.
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
         settings: how one example is made.
+        threads: processes where --workers does not say; 0 means one per core.
+        options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
     scene: Positional[str]
@@ -103,9 +107,12 @@ class Generate:
     test: bool = False
     sensor: Sensor = "paper"
     settings: Annotated[GenerateConfig, arg(name="")] = field(default_factory=GenerateConfig)
+    threads: Threads = 0
+    options_from: ConfigFile = None
 
     def run(self) -> None:
         """Write the folder of labelled examples."""
+        from mereo.io.atomic_files import write_json
         from mereo.synthesis.shards import generate
 
         generate(
@@ -114,11 +121,12 @@ class Generate:
             self.settings,
             examples=self.examples,
             seed=self.seed,
-            workers=self.workers or os.cpu_count() or 1,
+            workers=workers_for(self.workers, self.threads),
             shard=part_of(self.shard),
             resume=self.resume,
             test=self.test,
         )
+        write_json(self.output / CONFIG, options_of(self, "generate"))
 
 
 @dataclass(frozen=True)
@@ -131,18 +139,24 @@ class Train:
         preset: what the options below start from: as published, as published for --network.encoder autodecoder,
             recommended, the same for a GPU, one for tests.
         config: the recipe; defaults are the chosen preset's.
+        device: where the network is trained; auto takes a CUDA device where there is one.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        options_from: file of options, JSON or YAML, such as the config.json of a run; the command line wins over it.
     """
 
     dataset: Positional[Path]
     output: Path
     preset: PresetName = "base"
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+    device: Device = "auto"
+    threads: Threads = 0
+    options_from: ConfigFile = None
 
     def run(self) -> None:
         """Train, and print where the weights are."""
         from mereo.training.trainer import train
 
-        print(f"weights: {train(self.dataset, self.output, self.config)}")
+        print(f"weights: {train(self.dataset, self.output, self.config, device=self.device)}")
 
 
 @dataclass(frozen=True)
@@ -165,6 +179,9 @@ class Evaluate:
         inference: where and how exactly the network computes.
         fit: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the modes'
             and the draws' own scores beside it; off the network alone; modes leaves the draws out.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
     weights: Positional[str]
@@ -179,6 +196,9 @@ class Evaluate:
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
     fit: FitChoice = "auto"
+    force: bool = False
+    threads: Threads = 0
+    options_from: ConfigFile = None
 
     def run(self) -> None:
         """Write scores and pictures of their errors, and print the table."""
@@ -193,7 +213,15 @@ class Evaluate:
                     "--scans are real and take no simulated camera: leave out --sensor, --image-size and --noise-std"
                 )
             model = load_for(self.weights, self.inference)
-            evaluate_on_scans(model, self.output, truths=self.scans, scene=self.scene, choice=self.fit)
+            evaluate_on_scans(
+                model,
+                self.output,
+                truths=self.scans,
+                scene=self.scene,
+                choice=self.fit,
+                force=self.force,
+                options=options_of(self, "evaluate"),
+            )
             return
         evaluate_weights(
             self.weights,
@@ -204,6 +232,8 @@ class Evaluate:
             settings=settings,
             inference=self.inference,
             choice=self.fit,
+            force=self.force,
+            options=options_of(self, "evaluate"),
         )
 
 

@@ -1,10 +1,11 @@
 """``mereo reconstruct``: one frame of a sensor to a folder of results."""
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -16,8 +17,9 @@ from mereo.fitting.config import FitChoice
 from mereo.fitting.register import Registrar, describe, registrar_for
 from mereo.fitting.registration_state import write_state
 from mereo.geometry.transforms import inverse_rigid
+from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
-from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
+from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
 from mereo.io.output_folders import new_directory
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
@@ -47,19 +49,21 @@ class FrameJob:
         carry: files of what is defined in the rest model, to be brought to where the object is.
         carry_frame: their frame and unit: of the object's own files, or of its scene.
         force: replace an existing folder that mereo wrote.
+        options: what config.json of the results says, with the frame's own name as its only input; without any, none.
     """
 
     weights: str | Path
     resolution: int = 128
-    reading: InputConfig = InputConfig()
-    isolation: IsolationConfig = IsolationConfig()
-    inference: InferenceConfig = InferenceConfig()
+    reading: InputConfig = field(default_factory=InputConfig)
+    isolation: IsolationConfig = field(default_factory=IsolationConfig)
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
     files: FilesConfig = DEFAULT_FILES
     choice: FitChoice = "auto"
     scene: str | None = None
     carry: tuple[str | Path, ...] = ()
     carry_frame: CarryFrame = "source"
     force: bool = False
+    options: Mapping[str, Any] | None = None
 
     def check(self) -> None:
         """Raise for options that fit together with no frame: before the work, not after.
@@ -135,6 +139,8 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> An
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
         _write(directory, job, frame, seen, found, placed)
+        if job.options is not None:
+            write_json(directory / CONFIG, {**job.options, "inputs": [str(Path(input).absolute())]})
     result = found.reconstruction
     print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {seconds_of(found):.1f} s; open {Path(output) / 'report.html'} in a browser")

@@ -6,8 +6,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from mereo.cli.config_file import ConfigFile, options_of
 from mereo.fitting.config import FitChoice
-from mereo.io.bounds import Cells
+from mereo.io.bounds import Cells, Threads
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -38,6 +39,8 @@ class ReconstructCommand:
             glTF), points (PLY, PCD, XYZ, NPY) or CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses).
         carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
     inputs: Positional[tuple[Path, ...]]
@@ -53,6 +56,8 @@ class ReconstructCommand:
     carry: UseAppendAction[tuple[Path, ...]] = ()
     carry_frame: CarryFrame = "source"
     force: bool = False
+    threads: Threads = 0
+    options_from: ConfigFile = None
 
     def run(self) -> None:
         """Write the folder of results and print the segments."""
@@ -71,5 +76,6 @@ class ReconstructCommand:
             self.carry,
             self.carry_frame,
             self.force,
+            options_of(self, "reconstruct"),
         )
         reconstruct_inputs(self.inputs, self.output, job)

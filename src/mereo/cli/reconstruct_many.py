@@ -16,9 +16,9 @@ from mereo.cli.reconstruct import FrameJob, reconstruct_file, seconds_of
 from mereo.fitting.answer import Answer
 from mereo.io.config import InputConfig
 from mereo.io.output_folders import MARKER
+from mereo.io.progress import duration
 from mereo.io.ros_recordings import is_recording
 from mereo.io.scratch_folders import check_place
-from mereo.io.progress import duration
 from mereo.reconstruction.observation import SizeWarning
 from mereo.reconstruction.stream import sentence
 from mereo.reconstruction.stream_sources import frames_in
@@ -112,8 +112,8 @@ def reconstruct_frames(files: Sequence[Path], output: Path, job: FrameJob) -> li
     failed = sum(outcome.found is None for outcome in outcomes)
     if failed:
         raise ValueError(
-            f"{failed} of {len(files)} frames could not be reconstructed, each for the reason given with it; the others "
-            "are written: correct them, and name only those again"
+            f"{failed} of {len(files)} frames could not be reconstructed, each for the reason given with it; the "
+            "others are written: correct them, and name only those again"
         )
     return outcomes
 

@@ -12,9 +12,10 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
-from mereo.io.bounds import Cells, Count, Port, Positive, PositiveOrUnknown, Workers
+from mereo.io.bounds import Cells, Count, Port, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
-from mereo.models.config import InferenceConfig, Precision
+from mereo.io.cores import workers_for
+from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.reconstruction.config import IsolationConfig
 from mereo.training.config import PresetName
 
@@ -141,6 +142,7 @@ class StreamCommand:
         reading: how a frame is read.
         isolation: what is left out of it.
         inference: where and how exactly the network computes.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
     """
 
     source: Positional[str]
@@ -154,6 +156,7 @@ class StreamCommand:
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    threads: Threads = 0
 
     def run(self) -> None:
         """Print a line of JSON for each frame, and the summary at the end."""
@@ -183,7 +186,7 @@ class BenchCommand:
     Attributes:
         weights: a shipped name or a file; without it the preset's network is fitted to one shipped frame first.
         preset: the architecture to fit.
-        device: where the network runs; preprocessing is always on the CPU.
+        device: where the network runs, auto on a CUDA device where there is one; preprocessing is always on the CPU.
         precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
@@ -193,7 +196,7 @@ class BenchCommand:
 
     weights: str | None = None
     preset: PresetName = "paper"
-    device: Literal["cpu", "cuda"] = "cpu"
+    device: Device = "auto"
     precision: Precision = "float32"
     repeats: Count = 7
     rival: bool = False
@@ -217,20 +220,21 @@ class Experiment:
         name: which one.
         scale: smoke shows in minutes that it runs, cpu takes hours on two cores, paper is the full recipe for a GPU.
         output: folder for datasets, runs, scores and results, shared by all experiments.
-        workers: processes that make datasets; 0 means one per core.
+        workers: processes that make datasets; 0 means as many as --threads.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
     """
 
     name: Positional[ExperimentName]
     scale: ScaleName = "smoke"
     output: Path = Path("out/experiments")
     workers: Workers = 0
+    threads: Threads = 0
 
     def run(self) -> None:
         """Run the experiment and print its table."""
         from mereo.experiments.paper.registry import run_experiment
 
-        workers = self.workers or os.cpu_count() or 1
-        directory = run_experiment(self.name, self.scale, self.output, workers)
+        directory = run_experiment(self.name, self.scale, self.output, workers_for(self.workers, self.threads))
         print((directory / "table.md").read_text("utf-8"))
         print(f"wrote {directory}")
 

@@ -148,8 +148,8 @@ def _registration(facts: WeightsFacts) -> str:
         return "none: the network answers alone"
     states = facts.states
     return (
-        f"mesh at rest ({states.vertices:,} vertices) and {states.modes} modes of {states.states:,} states, which leave "
-        f"{states.residue:.2g} scene units of an unseen state"
+        f"mesh at rest ({states.vertices:,} vertices) and {states.modes} modes of {states.states:,} states, which "
+        f"leave {states.residue:.2g} scene units of an unseen state"
     )
 
 

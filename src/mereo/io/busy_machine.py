@@ -12,6 +12,8 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mereo.io.cores import cores
+
 SETTLED_S = 10.0
 """Seconds over which waiting is counted: less would see what starts and ends beside any work."""
 
@@ -25,13 +27,6 @@ Times = dict[str, tuple[int, int]]
 """Nanoseconds that each thread ran, and waited for a core, by its path."""
 
 _said = False
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def thread_times() -> Times:

@@ -18,7 +18,8 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from mereo.io.scratch_folders import check_place
-from mereo.models.device import compiling_pays, keep_freed_memory, pick_device, pick_precision
+from mereo.models.config import Device
+from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
 from mereo.models.weights import save_model, trained_steps
@@ -36,7 +37,14 @@ from mereo.training.validation import choose_offsets, held_out, validate
 WEIGHTS = "weights.safetensors"
 
 
-def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_every_s: float = 120.0) -> Path:
+def train(
+    dataset_dir: Path,
+    run_dir: Path,
+    config: TrainConfig,
+    *,
+    device: Device = "auto",
+    checkpoint_every_s: float = 120.0,
+) -> Path:
     """Train on a generated dataset; returns the path of the weights (``run_dir/weights.safetensors``).
 
     ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors. If it
@@ -46,13 +54,13 @@ def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_e
     """
     check_place(run_dir, may_be_link=True)
     process = join_processes()
-    device = pick_device(process.rank)
-    data = Dataset.load(dataset_dir, device)
+    place = find_device(device, process.rank)
+    data = Dataset.load(dataset_dir, place)
     config = fit_config(config, data)
     network = start_network(config, data)  # before anything is written: the weights it starts from may be unusable
     claim_run(run_dir, config, data, process)
     keep_freed_memory()
-    trainer = Trainer(config, data, network, run_dir, process, device)
+    trainer = Trainer(config, data, network, run_dir, process, place)
     if isinstance(network.encoder, Autodecoder):
         shown = len(held_out(data, config))
         trainer.say(f"the validation curve shows {shown} held-out examples, with codes found from their clouds")
