@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from mereo.cli.config_file import ConfigFile, options_of
+from mereo.cli.positionals import AssetNames, DatasetFolder, SceneName, WeightsName
 from mereo.fitting.config import FitChoice
 from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Threads, Workers
 from mereo.io.config import CONFIG
@@ -68,7 +69,7 @@ class AssetsGet:
         names: from `mereo assets list`; none means all of them.
     """
 
-    names: Positional[tuple[str, ...]] = ()
+    names: AssetNames = ()
 
     def run(self) -> None:
         """Fetch assets and print where they are."""
@@ -97,7 +98,7 @@ class Generate:
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
-    scene: Positional[str]
+    scene: SceneName
     examples: Count
     output: Path
     seed: CountOrNone = 0
@@ -144,7 +145,7 @@ class Train:
         options_from: file of options, JSON or YAML, such as the config.json of a run; the command line wins over it.
     """
 
-    dataset: Positional[Path]
+    dataset: DatasetFolder
     output: Path
     preset: PresetName = "base"
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
@@ -184,7 +185,7 @@ class Evaluate:
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
-    weights: Positional[str]
+    weights: WeightsName
     output: Path
     examples: Count = 128
     seed: CountOrNone = 1_000_000
@@ -248,7 +249,7 @@ class Export:
         force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
-    weights: Positional[str]
+    weights: WeightsName
     output: Path
     format: Literal["onnx", "torch"] = "onnx"
     force: bool = False

@@ -16,6 +16,8 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from tyro.conf import arg
 
+from mereo.io.bounds import check_values
+
 ConfigFile = Annotated[Path | None, arg(name="config")]
 """Option of commands that read their options from a file."""
 
@@ -94,6 +96,7 @@ def defaults_from(command: type, given: GivenOptions, defaults: Mapping[str, Any
     found = _filled(command, left, dict(defaults), given.path, "")
     if left:
         _refuse(given.path, next(iter(left)), command, "")
+    check_values(command, found, "--")  # here, where defaults, which are given for an example, are still the command's
     return {**defaults, **found}
 
 
@@ -103,7 +106,7 @@ def _filled(settings: type, given: dict[str, Any], base: Mapping[str, Any], path
     for item in fields(settings):
         name, inner = option_name(item, kinds[item.name]), _dataclass_of(kinds[item.name])
         if inner is None:
-            if name in given and not isinstance(given[name], dict):
+            if item.name != "options_from" and name in given and not isinstance(given[name], dict):
                 found[item.name] = _converted(kinds[item.name], given.pop(name), path, prefix + name)
             continue
         start = base[item.name] if item.name in base else _default(item)

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tyro.conf import Positional
-
 from mereo.cli.config_file import ConfigFile
+from mereo.cli.positionals import ObjectFiles
 from mereo.io.bounds import Positive, Threads, Workers
 from mereo.io.cores import workers_for
 
@@ -29,7 +28,7 @@ class LearnCommand:
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
-    object: Positional[tuple[Path, ...]]
+    object: ObjectFiles
     output: Path
     minutes: Positive = 10.0
     init: str = ""

@@ -4,9 +4,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import UseAppendAction, arg
 
 from mereo.cli.config_file import ConfigFile, options_of
+from mereo.cli.positionals import Inputs
 from mereo.fitting.config import FitChoice
 from mereo.io.bounds import Cells, Threads
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
@@ -43,7 +44,7 @@ class ReconstructCommand:
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
-    inputs: Positional[tuple[Path, ...]]
+    inputs: Inputs
     weights: str
     output: Path
     resolution: Cells = 128

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
 from mereo.io.bounds import Cells, Count, Port, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
@@ -39,7 +40,7 @@ class Align:
         force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
-    scan: Positional[Path]
+    scan: ScanCloud
     scene: str
     output: Path
     start: Path | None = None
@@ -89,7 +90,7 @@ class ViewCommand:
         inference: where and how exactly the network computes.
     """
 
-    input: Positional[Path | None] = None
+    input: InputOrNone = None
     weights: str | None = None
     scene: str | None = None
     state: Path | None = None
@@ -131,7 +132,7 @@ class StreamCommand:
     end, on standard error. The exit status is 0 where any frame was answered and the sequence was whole, else 2.
 
     Attributes:
-        source: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
+        input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
         weights: a shipped name or a file.
         resolution: grid cells along the longest side: fewer are faster.
         rate: frames per second at which a folder was recorded.
@@ -145,7 +146,7 @@ class StreamCommand:
         threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
     """
 
-    source: Positional[str]
+    input: InputName
     weights: str
     resolution: Cells = 48
     rate: Positive = 30.0
@@ -165,7 +166,7 @@ class StreamCommand:
         from mereo.cli.stream import stream_reconstructions
 
         stream_reconstructions(
-            self.source,
+            self.input,
             self.weights,
             resolution=self.resolution,
             rate_hz=self.rate,
@@ -251,7 +252,7 @@ class Release:
         force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
-    weights: Positional[str]
+    weights: WeightsName
     name: str
     output: Path
     tests: tuple[Path, ...] = ()

@@ -1,10 +1,8 @@
 """The commands ``mereo weights ...``: list and show. See ``mereo.cli.commands`` for how commands are written."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, arg
+from mereo.cli.positionals import WeightsFiles, WeightsName
 
 
 @dataclass(frozen=True)
@@ -15,7 +13,7 @@ class WeightsList:
         weights: files, or folders of them, to list instead of the shipped ones.
     """
 
-    weights: Annotated[Positional[tuple[Path, ...]], arg(metavar="[WEIGHTS ...]", help_behavior_hint="")] = ()
+    weights: WeightsFiles = ()
 
     def run(self) -> None:
         """Print a row for each file of weights."""
@@ -33,7 +31,7 @@ class WeightsShow:
         json: print everything as JSON, recipe and settings included.
     """
 
-    weights: Annotated[Positional[str], arg(metavar="WEIGHTS")]
+    weights: WeightsName
     json: bool = False
 
     def run(self) -> None:

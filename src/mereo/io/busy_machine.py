@@ -70,9 +70,11 @@ def describe_waiting(ran_s: float, waited_s: float, seconds: float) -> str | Non
     asked = ran_s + waited_s
     if asked < AT_WORK * seconds or waited_s < MUCH * asked:
         return None
-    wanted, got = max(1, round(asked / seconds)), max(1, round(ran_s / seconds))
+    threads = os.environ.get("OMP_NUM_THREADS", "")
+    used = min(round(asked / seconds), int(threads) if threads.isdecimal() else cores())
+    got = max(1, round(ran_s / seconds))
     load = f"load {os.getloadavg()[0]:.1f} on {cores()} cores" if sys.platform != "win32" else f"{cores()} cores"
-    fewer = f"work with fewer threads (--threads {got}), " if got < wanted else ""
+    fewer = f"work with fewer threads (--threads {got}), " if got < used else ""
     return (
         f"the machine is busy: this work waits {waited_s / asked:.0%} of its time for cores that others hold ({load}): "
         f"{fewer}end the others, or wait for them"

@@ -26,6 +26,7 @@ from mereo.models.weights import save_model, trained_steps
 from mereo.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mereo.training.config import TrainConfig
 from mereo.training.dataset import Batch, Dataset
+from mereo.training.going_nowhere import EXAMPLES, ConstantAnswer, Judge
 from mereo.training.losses import supervised_loss
 from mereo.training.metrics_log import MetricsLog
 from mereo.training.optimization import clip_gradients, parameter_groups, rate_share, update_average
@@ -112,6 +113,8 @@ class Trainer:
             self.module = nn.parallel.DistributedDataParallel(self.network)
         if config.compile == "on" or (config.compile == "auto" and compiling_pays(device, self.total)):
             self.module = torch.compile(self.module)  # type: ignore[assignment]
+        told = (values[:EXAMPLES].cpu().numpy() for values in (data.labels, data.distances))
+        self.judge = Judge(ConstantAnswer.of(*told, config.supervision.labels), self.total)
         self.first_step = 0
         self.shown = StepsShown(config, self.total, len(held_out(data, config)) * (2 if data.further else 1))
 
@@ -238,7 +241,7 @@ class Trainer:
         if self.data.further:
             scores = validate(self.average, self.data, self.config, further=True)
             log.add_validation(self.step, scores.iou, scores.miou, "sensor")
-        self.say(f"held-out examples at step {self.step}: {log.summary()}{log.doubt(self.total)}")
+        self.say(f"held-out examples at step {self.step}: {log.summary()}{self.judge.doubt(log.rows)}")
 
     def save(self, finished: bool = False) -> None:
         """Write metrics, curves, the weights and the checkpoint; every file atomically.
@@ -257,7 +260,7 @@ class Trainer:
         offsets = choose_offsets(self.average, self.data, self.config) if finished else None
         save_model(trained_model(self.average, self.data, self.config, self.step, offsets), self.run_dir / WEIGHTS)
         save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
-        self.say(f"saved at step {self.step}: {log.summary()}{log.doubt(self.total)}")
+        self.say(f"saved at step {self.step}: {log.summary()}{self.judge.doubt(log.rows)}")
 
     def finish(self) -> None:
         """Write all that a run leaves at its end, unless an earlier process has, which may have been killed before."""
