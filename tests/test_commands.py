@@ -47,8 +47,14 @@ from mereo.training.config import PRESETS
     ],
 )
 def test_command_calls_the_library_with_its_options(
-    text: str, module: str, function: str, expected: dict[str, object], monkeypatch: pytest.MonkeyPatch
+    text: str,
+    module: str,
+    function: str,
+    expected: dict[str, object],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     library = import_module(module)
     signature = inspect.signature(getattr(library, function))
     calls: list[dict[str, object]] = []

@@ -225,7 +225,7 @@ def test_one_command_and_the_same_again(
             learn([scene], out, **arguments)  # type: ignore[arg-type]
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="is not empty and holds no learn.json"):
+    with pytest.raises(FileExistsError, match="is not empty and holds no config.json"):
         learn([scene], tmp_path / "full", minutes=0.05)
 
 

@@ -63,7 +63,7 @@ class FrameJob:
     carry: tuple[str | Path, ...] = ()
     carry_frame: CarryFrame = "source"
     force: bool = False
-    options: Mapping[str, Any] | None = None
+    options: Mapping[str, Any] | None = field(default=None, compare=False)
 
     def check(self) -> None:
         """Raise for options that fit together with no frame: before the work, not after.

@@ -113,8 +113,8 @@ class Trainer:
             self.module = nn.parallel.DistributedDataParallel(self.network)
         if config.compile == "on" or (config.compile == "auto" and compiling_pays(device, self.total)):
             self.module = torch.compile(self.module)  # type: ignore[assignment]
-        told = (values[:EXAMPLES].cpu().numpy() for values in (data.labels, data.distances))
-        self.judge = Judge(ConstantAnswer.of(*told, config.supervision.labels), self.total)
+        labels, distances = (values[:EXAMPLES].cpu().numpy() for values in (data.labels, data.distances))
+        self.judge = Judge(ConstantAnswer.of(labels, distances, config.supervision.labels), self.total)
         self.first_step = 0
         self.shown = StepsShown(config, self.total, len(held_out(data, config)) * (2 if data.further else 1))
 
