@@ -134,6 +134,7 @@ def test_a_result_is_made_again_from_its_own_options(
     assert (first / "labels.npz").read_bytes() == (second / "labels.npz").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_dataset_is_made_again_from_its_own_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     line = "generate rope --examples 2 --seed 1000001 --test --output first --points 64 --per-segment 8 --workers 1"
