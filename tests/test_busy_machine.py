@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 from mereo.cli import doctor
+from mereo.io import busy_machine
+from mereo.io.busy_machine import BusyWatch, describe_waiting
+from mereo.io.cores import THREAD_VARIABLES, workers_for
 
 ROOT = Path(__file__).parents[1]
 VARIABLE = "OMP_WAIT_POLICY"
@@ -141,3 +144,90 @@ def test_advice_is_as_many_threads_as_cores_are_free(
     assert said.startswith(f"{load:.1f} on {cores} cores")
     assert ("OMP_NUM_THREADS" in said) == (advised is not None)
     assert advised is None or f"OMP_NUM_THREADS={advised} would help" in said
+
+
+# --- while it works ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("ran_s", "waited_s", "advised"),
+    [
+        (18.0, 2.0, None),  # two threads that hardly wait
+        (2.0, 1.0, None),  # who asks for little waits for files
+        (13.0, 7.0, "(--threads 1)"),
+        (9.8, 9.9, "(--threads 1)"),
+        (5.0, 6.0, ""),  # one thread already
+    ],
+)
+def test_waiting_for_cores_is_told_with_the_cure(
+    ran_s: float, waited_s: float, advised: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(busy_machine, "cores", lambda: 2)
+    told = describe_waiting(ran_s, waited_s, 10.0)
+    assert (told is None) == (advised is None)
+    if told is not None and advised is not None:
+        assert told.startswith(f"the machine is busy: this work waits {waited_s / (ran_s + waited_s):.0%} of its time")
+        assert ("--threads" in told) == bool(advised) and advised in told and told.endswith("or wait for them")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert "--threads" not in (describe_waiting(ran_s, waited_s, 10.0) or "")
+
+
+BESIDE = """
+import os, subprocess, sys, time
+os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+from mereo.io import busy_machine
+busy_machine.SETTLED_S = 1.0
+other = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+try:
+    watch = busy_machine.BusyWatch()
+    end = time.monotonic() + 1.2
+    while time.monotonic() < end:
+        pass
+    print(watch.look())
+    print(busy_machine.BusyWatch(watch.since - 9, watch.before).look())
+finally:
+    other.kill()
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").is_file(), reason="the system does not tell of it")
+def test_work_beside_other_work_on_one_core_says_so_once() -> None:
+    first, again = run([sys.executable, "-c", BESIDE], None).stdout.splitlines()
+    share = int(first.partition("waits ")[2].partition("%")[0])
+    assert share >= 40 and again == "None"
+
+
+def test_where_nothing_tells_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(busy_machine, "SETTLED_S", 0.0)
+    monkeypatch.setattr(busy_machine, "thread_times", dict)
+    assert BusyWatch().look() is None
+
+
+THREADS = """
+import os, sys
+from mereo import __main__ as command_line
+from mereo.cli.commands import Train
+
+def show(self):
+    import torch, threadpoolctl
+    import numpy
+    print(torch.get_num_threads(), *{pool["num_threads"] for pool in threadpoolctl.threadpool_info()})
+    print(*(os.environ[name] for name in sys.argv[1:]))
+
+Train.run = show
+assert command_line.main("train data --output out --threads 1".split()) == 0
+assert command_line.main("train data --output out --threads 2".split()) == 0
+"""
+
+
+def test_threads_hold_for_torch_blas_and_what_is_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before torch is loaded and after it."""
+    for name in THREAD_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    told = run([sys.executable, "-c", THREADS, *THREAD_VARIABLES], None).stdout.split("\n")
+    assert told[:4] == ["1 1", "1 1 1 1", "2 2", "2 2 2 2"]
+
+
+def test_workers_are_as_many_as_threads_unless_said() -> None:
+    assert (workers_for(3, 2), workers_for(0, 2)) == (3, 2) and workers_for(0, 0) >= 1

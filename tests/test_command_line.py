@@ -13,6 +13,7 @@ import pytest
 
 import mereo.__main__ as command_line
 from mereo.cli import commands
+from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.io.config import InputConfig
 from mereo.scenes.scene import SCENES
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
@@ -142,8 +143,8 @@ def test_train_options_override_the_preset() -> None:
 
 def test_reconstruct_options() -> None:
     text = "reconstruct scan.ply --weights bunny --output out --frame scanner --resolution 64 --drop-invalid --force"
-    assert command_line.parse(text.split()) == commands.Reconstruct(
-        Path("scan.ply"), "bunny", Path("out"), 64, InputConfig(frame="scanner", drop_invalid=True), force=True
+    assert command_line.parse(text.split()) == ReconstructCommand(
+        (Path("scan.ply"),), "bunny", Path("out"), 64, InputConfig(frame="scanner", drop_invalid=True), force=True
     )
 
 

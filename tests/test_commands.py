@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import mereo.__main__ as command_line
+from mereo.cli.reconstruct import FrameJob
 from mereo.io.config import InputConfig
 from mereo.training.config import PRESETS
 
@@ -34,16 +35,26 @@ from mereo.training.config import PRESETS
         ),
         (
             "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force",
-            "mereo.cli.reconstruct",
+            "mereo.cli.reconstruct_many",
             "reconstruct_file",
-            {"reading": InputConfig(Path("k.json"), 5000.0, Path("m.png")), "force": True},
+            {
+                "input": Path("a.png"),
+                "output": Path("out"),
+                "job": FrameJob("rope", reading=InputConfig(Path("k.json"), 5000.0, Path("m.png")), force=True),
+            },
         ),
         ("demo --output out", "mereo.cli.demo", "main", {"output": Path("out")}),
     ],
 )
 def test_command_calls_the_library_with_its_options(
-    text: str, module: str, function: str, expected: dict[str, object], monkeypatch: pytest.MonkeyPatch
+    text: str,
+    module: str,
+    function: str,
+    expected: dict[str, object],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     library = import_module(module)
     signature = inspect.signature(getattr(library, function))
     calls: list[dict[str, object]] = []

@@ -12,11 +12,12 @@ import pytest
 from safetensors.numpy import load_file
 from toy_scene import toy_scene
 
+from mereo.io import progress
 from mereo.io.scratch_folders import LOCK
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.synthesis import progress, shards
+from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.shards import example_bytes, generate
@@ -268,9 +269,10 @@ def test_wrong_numbers_are_named(
 def test_progress_tells_rate_and_time_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr(progress, "LINE_EVERY_S", 0.0)
     generate(TOY, tmp_path / "data", SMALL, examples=6, seed=3)
-    modes, *lines = capsys.readouterr().out.splitlines()
-    assert modes == "modes of 100 random states, for registration"
-    assert re.fullmatch(r"4 of 6, \d+\.\d examples/s, \d+ s left", lines[0])
-    assert lines[1].startswith("6 of 6, ") and re.fullmatch(r"6 examples made in \d+ (s|min)", lines[2])
+    printed = capsys.readouterr()
+    assert printed.out == "modes of 100 random states, for registration\n"
+    lines = printed.err.splitlines()
+    assert re.fullmatch(r"generate: 4 of 6 examples, \d+\.\d examples/s, \d+ s left", lines[0])
+    assert lines[1].startswith("generate: 6 of 6 ") and re.fullmatch(r"generate: 6 examples in \d+ (s|min)", lines[2])

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mereo import __main__ as command_line
-from mereo.cli.reconstruct import reconstruct_file
+from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.device import BFLOAT16_PAYS, bfloat16_gain, find_device
 from mereo.models.weights import load_for
@@ -44,7 +44,7 @@ def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None
 
 
 def test_results_say_where_they_were_computed(tmp_path: Path) -> None:
-    reconstruct_file(cloud_file(tmp_path), "bunny", tmp_path / "out", resolution=12, inference=CPU, choice="off")
+    reconstruct_file(cloud_file(tmp_path), tmp_path / "out", FrameJob("bunny", 12, inference=CPU, choice="off"))
     facts = json.loads((tmp_path / "out/summary.json").read_text())
     assert (facts["device"], facts["precision"]) == ("cpu", "bfloat16")
 

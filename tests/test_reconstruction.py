@@ -14,7 +14,7 @@ import trimesh
 from analytic import AnalyticModel, ball, logits_of, union, untrained
 
 import mereo
-from mereo.cli.reconstruct import reconstruct_file
+from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.cli.stream import stream_reconstructions
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
@@ -156,12 +156,12 @@ def test_from_file_to_files(
     cloud, model = scene("camera")
     monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: model)
     np.save(tmp_path / "cloud.npy", cloud)
-    result = reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "out", resolution=16)
-    assert summarize(result)["segments"][0]["name"] == "big"
+    found = reconstruct_file(tmp_path / "cloud.npy", tmp_path / "out", FrameJob("any", 16))
+    assert summarize(found.reconstruction)["segments"][0]["name"] == "big"
     assert (tmp_path / "out/report.html").is_file()
     assert "wrote" in capsys.readouterr().out
     with pytest.raises(FileExistsError):
-        reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "out", resolution=16)
+        reconstruct_file(tmp_path / "cloud.npy", tmp_path / "out", FrameJob("any", 16))
 
 
 def test_what_is_read_and_left_out_is_printed_and_kept(
@@ -171,12 +171,13 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     cloud, model = scene("camera")
     np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
     monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
-    read = partial(reconstruct_file, tmp_path / "cloud.npy", "any", resolution=16)
+    read = partial(reconstruct_file, tmp_path / "cloud.npy")
+    job = FrameJob("any", 16)
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
-        read(output=tmp_path / "crowded")
+        read(tmp_path / "crowded", job)
     assert "strays:" not in capsys.readouterr().out, "it is a surface: nothing says that it is not the object"
     with pytest.warns(SizeWarning, match="the visible part is 0.1[0-9]* m long"):
-        read(output=tmp_path / "alone", isolation=IsolationConfig(largest_cluster=True, cluster_gap=0.02))
+        read(tmp_path / "alone", replace(job, isolation=IsolationConfig(largest_cluster=True, cluster_gap=0.02)))
     assert "largest cluster: 1200 of 1800 points kept (1 of 2 clusters" in capsys.readouterr().out
     summary = json.loads((tmp_path / "alone/summary.json").read_text())
     assert summary["points"] == 1200 and summary["isolation"][-1]["name"] == "largest cluster"
@@ -200,8 +201,8 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     monkeypatch.setattr(
         "mereo.cli.reconstruct.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]})
     )
-    read = partial(reconstruct_file, tmp_path / "cloud.npy", "any", resolution=16)
-    result = read(output=tmp_path / "out")
+    read = partial(reconstruct_file, tmp_path / "cloud.npy")
+    result = read(tmp_path / "out", FrameJob("any", 16)).reconstruction
     said = capsys.readouterr().out
     assert "strays: 30 of 1230 points dropped, the longest side was" in said and "(--keep-all keeps them)" in said
     summary = json.loads((tmp_path / "out/summary.json").read_text())
@@ -210,7 +211,7 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     assert (step["name"], step["before"], step["kept"]) == ("strays", 1230, 1200)
     np.testing.assert_array_equal(result.labels.labels, reconstruct(own, model, resolution=16).labels.labels)
     with pytest.warns(SizeWarning, match="the visible part is 0.[5-9][0-9]* m long"):
-        read(output=tmp_path / "all", isolation=IsolationConfig(keep_all=True))
+        read(tmp_path / "all", FrameJob("any", 16, isolation=IsolationConfig(keep_all=True)))
     assert "strays:" not in capsys.readouterr().out
     assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
 
@@ -241,7 +242,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     save_model(untrained(NAMES), tmp_path / "w.safetensors")
     np.save(tmp_path / "cloud.npy", scene("camera")[0][:5])
     with pytest.raises(ValueError, match="the cloud has 5 points; the encoder needs at least 32"):
-        reconstruct_file(tmp_path / "cloud.npy", tmp_path / "w.safetensors", tmp_path / "deep/out")
+        reconstruct_file(tmp_path / "cloud.npy", tmp_path / "deep/out", FrameJob(tmp_path / "w.safetensors"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.npy", "w.safetensors"]
 
 

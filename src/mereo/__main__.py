@@ -9,16 +9,20 @@ from collections.abc import Mapping
 from contextlib import redirect_stderr, suppress
 from dataclasses import field, make_dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 
 import tyro
 from tyro.conf import subcommand
 
-from mereo.cli import commands, scene_commands, tool_commands, weights_hub_commands
+from mereo.cli import commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
+from mereo.cli.config_file import GivenOptions, defaults_from, read_options
 from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.learn import LearnCommand
+from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.io.bounds import check_bounds
+from mereo.io.cores import use_threads
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
@@ -26,6 +30,9 @@ Choice = TypeVar("Choice")
 
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 """Environment variable that shows where an error comes from."""
+
+CONFIGURABLE = ("generate", "train", "evaluate", "reconstruct", "learn")
+"""Commands with the option --config."""
 
 USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 """Exit codes; 70 is EX_SOFTWARE of sysexits.h, the last two are 128 plus the signal's number, as shells report them."""
@@ -48,7 +55,10 @@ def main(arguments: list[str] | None = None) -> int:
     warnings.formatwarning = _warning_line
     try:
         with stop_signals():
-            parse(arguments).run()
+            command = parse(arguments)
+            if threads := getattr(command, "threads", 0):
+                use_threads(threads)
+            command.run()
             sys.stdout.flush()
     except Stopped as stopped:
         return _stop(f"mereo: stopped by {stopped.signal.name}", 128 + stopped.signal)
@@ -124,8 +134,11 @@ def parse(arguments: list[str]) -> Command:
 
 def _read(arguments: list[str]) -> Command:
     """Command that tyro makes of these arguments, which exits where it cannot."""
+    given = _options_from(arguments)
+    recipe = _chosen(arguments, "--preset", PRESETS, (given and given.choice("preset")) or "base")
+    sensor = _chosen(arguments, "--sensor", SENSORS, (given and given.choice("sensor")) or "paper")
     command: Command = tyro.cli(
-        _syntax(_chosen(arguments, "--preset", PRESETS, "base"), _chosen(arguments, "--sensor", SENSORS, "paper")),
+        _syntax(recipe, sensor, given),
         args=arguments or ["--help"],
         prog="mereo",
         description="Reconstruct deformable objects with all their segments from one depth image or point cloud. "
@@ -135,8 +148,16 @@ def _read(arguments: list[str]) -> Command:
     return command
 
 
-def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
-    """All commands as a type that tyro reads; ``train`` starts from this recipe, what renders from this sensor."""
+def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | None) -> Any:
+    """All commands as a type that tyro reads.
+
+    ``train`` starts from this recipe, what renders from this sensor, and the command of a file of options from that.
+    """
+
+    def starting(command: type, name: str, **defaults: Any) -> Any:
+        own = given if given is not None and given.command == name else None
+        return Annotated[_starting(command, own, defaults), subcommand(name)]
+
     scene = (
         (scene_commands.SceneList, "list"),
         (scene_commands.SceneNew, "new"),
@@ -145,19 +166,24 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
         (scene_commands.SceneModes, "modes"),
         (scene_commands.SceneExport, "export"),
     )
-    weights = (weights_hub_commands.WeightsPush, "push"), (weights_hub_commands.WeightsPull, "pull")
+    weights = (
+        (weights_commands.WeightsList, "list"),
+        (weights_commands.WeightsShow, "show"),
+        (weights_hub_commands.WeightsPush, "push"),
+        (weights_hub_commands.WeightsPull, "pull"),
+    )
     assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")
     return (
         Annotated[commands.Demo, subcommand("demo")]
         | Annotated[commands.Doctor, subcommand("doctor")]
-        | Annotated[LearnCommand, subcommand("learn")]
+        | starting(LearnCommand, "learn")
         | Annotated[_group(scene), subcommand("scene", description="List, write, check, draw or export scenes.")]
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
-        | Annotated[_group(weights), subcommand("weights", description="Put weights on a model hub, or fetch them.")]
-        | Annotated[_starting(commands.Generate, settings=GenerateConfig(sensor=sensor)), subcommand("generate")]
-        | Annotated[_starting(commands.Train, config=recipe), subcommand("train")]
-        | Annotated[_starting(commands.Evaluate, terms=sensor), subcommand("evaluate")]
-        | Annotated[commands.Reconstruct, subcommand("reconstruct")]
+        | Annotated[_group(weights), subcommand("weights", description="List, show, publish or fetch weights.")]
+        | starting(commands.Generate, "generate", settings=GenerateConfig(sensor=sensor))
+        | starting(commands.Train, "train", config=recipe)
+        | starting(commands.Evaluate, "evaluate", terms=sensor)
+        | starting(ReconstructCommand, "reconstruct")
         | Annotated[tool_commands.Align, subcommand("align")]
         | Annotated[tool_commands.ViewCommand, subcommand("view")]
         | Annotated[tool_commands.StreamCommand, subcommand("stream")]
@@ -168,12 +194,23 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig) -> Any:
     )
 
 
-def _starting(command: type, **defaults: Any) -> type:
-    """Command with other defaults for these options."""
+def _starting(command: type, given: GivenOptions | None, defaults: Mapping[str, Any]) -> type:
+    """Command with other defaults, those of a file of options before the others; itself where there are none."""
+    if given is not None:
+        defaults = defaults_from(command, given, defaults)
+    if not defaults:
+        return command
     changed = [(name, command.__annotations__[name], field(default=value)) for name, value in defaults.items()]
+    # by keyword alone, as options that have got a default come before some without
     return make_dataclass(
-        command.__name__, changed, bases=(command,), frozen=True, namespace={"__doc__": command.__doc__}
+        command.__name__, changed, bases=(command,), frozen=True, kw_only=True, namespace={"__doc__": command.__doc__}
     )
+
+
+def _options_from(arguments: list[str]) -> GivenOptions | None:
+    """Options of the file that --config names, for the command that takes them."""
+    files = _values(arguments, "--config")
+    return read_options(Path(files[-1]), arguments[0]) if files and arguments[0] in CONFIGURABLE else None
 
 
 def _group(members: tuple[tuple[type, str], ...]) -> Any:
@@ -182,9 +219,14 @@ def _group(members: tuple[tuple[type, str], ...]) -> Any:
 
 def _chosen(arguments: list[str], option: str, choices: Mapping[Any, Choice], otherwise: str) -> Choice:
     """Choice of an option, which must be known before parsing because the other defaults depend on it."""
-    values = [a.partition("=")[2] for a in arguments if a.startswith(f"{option}=")]
-    values += [after for before, after in pairwise(arguments) if before == option]
+    values = _values(arguments, option)
     return choices[values[-1] if values and values[-1] in choices else otherwise]
+
+
+def _values(arguments: list[str], option: str) -> list[str]:
+    """All values that an option is given."""
+    values = [a.partition("=")[2] for a in arguments if a.startswith(f"{option}=")]
+    return values + [after for before, after in pairwise(arguments) if before == option]
 
 
 if __name__ == "__main__":

@@ -3,18 +3,19 @@
 ``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
 """
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import arg
 
+from mereo.cli.config_file import ConfigFile, options_of
+from mereo.cli.positionals import AssetNames, DatasetFolder, SceneName, WeightsName
 from mereo.fitting.config import FitChoice
-from mereo.io.bounds import Cells, Count, CountOrNone, ImageSize, NotNegative, Workers
-from mereo.io.config import CarryFrame, FilesConfig, InputConfig
-from mereo.models.config import EXACT, InferenceConfig
-from mereo.reconstruction.config import IsolationConfig
+from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Threads, Workers
+from mereo.io.config import CONFIG
+from mereo.io.cores import workers_for
+from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.training.config import PresetName, TrainConfig
 
@@ -68,7 +69,7 @@ class AssetsGet:
         names: from `mereo assets list`; none means all of them.
     """
 
-    names: Positional[tuple[str, ...]] = ()
+    names: AssetNames = ()
 
     def run(self) -> None:
         """Fetch assets and print where they are."""
@@ -87,15 +88,17 @@ class Generate:
         examples: how many.
         output: folder to create.
         seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
-        workers: processes; the result does not depend on them. 0 means one per core.
+        workers: processes, each in one thread; the result does not depend on them. 0 means as many as --threads.
         shard: make only part i of n, as i/n from 0/n to (n-1)/n, for example on several machines.
         resume: go on with a run that was stopped.
         test: allow a test seed.
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
         settings: how one example is made.
+        threads: processes where --workers does not say; 0 means one per core.
+        options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
-    scene: Positional[str]
+    scene: SceneName
     examples: Count
     output: Path
     seed: CountOrNone = 0
@@ -105,9 +108,12 @@ class Generate:
     test: bool = False
     sensor: Sensor = "paper"
     settings: Annotated[GenerateConfig, arg(name="")] = field(default_factory=GenerateConfig)
+    threads: Threads = 0
+    options_from: ConfigFile = None
 
     def run(self) -> None:
         """Write the folder of labelled examples."""
+        from mereo.io.atomic_files import write_json
         from mereo.synthesis.shards import generate
 
         generate(
@@ -116,11 +122,12 @@ class Generate:
             self.settings,
             examples=self.examples,
             seed=self.seed,
-            workers=self.workers or os.cpu_count() or 1,
+            workers=workers_for(self.workers, self.threads),
             shard=part_of(self.shard),
             resume=self.resume,
             test=self.test,
         )
+        write_json(self.output / CONFIG, options_of(self, "generate"))
 
 
 @dataclass(frozen=True)
@@ -133,18 +140,24 @@ class Train:
         preset: what the options below start from: as published, as published for --network.encoder autodecoder,
             recommended, the same for a GPU, one for tests.
         config: the recipe; defaults are the chosen preset's.
+        device: where the network is trained; auto takes a CUDA device where there is one.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        options_from: file of options, JSON or YAML, such as the config.json of a run; the command line wins over it.
     """
 
-    dataset: Positional[Path]
+    dataset: DatasetFolder
     output: Path
     preset: PresetName = "base"
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+    device: Device = "auto"
+    threads: Threads = 0
+    options_from: ConfigFile = None
 
     def run(self) -> None:
         """Train, and print where the weights are."""
         from mereo.training.trainer import train
 
-        print(f"weights: {train(self.dataset, self.output, self.config)}")
+        print(f"weights: {train(self.dataset, self.output, self.config, device=self.device)}")
 
 
 @dataclass(frozen=True)
@@ -167,9 +180,12 @@ class Evaluate:
         inference: where and how exactly the network computes.
         fit: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the modes'
             and the draws' own scores beside it; off the network alone; modes leaves the draws out.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
-    weights: Positional[str]
+    weights: WeightsName
     output: Path
     examples: Count = 128
     seed: CountOrNone = 1_000_000
@@ -181,6 +197,9 @@ class Evaluate:
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
     fit: FitChoice = "auto"
+    force: bool = False
+    threads: Threads = 0
+    options_from: ConfigFile = None
 
     def run(self) -> None:
         """Write scores and pictures of their errors, and print the table."""
@@ -195,7 +214,15 @@ class Evaluate:
                     "--scans are real and take no simulated camera: leave out --sensor, --image-size and --noise-std"
                 )
             model = load_for(self.weights, self.inference)
-            evaluate_on_scans(model, self.output, truths=self.scans, scene=self.scene, choice=self.fit)
+            evaluate_on_scans(
+                model,
+                self.output,
+                truths=self.scans,
+                scene=self.scene,
+                choice=self.fit,
+                force=self.force,
+                options=options_of(self, "evaluate"),
+            )
             return
         evaluate_weights(
             self.weights,
@@ -206,65 +233,8 @@ class Evaluate:
             settings=settings,
             inference=self.inference,
             choice=self.fit,
-        )
-
-
-@dataclass(frozen=True)
-class Reconstruct:
-    """Reconstruct all segments from one frame: a depth image, a point cloud or a ROS recording.
-
-    Attributes:
-        input: depth image (PNG, TIFF, EXR, NPY), point cloud (PLY, PCD, XYZ, NPY, NPZ, ZDF) or ROS recording (bag,
-            MCAP); results are in its frame and units.
-        weights: a shipped name or a file.
-        output: folder to create.
-        resolution: grid cells along the longest side.
-        reading: how the frame is read.
-        isolation: what of the frame is left out.
-        inference: where and how exactly the network computes.
-        files: which files, and in which unit.
-        fit: register the object's own deformation model to the frame: auto takes the registered model where it explains
-            the frame, if the weights carry one; off leaves the network's answer; modes and full take the model in any
-            case, full by fitting the draws of the scene as well.
-        scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
-        carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
-            glTF), points (PLY, PCD, XYZ, NPY) or CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses).
-        carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
-        force: replace an existing output folder that mereo wrote, and nothing else is in.
-    """
-
-    input: Positional[Path]
-    weights: str
-    output: Path
-    resolution: Cells = 128
-    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
-    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
-    files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
-    fit: FitChoice = "auto"
-    scene: str | None = None
-    carry: UseAppendAction[tuple[Path, ...]] = ()
-    carry_frame: CarryFrame = "source"
-    force: bool = False
-
-    def run(self) -> None:
-        """Write the folder of results and print the segments."""
-        from mereo.cli.reconstruct import reconstruct_file
-
-        reconstruct_file(
-            self.input,
-            self.weights,
-            self.output,
-            resolution=self.resolution,
-            reading=self.reading,
-            isolation=self.isolation,
-            inference=self.inference,
-            files=self.files,
-            choice=self.fit,
-            scene=self.scene,
-            carry=self.carry,
-            carry_frame=self.carry_frame,
             force=self.force,
+            options=options_of(self, "evaluate"),
         )
 
 
@@ -279,7 +249,7 @@ class Export:
         force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
-    weights: Positional[str]
+    weights: WeightsName
     output: Path
     format: Literal["onnx", "torch"] = "onnx"
     force: bool = False

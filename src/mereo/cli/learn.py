@@ -1,13 +1,13 @@
 """The command ``mereo learn``. See ``mereo.cli.commands`` for how commands are written."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tyro.conf import Positional
-
-from mereo.io.bounds import Positive, Workers
+from mereo.cli.config_file import ConfigFile
+from mereo.cli.positionals import ObjectFiles
+from mereo.io.bounds import Positive, Threads, Workers
+from mereo.io.cores import workers_for
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,19 @@ class LearnCommand:
         minutes: what all stages may take together; more is better.
         init: weights to start from, a shipped name or a file; by default the shipped ones that adapt fastest.
         units: of the meshes; guessed where not given.
-        workers: processes that make examples; 0 means one per core.
+        workers: processes that make examples; 0 means as many as --threads.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
-    object: Positional[tuple[Path, ...]]
+    object: ObjectFiles
     output: Path
     minutes: Positive = 10.0
     init: str = ""
     units: Literal["mm", "cm", "m", "in"] | None = None
     workers: Workers = 0
+    threads: Threads = 0
+    options_from: ConfigFile = None
 
     def run(self) -> None:
         """Learn, and print the scores and how to use the weights."""
@@ -43,5 +47,5 @@ class LearnCommand:
             minutes=self.minutes,
             init=self.init,
             units=self.units,
-            workers=self.workers or os.cpu_count() or 1,
+            workers=workers_for(self.workers, self.threads),
         )

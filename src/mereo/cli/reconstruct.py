@@ -1,8 +1,11 @@
 """``mereo reconstruct``: one frame of a sensor to a folder of results."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -14,45 +17,31 @@ from mereo.fitting.config import FitChoice
 from mereo.fitting.register import Registrar, describe, registrar_for
 from mereo.fitting.registration_state import write_state
 from mereo.geometry.transforms import inverse_rigid
-from mereo.io.attachments import read_attachments
-from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
+from mereo.io.atomic_files import write_json
+from mereo.io.attachments import Attachment, read_attachments
+from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
 from mereo.io.output_folders import new_directory
-from mereo.io.sensor_frame import read_frame
+from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
+from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
+from mereo.reconstruction.observation import Observation, SizeWarning, find_object, size_warning
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import files_of
 from mereo.visualization.result_files import write_files
 
 
-def reconstruct_file(
-    input: str | Path,
-    weights: str | Path,
-    output: str | Path,
-    *,
-    resolution: int = 128,
-    reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
-    isolation: IsolationConfig = IsolationConfig(),  # noqa: B008
-    inference: InferenceConfig = InferenceConfig(),  # noqa: B008
-    files: FilesConfig = DEFAULT_FILES,
-    choice: FitChoice = "auto",
-    scene: str | None = None,
-    carry: Sequence[str | Path] = (),
-    carry_frame: CarryFrame = "source",
-    force: bool = False,
-) -> Reconstruction:
-    """Read one frame of a sensor, reconstruct it, write a new directory, print what was found: ``mereo reconstruct``.
+@dataclass(frozen=True)
+class FrameJob:
+    """Options of ``mereo reconstruct``, and what all its frames share, which is read and loaded once.
 
-    Args:
-        input: a depth image, a point cloud or a ROS recording.
+    Attributes:
         weights: a shipped name or a file.
-        output: folder to create.
         resolution: cells along the longest side of the object's box.
-        reading: how the frame is read.
-        isolation: what of the frame is left out.
+        reading: how a frame is read.
+        isolation: what of a frame is left out.
         inference: where and how exactly the network computes.
         files: which files are written, and in which unit.
         choice: whether the network answers, or the registered model.
@@ -60,59 +49,128 @@ def reconstruct_file(
         carry: files of what is defined in the rest model, to be brought to where the object is.
         carry_frame: their frame and unit: of the object's own files, or of its scene.
         force: replace an existing folder that mereo wrote.
-
-    Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``read_frame``, ``find_object`` and
-    ``reconstruct`` do, and ``ValueError`` for ``carry`` without a registration.
+        options: what config.json of the results says, with the frame's own name as its only input; without any, none.
     """
-    formats = chosen_formats(files.formats)  # a missing extra is said before the work, not after
-    attachments = read_attachments(carry)
-    if carry_frame != "source" and not attachments:
-        raise ValueError(f"--carry-frame is {carry_frame!r} and nothing is carried: name a file with --carry")
-    if attachments and choice == "off":
-        raise ValueError("--fit is off, but --carry needs a registration, along which things move: use --fit auto")
-    named = () if scene is None else files_of(scene)
-    read = [path for path in (input, weights, *named, reading.intrinsics, reading.mask, *carry) if path is not None]
-    with new_directory(output, force, read) as directory:
-        frame = read_frame(input, reading)
-        seen = find_object(frame, isolation)
+
+    weights: str | Path
+    resolution: int = 128
+    reading: InputConfig = field(default_factory=InputConfig)
+    isolation: IsolationConfig = field(default_factory=IsolationConfig)
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
+    files: FilesConfig = DEFAULT_FILES
+    choice: FitChoice = "auto"
+    scene: str | None = None
+    carry: tuple[str | Path, ...] = ()
+    carry_frame: CarryFrame = "source"
+    force: bool = False
+    options: Mapping[str, Any] | None = field(default=None, compare=False)
+
+    def check(self) -> None:
+        """Raise for options that fit together with no frame: before the work, not after.
+
+        ``ImportError`` for a missing extra, ``ValueError`` and ``OSError`` for files that cannot be carried.
+        """
+        chosen_formats(self.files.formats)
+        if self.carry_frame != "source" and not self.attachments:
+            raise ValueError(f"--carry-frame is {self.carry_frame!r} and nothing is carried: name a file with --carry")
+        if self.attachments and self.choice == "off":
+            raise ValueError("--fit is off, but --carry needs a registration, along which things move: use --fit auto")
+
+    @property
+    def read(self) -> tuple[str | Path, ...]:
+        """Files that are read beside the frames."""
+        named = () if self.scene is None else files_of(self.scene)
+        given = (self.weights, *named, self.reading.intrinsics, self.reading.mask, *self.carry)
+        return tuple(path for path in given if path is not None)
+
+    @cached_property
+    def attachments(self) -> tuple[Attachment, ...]:
+        """Content of the files that are carried."""
+        return tuple(read_attachments(self.carry))
+
+    @cached_property
+    def model(self) -> Model:
+        """Weights, on their device."""
+        return load_for(self.weights, self.inference)
+
+    @cached_property
+    def registrar(self) -> Registrar | None:
+        """Registrar of the object's model; None where the network alone answers."""
+        of = Registrar.of if self.attachments else registrar_for
+        return of(self.model, self.choice, self.scene)
+
+    @cached_property
+    def placed(self) -> tuple[Placed, ...]:
+        """What is carried, in its place on the object at rest."""
+        return () if self.registrar is None else tuple(place(self.attachments, self.registrar, self.carry_frame))
+
+
+def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Answer:
+    """Read one frame of a sensor, reconstruct it, write a new directory, print what was found.
+
+    Args:
+        input: a depth image, a point cloud or a ROS recording.
+        output: folder to create.
+        job: everything else.
+
+    Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``FrameJob.check``, ``read_frame``,
+    ``find_object`` and ``reconstruct`` do, and ``ValueError`` for ``carry`` without a registration.
+    """
+    job.check()
+    with new_directory(output, job.force, [input, *job.read]) as directory:
+        frame = read_frame(input, job.reading)
+        seen = find_object(frame, job.isolation)
         print(seen)
-        model = load_for(weights, inference)
-        registrar = Registrar.of(model, choice, scene) if attachments else registrar_for(model, choice, scene)
-        placed = place(attachments, registrar, carry_frame) if registrar is not None else ()
+        placed = job.placed  # what is carried is refused before the work
         found = answer(
             seen.cloud,
-            model,
-            registrar,
-            resolution,
+            job.model,
+            job.registrar,
+            job.resolution,
             frame.axes,
-            label_points="points" in formats,
-            stated_unit=None if registrar is None else registrar.stated_unit(frame.unit_m),
-            keep_all=isolation.keep_all,
+            label_points="points" in chosen_formats(job.files.formats),
+            stated_unit=None if job.registrar is None else job.registrar.stated_unit(frame.unit_m),
+            keep_all=job.isolation.keep_all,
         )
-        result = found.reconstruction
-        seen = seen.read_as(result.reading)
-        if result.reading.dropped:
-            print(result.reading)
-        warning = size_warning(seen, model.provenance)
+        seen = seen.read_as(found.reconstruction.reading)
+        if found.reconstruction.reading.dropped:
+            print(found.reconstruction.reading)
+        warning = size_warning(seen, job.model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
-        facts: dict[str, object] = {
-            "title": frame.source,
-            "weights": str(weights),
-            "resolution": resolution,
-            "points": len(seen.cloud),
-        }
-        if registrar is not None:
-            facts["registration"] = facts_of(found)
-        facts |= {"device": model.device.type, "precision": model.working_precision}
-        carried = carried_along(placed, found)
-        if carried:
-            facts["carried"] = [one.facts() for one in carried]
-        write_files(directory, result, seen.cloud, frame.axes, files, frame.unit_m, {**facts, **seen.facts()}, carried)
-        write_state(directory, found, registrar, str(weights), frame.axes, frame.unit_m)
+        _write(directory, job, frame, seen, found, placed)
+        if job.options is not None:
+            write_json(directory / CONFIG, {**job.options, "inputs": [str(Path(input).absolute())]})
+    result = found.reconstruction
     print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
-    print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
-    return result
+    print(f"wrote {output} in {seconds_of(found):.1f} s; open {Path(output) / 'report.html'} in a browser")
+    return found
+
+
+def seconds_of(found: Answer) -> float:
+    """Seconds that an answer took, without reading and writing."""
+    return sum(found.reconstruction.timings_s.values())
+
+
+def _write(
+    directory: Path, job: FrameJob, frame: SensorFrame, seen: Observation, found: Answer, placed: tuple[Placed, ...]
+) -> None:
+    """Write the answer's files, and say where it comes from."""
+    facts: dict[str, object] = {
+        "title": frame.source,
+        "weights": str(job.weights),
+        "resolution": job.resolution,
+        "points": len(seen.cloud),
+    }
+    if job.registrar is not None:
+        facts["registration"] = facts_of(found)
+    facts |= {"device": job.model.device.type, "precision": job.model.working_precision}
+    carried = carried_along(placed, found)
+    if carried:
+        facts["carried"] = [one.facts() for one in carried]
+    facts |= seen.facts()
+    write_files(directory, found.reconstruction, seen.cloud, frame.axes, job.files, frame.unit_m, facts, carried)
+    write_state(directory, found, job.registrar, str(job.weights), frame.axes, frame.unit_m)
 
 
 def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...]:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tyro.conf import Positional
-
+from mereo.cli.positionals import ObjectFiles, SceneName, SceneNameOrNone
 from mereo.io.bounds import CountOrNone, States
 
 
@@ -35,7 +34,7 @@ class SceneNew:
         units: of the files; guessed where not given.
     """
 
-    files: Positional[tuple[Path, ...]]
+    files: ObjectFiles
     output: Path | None = None
     units: Literal["mm", "cm", "m", "in"] | None = None
 
@@ -58,7 +57,7 @@ class SceneCheck:
         repair: write repaired copies of faulty meshes, and a scene file that names them, beside a YAML scene file.
     """
 
-    scene: Positional[str]
+    scene: SceneName
     repair: bool = False
 
     def run(self) -> None:
@@ -81,7 +80,7 @@ class ScenePreview:
     """
 
     output: Path
-    scene: Positional[str] = ""
+    scene: SceneNameOrNone = ""
     all: bool = False
     seed: CountOrNone = 0
     force: bool = False
@@ -117,7 +116,7 @@ class SceneModes:
         force: replace an existing file, unless the scene or the weights are read from it.
     """
 
-    scene: Positional[str]
+    scene: SceneName
     output: Path | None = None
     states: States = 1500
     force: bool = False
@@ -139,7 +138,7 @@ class SceneExport:
         force: replace an existing file, unless the scene is read from it.
     """
 
-    scene: Positional[str]
+    scene: SceneName
     output: Path
     force: bool = False
 

@@ -11,10 +11,12 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
-from mereo.io.bounds import Cells, Count, Port, Positive, PositiveOrUnknown, Workers
+from mereo.io.bounds import Cells, Count, Port, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
-from mereo.models.config import InferenceConfig, Precision
+from mereo.io.cores import workers_for
+from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.reconstruction.config import IsolationConfig
 from mereo.training.config import PresetName
 
@@ -38,7 +40,7 @@ class Align:
         force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
-    scan: Positional[Path]
+    scan: ScanCloud
     scene: str
     output: Path
     start: Path | None = None
@@ -88,7 +90,7 @@ class ViewCommand:
         inference: where and how exactly the network computes.
     """
 
-    input: Positional[Path | None] = None
+    input: InputOrNone = None
     weights: str | None = None
     scene: str | None = None
     state: Path | None = None
@@ -130,7 +132,7 @@ class StreamCommand:
     end, on standard error. The exit status is 0 where any frame was answered and the sequence was whole, else 2.
 
     Attributes:
-        source: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
+        input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
         weights: a shipped name or a file.
         resolution: grid cells along the longest side: fewer are faster.
         rate: frames per second at which a folder was recorded.
@@ -141,9 +143,10 @@ class StreamCommand:
         reading: how a frame is read.
         isolation: what is left out of it.
         inference: where and how exactly the network computes.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
     """
 
-    source: Positional[str]
+    input: InputName
     weights: str
     resolution: Cells = 48
     rate: Positive = 30.0
@@ -154,6 +157,7 @@ class StreamCommand:
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    threads: Threads = 0
 
     def run(self) -> None:
         """Print a line of JSON for each frame, and the summary at the end."""
@@ -162,7 +166,7 @@ class StreamCommand:
         from mereo.cli.stream import stream_reconstructions
 
         stream_reconstructions(
-            self.source,
+            self.input,
             self.weights,
             resolution=self.resolution,
             rate_hz=self.rate,
@@ -183,7 +187,7 @@ class BenchCommand:
     Attributes:
         weights: a shipped name or a file; without it the preset's network is fitted to one shipped frame first.
         preset: the architecture to fit.
-        device: where the network runs; preprocessing is always on the CPU.
+        device: where the network runs, auto on a CUDA device where there is one; preprocessing is always on the CPU.
         precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
@@ -193,7 +197,7 @@ class BenchCommand:
 
     weights: str | None = None
     preset: PresetName = "paper"
-    device: Literal["cpu", "cuda"] = "cpu"
+    device: Device = "auto"
     precision: Precision = "float32"
     repeats: Count = 7
     rival: bool = False
@@ -217,13 +221,15 @@ class Experiment:
         name: which one.
         scale: smoke shows in minutes that it runs, cpu takes hours on two cores, paper is the full recipe for a GPU.
         output: folder for datasets, runs, scores and results, shared by all experiments.
-        workers: processes that make datasets; 0 means one per core.
+        workers: processes that make datasets; 0 means as many as --threads.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
     """
 
     name: Positional[ExperimentName]
     scale: ScaleName = "smoke"
     output: Path = Path("out/experiments")
     workers: Workers = 0
+    threads: Threads = 0
 
     def run(self) -> None:
         """Run the experiment and print its table."""
@@ -232,8 +238,7 @@ class Experiment:
         pyplot()  # before the hours that it takes
         from mereo.experiments.paper.registry import run_experiment
 
-        workers = self.workers or os.cpu_count() or 1
-        directory = run_experiment(self.name, self.scale, self.output, workers)
+        directory = run_experiment(self.name, self.scale, self.output, workers_for(self.workers, self.threads))
         print((directory / "table.md").read_text("utf-8"))
         print(f"wrote {directory}")
 
@@ -250,7 +255,7 @@ class Release:
         force: replace an existing output folder that mereo wrote, and nothing else is in.
     """
 
-    weights: Positional[str]
+    weights: WeightsName
     name: str
     output: Path
     tests: tuple[Path, ...] = ()

@@ -53,7 +53,7 @@ def evaluate_scans(
     for scan in scans:
         check_names(model, scan.truth.names)
     registrar = registrar_for(model, choice, scene)
-    return score_cases(model, lambda index: _case(scans[index], cells), len(scans), False, registrar)
+    return score_cases(model, lambda index: _case(scans[index], cells), len(scans), True, registrar)
 
 
 def _case(scan: PosedScan, cells: int) -> TestCase:

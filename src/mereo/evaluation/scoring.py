@@ -11,8 +11,6 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from rich.console import Console
-from rich.progress import track
 
 from mereo.evaluation.candidates import Candidates, RegistrationErrors, find_candidates, names_for, network_labels
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
@@ -23,6 +21,7 @@ from mereo.fitting.register import Registrar, registrar_for
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.io.progress import tracked
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.random_states import state_points
@@ -180,7 +179,7 @@ def score_cases(
     views: list[EvaluatedView] = []
     tallies = {name: Tally() for name in names_for(registrar)}
     answer, sources, errors = Tally(), [], []
-    for index in track(range(count), "evaluating", console=Console(stderr=True), disable=not progress):
+    for index in tracked("evaluate", count, "views", quiet=not progress):
         one = case(index)
         found = find_candidates(model, one.cloud, one.truth.grid, registrar, one.scene_unit)
         for name, tally in tallies.items():

@@ -63,6 +63,7 @@ _BATCH, _QUERIES, _TIMES = Bounds(1, 65536), Bounds(1, 100_000), Bounds(1, 1000)
 _STATES, _WORKERS, _MULTIPLE = Bounds(1, 20_000), Bounds(0, 1024), Bounds(0, 1000)
 _SEED = Bounds(0, 2**63, below=True)  # what torch takes
 
+Threads = Annotated[int, _WORKERS, _shown(_WORKERS)]
 Count = Annotated[int, _COUNT, _shown(_COUNT)]
 CountOrNone = Annotated[int, _COUNT_OR_NONE, _shown(_COUNT_OR_NONE)]
 Points = Annotated[int, _POINTS, _shown(_POINTS)]

@@ -8,6 +8,9 @@ from typing import Literal
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 
+CONFIG = "config.json"
+"""Name of the file of options that a folder of results was made with; ``--config`` reads it."""
+
 Format = Literal["glb", "ply", "obj", "stl", "npz", "vti", "nifti", "seg.nrrd", "points", "json"]
 
 

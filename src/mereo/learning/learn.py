@@ -16,6 +16,7 @@ from typing import Any
 from mereo.evaluation.scoring import evaluate
 from mereo.evaluation.tables import read_metrics
 from mereo.io.atomic_files import atomic_file, write_json
+from mereo.io.config import CONFIG
 from mereo.io.output_folders import MARKER, claim_directory
 from mereo.io.scratch_folders import scratch_folder
 from mereo.learning.example_frame import FRAME, write_example_frame
@@ -32,7 +33,7 @@ from mereo.training.config import PRESETS, TrainConfig
 from mereo.training.trainer import WEIGHTS, train
 from mereo.visualization.result_files import evaluate_weights
 
-SETTINGS, PLAN = "learn.json", "plan.json"
+SETTINGS, PLAN = CONFIG, "plan.json"
 """What was asked for, and what was decided, with the measurements behind it."""
 
 DATA, RUN, TEST = "data", "run", "test"

@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from mereo.training.steps_shown import VALIDATIONS
+
 EVALUATION_SHARE = 0.15
 """Of the time that is left after the measurements, for the scores: whose number says how far they can be trusted."""
 
@@ -19,8 +21,6 @@ HOLDOUT = 32
 
 OFFSET_EXAMPLES = 128
 """Training examples from which class offsets are chosen."""
-
-VALIDATIONS = 20
 
 LEAST_TESTS, MOST_TESTS = 4, 64
 

@@ -20,11 +20,11 @@ def pick_device(rank: int = 0) -> torch.device:
     return torch.device("cpu")
 
 
-def find_device(device: Device) -> torch.device:
-    """Device that was asked for; ``ValueError`` for CUDA where torch sees none."""
+def find_device(device: Device, rank: int = 0) -> torch.device:
+    """Device that a process was asked for; ``ValueError`` for CUDA where torch sees none."""
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("the device is cuda, but torch sees no CUDA device; leave out --device to use the CPU")
-    return torch.device("cpu") if device == "cpu" else pick_device()
+    return torch.device("cpu") if device == "cpu" else pick_device(rank)
 
 
 @cache

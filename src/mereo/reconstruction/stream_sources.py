@@ -47,13 +47,18 @@ def frames_of(
         return _recorded(path, reading, isolation)
     if not path.is_dir():
         raise ValueError(f"{path} is a single file; for one frame use `mereo reconstruct`, here name its folder")
-    files = sorted(file for file in path.iterdir() if _is_frame(file, reading))
-    if not files:
-        raise ValueError(f"{path} has no depth images or point clouds; a folder of frames is needed: check the path")
     return (
         StreamFrame(file.name, i / rate_hz, _loader(partial(read_frame, file, reading), isolation))
-        for i, file in enumerate(files)
+        for i, file in enumerate(frames_in(path, reading))
     )
+
+
+def frames_in(folder: Path, reading: InputConfig) -> list[Path]:
+    """Depth images and point clouds of a folder in the order of their names; ``ValueError`` where it has none."""
+    files = sorted(file for file in folder.iterdir() if _is_frame(file, reading))
+    if not files:
+        raise ValueError(f"{folder} has no depth images or point clouds; a folder of frames is needed: check the path")
+    return files
 
 
 def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:

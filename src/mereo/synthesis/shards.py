@@ -34,6 +34,7 @@ from jaxtyping import Float
 from mereo.io.atomic_files import atomic_file
 from mereo.io.checked_tensors import pack_tensors
 from mereo.io.output_folders import claim_directory
+from mereo.io.progress import progress
 from mereo.io.scratch_folders import check_place
 from mereo.scenes.random_states import scene_model, states_for
 from mereo.scenes.registry import is_yaml, load_scene
@@ -45,7 +46,6 @@ from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
 from mereo.synthesis.dataset_files import check_space, dataset_key, read_shard, read_template
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.observations import Clouds
-from mereo.synthesis.progress import progress
 from mereo.synthesis.workers import in_processes
 
 SHARD_SIZE = 64
@@ -134,11 +134,11 @@ def generate(
     total = sum(item.end - item.first for item in missing)
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile
     work = partial(_make_shard, _Work(loaded if is_yaml(scene) else scene, settings, seed, key))
-    with closing(in_processes(work, missing, workers)) as made, progress(total) as advance:
+    with closing(in_processes(work, missing, workers)) as made, progress("generate", total) as shown:
         for item, data in made:
             with atomic_file(item.path) as temporary:
                 temporary.write_bytes(data)
-            advance(item.end - item.first)
+            shown.advance(item.end - item.first)
 
 
 def _check_request(examples: int, seed: int, workers: int, shard: tuple[int, int], test: bool) -> None:

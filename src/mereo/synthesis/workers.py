@@ -17,13 +17,13 @@ from multiprocessing import connection, resource_tracker
 from multiprocessing.synchronize import Event
 from typing import Any, TypeVar
 
+from mereo.io.cores import THREAD_VARIABLES
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 Function = Callable[[Item, Callable[[], bool]], Result]
 """Takes an item, and a function that tells whether to give up (then what it returns is thrown away)."""
-
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
 
 
 def in_processes(

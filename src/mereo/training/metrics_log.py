@@ -13,12 +13,6 @@ FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "code", "va
 SENSOR_FIELDS = ("sensor_iou", "sensor_miou")
 """Scores that runs on datasets with further observations have besides: of these."""
 
-JUDGED = 8
-"""Steps whose mean loss is compared with that of the first ones."""
-
-FOUND, FALLEN = 0.05, 0.9
-"""By a tenth of its steps a run that gets anywhere has an IoU above the one, a loss below the other of its first."""
-
 TABLE, CURVES = "metrics.csv", "curves.png"
 Row = dict[str, float]
 
@@ -65,21 +59,6 @@ class MetricsLog:
         latest = self.rows[-1] if self.rows else {}
         shown = {k: v for k, v in latest.items() if k not in ("step", "rate")}
         return "  ".join(f"{name} {value:.4f}" for name, value in shown.items())
-
-    def doubt(self, total: int) -> str:
-        """A warning, once, where a run of ``total`` steps has got nowhere by a tenth of them; else nothing."""
-        done = [row for row in self.rows if "loss" in row]
-        if not total / 10 <= len(done) < total / 10 + total / 20 or len(done) < 2 * JUDGED:
-            return ""
-        first, last = (sum(row["loss"] for row in rows) / JUDGED for rows in (done[:JUDGED], done[-JUDGED:]))
-        iou = self.rows[-1].get("val_iou", 1.0)
-        if iou > FOUND and last < FALLEN * first:
-            return ""
-        return (
-            f"\nwarning: after a tenth of the steps the held-out IoU is {iou:.2f} and the loss {last:.2f}, from "
-            f"{first:.2f} at first: this training gets nowhere so far; where it stays so, start from weights of "
-            "another object (--init) or take a lower --learning-rate"
-        )
 
     def write(self) -> None:
         """Write metrics.csv, and curves.png where it can be drawn, each atomically."""

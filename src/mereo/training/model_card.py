@@ -6,7 +6,7 @@ the weights and their tests say themselves.
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -114,7 +114,7 @@ def _training(provenance: dict[str, object]) -> str:
     lines += _observations(provenance)
     lines.append(f"- {steps} steps of {batch} examples{seen}")
     if recipe:
-        lines.append(f"- recipe, nearest preset `{_nearest_preset(recipe)}`: `{json.dumps(recipe)}`")
+        lines.append(f"- recipe, nearest preset `{nearest_preset(recipe)}`: `{json.dumps(recipe)}`")
     return "\n".join([*lines, ""])
 
 
@@ -129,7 +129,7 @@ def _observations(provenance: dict[str, Any]) -> list[str]:
     ]
 
 
-def _nearest_preset(recipe: dict[str, Any]) -> str:
+def nearest_preset(recipe: dict[str, Any]) -> str:
     """Name of the preset whose network it is, else of which most settings are."""
     network = NetworkConfig.from_dict(recipe["network"])  # what older recipes do not state is at its default
     share = recipe.get("augment", {}).get("observations", 0.0)  # which the dataset decides, too
@@ -154,6 +154,39 @@ def _result(test: dict[str, Any]) -> str:
     values = [test["iou"], test["miou"], *segments.values()]
     rows = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}", f"| {' | '.join(format_score(v) for v in values)} |"]
     return "\n".join([f"{title}:\n", *rows, "", *_answers(test)])
+
+
+@dataclass(frozen=True)
+class CardResult:
+    """One test of a card, as text.
+
+    Attributes:
+        title: what was tested.
+        scores: as the card rounds them: "IoU", "mIoU", then each segment.
+        answers: line on who could have answered; empty where only the network could.
+    """
+
+    title: str
+    scores: dict[str, str]
+    answers: str
+
+    @property
+    def on_scans(self) -> bool:
+        """Whether the test was of real scans."""
+        return "real scans" in self.title
+
+
+def card_results(text: str) -> list[CardResult]:
+    """Tests that a card tells of, the inverse of what ``card`` writes; none where it was written otherwise."""
+    lines = [line.strip() for line in text.partition("## Results\n")[2].partition("## ")[0].splitlines()]
+    found = []
+    for number, line in enumerate(lines):
+        if line.startswith("| IoU |") and number + 2 < len(lines):
+            names, values = ([cell.strip() for cell in lines[n].strip("|").split("|")] for n in (number, number + 2))
+            title = next((before for before in reversed(lines[:number]) if before), "").removesuffix(":")
+            after = next((later for later in lines[number + 3 :] if later), "")
+            found.append(CardResult(title, dict(zip(names, values, strict=False)), after * after.startswith("By who")))
+    return found
 
 
 def _answers(test: dict[str, Any]) -> list[str]:

@@ -18,24 +18,34 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from mereo.io.scratch_folders import check_place
-from mereo.models.device import compiling_pays, keep_freed_memory, pick_device, pick_precision
+from mereo.models.config import Device
+from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
 from mereo.models.weights import save_model, trained_steps
 from mereo.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mereo.training.config import TrainConfig
 from mereo.training.dataset import Batch, Dataset
+from mereo.training.going_nowhere import EXAMPLES, ConstantAnswer, Judge
 from mereo.training.losses import supervised_loss
 from mereo.training.metrics_log import MetricsLog
 from mereo.training.optimization import clip_gradients, parameter_groups, rate_share, update_average
 from mereo.training.processes import Process, join_processes, meeting
 from mereo.training.run_directory import claim_run, fit_config, start_network, trained_model
+from mereo.training.steps_shown import StepsShown, steps_between
 from mereo.training.validation import choose_offsets, held_out, validate
 
 WEIGHTS = "weights.safetensors"
 
 
-def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_every_s: float = 120.0) -> Path:
+def train(
+    dataset_dir: Path,
+    run_dir: Path,
+    config: TrainConfig,
+    *,
+    device: Device = "auto",
+    checkpoint_every_s: float = 120.0,
+) -> Path:
     """Train on a generated dataset; returns the path of the weights (``run_dir/weights.safetensors``).
 
     ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors. If it
@@ -45,36 +55,34 @@ def train(dataset_dir: Path, run_dir: Path, config: TrainConfig, *, checkpoint_e
     """
     check_place(run_dir, may_be_link=True)
     process = join_processes()
-    device = pick_device(process.rank)
-    data = Dataset.load(dataset_dir, device)
+    place = find_device(device, process.rank)
+    data = Dataset.load(dataset_dir, place)
     config = fit_config(config, data)
     network = start_network(config, data)  # before anything is written: the weights it starts from may be unusable
     claim_run(run_dir, config, data, process)
     keep_freed_memory()
-    trainer = Trainer(config, data, network, run_dir, process, device)
+    trainer = Trainer(config, data, network, run_dir, process, place)
     if isinstance(network.encoder, Autodecoder):
         shown = len(held_out(data, config))
         trainer.say(f"the validation curve shows {shown} held-out examples, with codes found from their clouds")
     if trainer.resume():
         trainer.say(f"continuing from step {trainer.step} of {trainer.total}")
     last_save = time.monotonic()
-    for batch in trainer.batches():
-        trainer.train_step(batch)
-        trainer.validate()
-        if trainer.step < trainer.total and trainer.agree(time.monotonic() - last_save > checkpoint_every_s):
-            trainer.save()
-            last_save = time.monotonic()
-    trainer.finish()
+    with trainer.shown.showing(trainer.step) if process.is_main else nullcontext():
+        for batch in trainer.batches():
+            trainer.train_step(batch)
+            trainer.validate()
+            if trainer.step < trainer.total and trainer.agree(time.monotonic() - last_save > checkpoint_every_s):
+                trainer.save()
+                last_save = time.monotonic()
+        trainer.finish()
     if process.world > 1:
         dist.destroy_process_group()
     return run_dir / WEIGHTS
 
 
-REPORT_EVERY = 20
-"""Steps between two lines of progress."""
-
-VALIDATIONS = 20
-"""Held-out scores of a run, evenly over its steps: by the clock, a resumed run would have others."""
+READ_EVERY = 20
+"""Steps after which losses are read on a device where reading waits."""
 
 
 class Trainer:
@@ -105,7 +113,10 @@ class Trainer:
             self.module = nn.parallel.DistributedDataParallel(self.network)
         if config.compile == "on" or (config.compile == "auto" and compiling_pays(device, self.total)):
             self.module = torch.compile(self.module)  # type: ignore[assignment]
-        self.started, self.first_step = time.monotonic(), 0
+        labels, distances = (values[:EXAMPLES].cpu().numpy() for values in (data.labels, data.distances))
+        self.judge = Judge(ConstantAnswer.of(labels, distances, config.supervision.labels), self.total)
+        self.first_step = 0
+        self.shown = StepsShown(config, self.total, len(held_out(data, config)) * (2 if data.further else 1))
 
     def say(self, text: str) -> None:
         """Print a line, in process 0 only."""
@@ -158,10 +169,8 @@ class Trainer:
         update_average(self.average, self.network, self.step, self.config.ema_decay)
         values = {"norm": norm, **self._of_all({"loss": loss.detach(), **terms})}
         self.unread.append((self.step, self.config.learning_rate * part, values))
-        if self.device.type == "cpu":  # where reading waits for nothing
-            self._read_losses()
-        if self.step % REPORT_EVERY == 0 or self.step == self.total:
-            self._report_progress()
+        if self.device.type == "cpu" or self.step % READ_EVERY == 0 or self.step == self.total:
+            self._read_losses()  # on a CPU that waits for nothing
 
     def _of_all(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
         """Means over all processes, which so stop at the same step, as DDP has made them of the gradients."""
@@ -198,6 +207,7 @@ class Trainer:
             if self.log is not None:
                 self.log.add_step(step, rate, losses)
         self.unread.clear()
+        self.shown.took(self.step, losses["loss"])
 
     def _divergence(self, step: int, loss: float, norm: float) -> str:
         """Sentence about a step that is not finite: where it is, what is left, and what may help."""
@@ -214,25 +224,13 @@ class Trainer:
             "or check these examples"
         )
 
-    def _report_progress(self) -> None:
-        self._read_losses()
-        if self.log is None:
-            return
-        loss = self.log.rows[-1]["loss"]
-        rate = (self.step - self.first_step) / (time.monotonic() - self.started)
-        left_s = (self.total - self.step) / max(rate, 1e-9)
-        self.say(
-            f"step {self.step}/{self.total}  loss {loss:.4f}  {rate * self.config.batch:.1f} examples/s  "
-            f"{left_s / 60:.1f} min left"
-        )
-
     def validate(self) -> None:
         """Score the averaged network on held-out examples, in the steps that have such scores."""
-        due = self.step % math.ceil(self.total / VALIDATIONS) == 0 or self.step == self.total
+        due = self.step % steps_between(self.total) == 0 or self.step == self.total
         if not (due and self.config.holdout):
             return
         self._read_losses()
-        with meeting(self.process):
+        with self.shown.apart(self.shown.scored), meeting(self.process):
             if self.log is not None:
                 self._validate(self.log)
 
@@ -243,7 +241,7 @@ class Trainer:
         if self.data.further:
             scores = validate(self.average, self.data, self.config, further=True)
             log.add_validation(self.step, scores.iou, scores.miou, "sensor")
-        self.say(f"held-out examples at step {self.step}: {log.summary()}{log.doubt(self.total)}")
+        self.say(f"held-out examples at step {self.step}: {log.summary()}{self.judge.doubt(log.rows)}")
 
     def save(self, finished: bool = False) -> None:
         """Write metrics, curves, the weights and the checkpoint; every file atomically.
@@ -251,7 +249,7 @@ class Trainer:
         The checkpoint is the last, so whatever stops this leaves one from which the others are written again.
         """
         self._read_losses()
-        with meeting(self.process):
+        with self.shown.apart(), meeting(self.process):
             if self.log is not None:
                 self._save(self.log, finished)
         self.saved_step = self.step
@@ -262,7 +260,7 @@ class Trainer:
         offsets = choose_offsets(self.average, self.data, self.config) if finished else None
         save_model(trained_model(self.average, self.data, self.config, self.step, offsets), self.run_dir / WEIGHTS)
         save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
-        self.say(f"saved at step {self.step}: {log.summary()}{log.doubt(self.total)}")
+        self.say(f"saved at step {self.step}: {log.summary()}{self.judge.doubt(log.rows)}")
 
     def finish(self) -> None:
         """Write all that a run leaves at its end, unless an earlier process has, which may have been killed before."""

@@ -1,7 +1,7 @@
 """Folders of results that `mereo reconstruct` and `mereo evaluate` leave on disk."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Surfaces, write_attachment
-from mereo.io.config import DEFAULT_FILES, FilesConfig
+from mereo.io.config import CONFIG, DEFAULT_FILES, FilesConfig
 from mereo.io.output_folders import new_directory
 from mereo.io.writers.formats import Results, chosen_formats, write_formats
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
@@ -29,7 +29,7 @@ from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.pipeline import Reconstruction
-from mereo.scenes.registry import load_scene
+from mereo.scenes.registry import files_of, load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
 from mereo.visualization.error_maps import error_picture
@@ -55,9 +55,14 @@ def evaluate_weights(
     settings: GenerateConfig | None = None,
     inference: InferenceConfig = EXACT,
     choice: FitChoice = "auto",
+    force: bool = False,
+    options: Mapping[str, Any] | None = None,
 ) -> Evaluation:
-    """Score weights, write metrics.json, table.md, errors.png, report.html, and print the table: ``mereo evaluate``."""
-    with new_directory(output) as directory:
+    """Score weights, write metrics.json, table.md, errors.png, report.html, and print the table: ``mereo evaluate``.
+
+    With ``force`` an existing folder that mereo wrote is replaced; ``options`` are written to config.json.
+    """
+    with new_directory(output, force, [weights, *([] if scene is None else files_of(scene))]) as directory:
         model = load_for(weights, inference)
         settings = settings or GenerateConfig()
         evaluation = evaluate(
@@ -81,7 +86,7 @@ def evaluate_weights(
             "precision": model.working_precision,
             "trained": model.provenance,
         }
-        write_evaluation(directory, evaluation, facts)
+        write_evaluation(directory, evaluation, facts, options)
     print(markdown_table(evaluation))
     print(f"wrote {output}")
     return evaluation
@@ -95,22 +100,31 @@ def evaluate_on_scans(
     scene: str | None = None,
     cells: int = CELLS,
     choice: FitChoice = "auto",
+    force: bool = False,
+    options: Mapping[str, Any] | None = None,
 ) -> Evaluation:
     """Score a model on real scans, with the same files as ``evaluate_weights``: ``mereo evaluate --scans``.
 
-    Takes the arguments of ``evaluate_scans``; ``scene`` is a name or a file.
+    Takes the arguments of ``evaluate_scans``; ``scene`` is a name or a file; the others are as there.
     """
-    with new_directory(output) as directory:
+    with new_directory(output, force, [*truths, *([] if scene is None else files_of(scene))]) as directory:
         loaded = None if scene is None else load_scene(scene)
         evaluation = evaluate_scans(model, truths=truths, scene=loaded, cells=cells, choice=choice)
         facts = {"scans": list(evaluation.examples), "truths": [str(path) for path in truths]}
-        write_evaluation(directory, evaluation, {**facts, "trained": model.provenance})
+        write_evaluation(directory, evaluation, {**facts, "trained": model.provenance}, options)
     print(markdown_table(evaluation))
     return evaluation
 
 
-def write_evaluation(directory: Path, evaluation: Evaluation, facts: dict[str, Any]) -> None:
-    """Write metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON."""
+def write_evaluation(
+    directory: Path, evaluation: Evaluation, facts: dict[str, Any], options: Mapping[str, Any] | None = None
+) -> None:
+    """Write metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON.
+
+    Also config.json of ``options``, where there are any.
+    """
+    if options is not None:
+        write_json(directory / CONFIG, options)
     found = metrics(evaluation, facts)
     write_json(directory / "metrics.json", found)
     (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")

@@ -1,0 +1,82 @@
+"""The command ``mereo reconstruct``. See ``mereo.cli.commands`` for how commands are written."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import UseAppendAction, arg
+
+from mereo.cli.config_file import ConfigFile, options_of
+from mereo.cli.positionals import Inputs
+from mereo.fitting.config import FitChoice
+from mereo.io.bounds import Cells, Threads
+from mereo.io.config import CarryFrame, FilesConfig, InputConfig
+from mereo.models.config import InferenceConfig
+from mereo.reconstruction.config import IsolationConfig
+
+
+@dataclass(frozen=True)
+class ReconstructCommand:
+    """Reconstruct all segments from a frame, a depth image, point cloud or ROS recording, or from many frames.
+
+    Several frames, or folders of them, share one loading of the weights and all options. Each gets a folder of its own
+    in --output, named by its file; one that cannot be answered is said and passed over, and the exit status is then 2.
+
+    Attributes:
+        inputs: depth images (PNG, TIFF, EXR, NPY), point clouds (PLY, PCD, XYZ, NPY, NPZ, ZDF), ROS recordings (bag,
+            MCAP; one frame of each), or folders of images and clouds; results are in each one's frame and units.
+        weights: a shipped name or a file.
+        output: folder to create; of several frames, the folder in which each one's is created.
+        resolution: grid cells along the longest side.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
+        files: which files, and in which unit.
+        fit: register the object's own deformation model to the frame: auto takes the registered model where it explains
+            the frame, if the weights carry one; off leaves the network's answer; modes and full take the model in any
+            case, full by fitting the draws of the scene as well.
+        scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
+        carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
+            glTF), points (PLY, PCD, XYZ, NPY) or CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses).
+        carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
+    """
+
+    inputs: Inputs
+    weights: str
+    output: Path
+    resolution: Cells = 128
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
+    fit: FitChoice = "auto"
+    scene: str | None = None
+    carry: UseAppendAction[tuple[Path, ...]] = ()
+    carry_frame: CarryFrame = "source"
+    force: bool = False
+    threads: Threads = 0
+    options_from: ConfigFile = None
+
+    def run(self) -> None:
+        """Write the folder of results and print the segments."""
+        from mereo.cli.reconstruct import FrameJob
+        from mereo.cli.reconstruct_many import reconstruct_inputs
+
+        job = FrameJob(
+            self.weights,
+            self.resolution,
+            self.reading,
+            self.isolation,
+            self.inference,
+            self.files,
+            self.fit,
+            self.scene,
+            self.carry,
+            self.carry_frame,
+            self.force,
+            options_of(self, "reconstruct"),
+        )
+        reconstruct_inputs(self.inputs, self.output, job)

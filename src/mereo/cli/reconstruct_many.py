@@ -1,0 +1,155 @@
+"""``mereo reconstruct`` for several frames and folders of them: one model, a folder of results for each frame."""
+
+import os
+import sys
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from mereo.cli.reconstruct import FrameJob, reconstruct_file, seconds_of
+from mereo.fitting.answer import Answer
+from mereo.io.config import InputConfig
+from mereo.io.output_folders import MARKER
+from mereo.io.progress import duration
+from mereo.io.ros_recordings import is_recording
+from mereo.io.scratch_folders import check_place
+from mereo.reconstruction.observation import SizeWarning
+from mereo.reconstruction.stream import sentence
+from mereo.reconstruction.stream_sources import frames_in
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What became of one frame.
+
+    Attributes:
+        path: its file.
+        folder: of its results.
+        found: the answer; None for a frame that could not be answered.
+    """
+
+    path: Path
+    folder: Path
+    found: Answer | None
+
+
+def reconstruct_inputs(inputs: Sequence[Path], output: Path, job: FrameJob) -> None:
+    """Reconstruct one frame into ``output``, or several, or folders of them, into ``output``/NAME each.
+
+    Raises as ``reconstruct_file`` does for one frame; for several as ``reconstruct_frames``.
+    """
+    if not inputs:
+        raise ValueError("no input is given; name a frame, several, or a folder of them: mereo reconstruct FRAME ...")
+    if len(inputs) == 1 and not is_folder_of_frames(inputs[0]):
+        reconstruct_file(inputs[0], output, job)
+    else:
+        reconstruct_frames(list_frames(inputs, job.reading), output, job)
+
+
+def is_folder_of_frames(path: Path) -> bool:
+    """Whether a path is a folder of frames, and not the folder that a ROS 2 recording is."""
+    return path.is_dir() and not is_recording(path)
+
+
+def list_frames(inputs: Sequence[Path], reading: InputConfig) -> list[Path]:
+    """Files of inputs and of the folders among them, each once; ``ValueError`` for a folder without frames."""
+    files = [file for path in inputs for file in (frames_in(path, reading) if is_folder_of_frames(path) else [path])]
+    return list({file.resolve(): file for file in files}.values())
+
+
+def folder_names(files: Sequence[Path]) -> list[str]:
+    """Name of each frame's folder of results: its file's without the suffix, with as much more as tells all apart.
+
+    Raises ``ValueError`` where no name does, because files of one name lie in folders of one name.
+    """
+    kinds: tuple[Callable[[Path], str], ...] = (
+        lambda file: file.stem,
+        lambda file: file.name,
+        lambda file: f"{file.resolve().parent.name}-{file.name}",
+    )
+    for kind in kinds:
+        names = [kind(file) for file in files]
+        twice, count = Counter(name.casefold() for name in names).most_common(1)[0]  # some systems ignore case
+        if count == 1:
+            return names
+    alike = [str(file) for file, name in zip(files, names, strict=True) if name.casefold() == twice]
+    raise ValueError(f"{alike[0]} and {alike[1]} would both be written to {names[0]!r}: reconstruct them one at a time")
+
+
+def reconstruct_frames(files: Sequence[Path], output: Path, job: FrameJob) -> list[Outcome]:
+    """Reconstruct each file into ``output``/NAME, print a table at the end; a bad frame is said and passed over.
+
+    Raises ``ValueError`` at the end where a frame could not be answered, and before the work as ``FrameJob.check`` and
+    loading do; ``FileExistsError`` where ``output`` is itself a folder of results.
+    """
+    names = folder_names(files)
+    check_place(output, may_be_link=True)
+    if output.exists() and not output.is_dir():
+        raise FileExistsError(f"{output} is a file; a folder for each frame is written there: choose another --output")
+    if (output / MARKER).exists():
+        raise FileExistsError(
+            f"{output} is a folder of results; each frame gets a folder of its own in --output: choose another"
+        )
+    job.check()
+    _ = job.model, job.placed  # what is wrong with them is no frame's fault
+    outcomes: list[Outcome] = []
+    started = time.monotonic()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", category=SizeWarning)  # for each frame, also in the same words
+        for number, (file, name) in enumerate(zip(files, names, strict=True)):
+            answered = sum(outcome.found is not None for outcome in outcomes)  # bad ones take no time
+            each_s = (time.monotonic() - started) / max(answered, 1)
+            left = f", {duration(each_s * (len(files) - number))} left" if answered else ""
+            print(f"\n[{number + 1}/{len(files)}] {file}{left}", flush=True)
+            outcomes.append(Outcome(file, output / name, _answered(file, output / name, job)))
+    _show(outcomes, output)
+    failed = sum(outcome.found is None for outcome in outcomes)
+    if failed:
+        raise ValueError(
+            f"{failed} of {len(files)} frames could not be reconstructed, each for the reason given with it; the "
+            "others are written: correct them, and name only those again"
+        )
+    return outcomes
+
+
+def _answered(file: Path, folder: Path, job: FrameJob) -> Answer | None:
+    """Answer to a frame, None after a sentence on standard error where there is none."""
+    try:
+        return reconstruct_file(file, folder, job)
+    except Exception as problem:
+        if os.environ.get("MEREO_TRACEBACK") == "1":
+            raise
+        print(f"mereo: error: {sentence(problem, file.name)}", file=sys.stderr, flush=True)
+        return None
+
+
+def _show(outcomes: Sequence[Outcome], output: Path) -> None:
+    """Table of all frames."""
+    print()
+    table = Table(title=f"{len(outcomes)} frames, results in {output}", title_justify="left")
+    table.add_column("frame")
+    table.add_column("answer")
+    for column in ("explained", "segments", "seconds"):
+        table.add_column(column, justify="right")
+    table.add_column("folder", overflow="fold")
+    for outcome in outcomes:
+        table.add_row(outcome.path.name, *_row(outcome))
+    console = Console(markup=False, emoji=False)
+    console.print(table)
+
+
+def _row(outcome: Outcome) -> tuple[str, ...]:
+    found = outcome.found
+    if found is None:
+        return "none", "", "", "", ""
+    registration, segments = found.registration, found.reconstruction.segments
+    explained = "" if registration is None else f"{registration.explained:.1%}"
+    seen = f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}"
+    who = "registered model" if found.taken else "network"
+    return who, explained, seen, f"{seconds_of(found):.1f}", outcome.folder.name

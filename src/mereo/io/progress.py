@@ -1,0 +1,155 @@
+"""Progress of long work, in one style for all: stage, done, rate and time left, on standard error.
+
+    train    ━━━━━━━━━━━━╸━━━━━━━━━━  step 120 of 300, 24.0 examples/s, 90 s left, loss 1.234
+
+is a bar on a terminal, and elsewhere the same as a plain line now and then. What others print meanwhile stays above it.
+"""
+
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bar
+
+from mereo.io.busy_machine import BusyWatch
+
+LINE_EVERY_S = 10.0
+"""Seconds between two plain lines."""
+
+WINDOW_S = 60.0
+"""Seconds, the latest, of which the rate is: a machine that becomes busy shows in it."""
+
+
+class Progress:
+    """Progress of one stage, which ``progress`` makes.
+
+    Attributes:
+        stage: its name.
+        total: units of work.
+        unit: what these are, in the plural.
+        each: examples in a unit, where the rate is not of units but of examples; else 0.
+        done: units so far.
+    """
+
+    def __init__(self, stage: str, total: int, unit: str, each: int, bar: Bar | None) -> None:
+        self.stage, self.total, self.unit, self.each, self.bar = stage, total, unit, each, bar
+        self.done = 0
+        self.task = None if bar is None else bar.add_task("", total=total, stage=stage)
+        self.started = self.shown = time.monotonic()
+        self.paused_s = 0.0
+        self.past = deque([(0.0, 0)])
+        self.watch = BusyWatch()
+
+    def advance(self, count: int = 1, note: str = "", tail_s: float = 0.0) -> None:
+        """Count ``count`` units as done.
+
+        Args:
+            count: how many more.
+            note: to be shown behind the time left.
+            tail_s: seconds that are expected beside the units that are left, which the time left then includes.
+        """
+        now = time.monotonic()
+        self.done += count
+        worked_s = now - self.started - self.paused_s
+        while len(self.past) > 1 and worked_s - self.past[1][0] > WINDOW_S:
+            self.past.popleft()
+        then_s, then = self.past[0]
+        self.past.append((worked_s, self.done))
+        rate = (self.done - then) / max(worked_s - then_s, 1e-9)
+        self._show(self._text(rate, (self.total - self.done) / max(rate, 1e-9) + tail_s, note), now)
+        if (busy := self.watch.look()) is not None:
+            print(f"mereo: warning: {busy}", file=sys.stderr, flush=True)
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Block whose time is no unit's: what is done between them."""
+        begun = time.monotonic()
+        try:
+            yield
+        finally:
+            self.paused_s += time.monotonic() - begun
+
+    def _text(self, rate: float, left_s: float, note: str) -> str:
+        speed = (
+            f"{rate * self.each:.1f} examples/s" if self.each else f"{rate:.{1 if rate >= 0.1 else 3}f} {self.unit}/s"
+        )
+        return ", ".join(part for part in (self._count, speed, f"{duration(left_s)} left", note) if part)
+
+    @property
+    def unit_s(self) -> float:
+        """Seconds that a unit took, in the mean; 0 before the first."""
+        return (time.monotonic() - self.started - self.paused_s) / self.done if self.done else 0.0
+
+    @property
+    def _count(self) -> str:
+        return f"{self.done} of {self.total} {self.unit}"
+
+    def _show(self, text: str, now: float) -> None:
+        if self.bar is not None and self.task is not None:
+            self.bar.update(self.task, completed=self.done, description=text)
+        elif now - self.shown >= LINE_EVERY_S:
+            print(f"{self.stage}: {text}", file=sys.stderr, flush=True)
+            self.shown = now
+
+    def close(self) -> None:
+        """Say how long it took, where anything was to be done."""
+        if not self.done:
+            return
+        took = duration(time.monotonic() - self.started)
+        print(f"{self.stage}: {self.done} {self.unit} in {took}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def progress(
+    stage: str, total: int, unit: str = "examples", *, each: int = 0, quiet: bool = False
+) -> Iterator[Progress]:
+    """Context of a stage, which shows its progress; at its end a line with the time it took, unless it failed.
+
+    Args:
+        stage: its name: the command's.
+        total: units of work.
+        unit: what these are, in the plural.
+        each: examples in a unit, where the rate shall be of these.
+        quiet: show nothing.
+    """
+    if quiet:
+        yield _Quiet(stage, total, unit, each, None)
+        return
+    console = Console(stderr=True, highlight=False)
+    bar = None
+    if console.is_terminal:
+        columns = TextColumn("{task.fields[stage]}"), BarColumn(), TextColumn("{task.description}")
+        # text that goes into a file is not drawn on the terminal
+        bar = Bar(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
+    with bar or nullcontext():
+        shown = Progress(stage, total, unit, each, bar)
+        yield shown
+    shown.close()
+
+
+def tracked(stage: str, count: int, unit: str, *, quiet: bool = False) -> Iterator[int]:
+    """Numbers from 0 to ``count`` - 1, with the progress of what is done for each."""
+    with progress(stage, count, unit, quiet=quiet) as shown:
+        for index in range(count):
+            yield index
+            shown.advance()
+
+
+class _Quiet(Progress):
+    """Progress that nobody sees."""
+
+    def advance(self, count: int = 1, note: str = "", tail_s: float = 0.0) -> None:
+        """Count alone."""
+        self.done += count
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words: "45 s", "12 min", "3 h 05 min"."""
+    minutes = round(seconds / 60)
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"

@@ -1,0 +1,144 @@
+"""A file of options says what the command line says, wins over defaults and presets, and loses to the command line."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_reconstruction import scene
+
+from mereo import __main__ as command_line
+from mereo.cli.config_file import options_of
+from mereo.synthesis.config import SENSORS
+from mereo.training.config import PRESETS
+
+LINES = {
+    "generate": "generate rope --examples 7 --output out --seed 3 --sensor time-of-flight --sensor.hand 0.5 "
+    "--points 512 --sampler nested-sort-sample --observations all",
+    "train": "train data --output out --preset tiny --epochs 2 --network.width 64 --augment.keep-points 0.4 0.9 "
+    "--network.no-encode-positions --loss ce --init bunny",
+    "evaluate": "evaluate bunny --output out --examples 4 --sensor structured-light --noise-std 0.2 --fit modes",
+    "reconstruct": "reconstruct a.ply b.ply --weights bunny --output out --depth-range 0.4 0.9 --carry p.stl "
+    "--carry q.stl --formats glb ply --fit off --millimetres --unit-m 0.001",
+    "learn": "learn a.stl b.stl --output out --minutes 3 --units mm",
+}
+
+
+def parsed(text: str) -> dict[str, Any]:
+    return vars(command_line.parse(text.split()))
+
+
+def written(folder: Path, content: Any, name: str = "options.json") -> Path:
+    path = folder / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize("command", LINES)
+def test_what_a_command_writes_says_the_same_as_its_line(command: str, tmp_path: Path) -> None:
+    """Through JSON and back, every option has its value; files are absolute then."""
+    before = command_line.parse(LINES[command].split())
+    content = json.loads(json.dumps(options_of(before, command)))
+    assert content.pop("command") == command
+    after = parsed(f"{command} --config {written(tmp_path, content)} --output out")
+    for name, value in vars(before).items():
+        absolute = (
+            lambda v: tuple(p.absolute() if isinstance(p, Path) else p for p in v) if isinstance(v, tuple) else v
+        )(value)
+        absolute = value.absolute() if isinstance(value, Path) and name != "output" else absolute
+        if name not in ("options_from", "preset", "sensor"):  # the last two are where other options start
+            assert after[name] == absolute, name
+
+
+def test_the_command_line_wins_over_the_file_and_the_file_over_the_preset(tmp_path: Path) -> None:
+    path = written(tmp_path, {"preset": "tiny", "epochs": 3, "network": {"width": 64}, "batch": 5})
+    config = parsed(f"train data --output out --config {path} --batch 7 --network.depth 6")["config"]
+    assert (config.epochs, config.batch, config.network.decoder.width, config.network.decoder.depth) == (3, 7, 64, 6)
+    assert config.learning_rate == PRESETS["tiny"].learning_rate
+    config = parsed(f"train data --output out --config={path} --preset paper")["config"]
+    assert (config.epochs, config.learning_rate) == (3, PRESETS["paper"].learning_rate)
+
+
+def test_a_sensor_is_a_word_or_its_terms(tmp_path: Path) -> None:
+    path = written(tmp_path, {"sensor": "time-of-flight"})
+    assert parsed(f"evaluate bunny --output out --config {path}")["terms"] == SENSORS["time-of-flight"]
+    field = next(iter(vars(SENSORS["paper"])))
+    value = vars(SENSORS["time-of-flight"])[field]
+    path = written(tmp_path, {"sensor": {field: value}})
+    assert parsed(f"evaluate bunny --output out --config {path}")["terms"] == replace(
+        SENSORS["paper"], **{field: value}
+    )
+
+
+def test_yaml_and_names_with_hyphens(tmp_path: Path) -> None:
+    path = written(tmp_path, "unit-m: 0.001\nfit: modes\ndepth-range: [0.4, 0.9]\n", "options.yaml")
+    found = parsed(f"reconstruct a.ply --weights bunny --output out --config {path}")
+    assert (found["reading"].unit_m, found["fit"], found["isolation"].depth_range) == (0.001, "modes", (0.4, 0.9))
+
+
+def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
+    recipe = replace(PRESETS["tiny"], epochs=2.0, init="bunny")
+    path = written(tmp_path, {"dataset": {"scene": "rope", "seed": 1, "examples": 8}, "train": recipe.to_dict()})
+    assert parsed(f"train data --output out --config {path}")["config"] == recipe
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ({"wieghts": "bunny"}, "has 'wieghts', which is no option of this command: correct it, perhaps to 'weights'"),
+        ({"frobnicate": 1}, "has 'frobnicate', which is no option of this command: take it out"),
+        ({"config": "other.json"}, "has 'config', which is no option"),
+        ({"resolution": "many"}, "has resolution = 'many', which cannot be"),
+        ({"resolution": 1}, "--resolution is 1; it must be a whole number, from 4 to 4096: give for example 128"),
+        ({"depth_range": [0.9, 0.4]}, "the depth range is 0.9 0.4"),
+        ({"fit": "perhaps"}, "has fit = 'perhaps', which cannot be"),
+        ({"weights": {"name": "bunny"}}, "has 'weights', which is no option"),
+        ({"command": "train"}, "has options of `mereo train`, not of `mereo reconstruct`"),
+        ([1, 2], "is no file of options; it must name each with its value"),
+        ("{", "is no file of options (Expecting property name"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_one_sentence(
+    content: Any, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, content)
+    out = tmp_path / "out"
+    assert (
+        command_line.main(["reconstruct", "a.ply", "--weights", "w", "--output", str(out), "--config", str(path)]) == 2
+    )
+    said = capsys.readouterr().err
+    assert sentence in said and said.count("\n") == 1 and not out.exists(), said
+
+
+def test_a_file_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line.main(["learn", "a.stl", "--output", "out", "--config", str(tmp_path / "no.json")]) == 2
+    assert "no.json does not exist; --config takes a file of options" in capsys.readouterr().err
+
+
+def test_a_result_is_made_again_from_its_own_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: scene("camera")[1])
+    monkeypatch.chdir(tmp_path)
+    np.save("cloud.npy", scene("camera")[0])
+    line = "reconstruct cloud.npy --weights any --output first --resolution 12 --formats npz --keep-all"
+    assert command_line.main(line.split()) == 0
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert command_line.main(["reconstruct", "--config", "../first/config.json", "--output", "second"]) == 0
+    first, second = tmp_path / "first", tmp_path / "elsewhere/second"
+    assert {path.name for path in first.iterdir()} == {path.name for path in second.iterdir()}
+    assert (first / "config.json").read_text() == (second / "config.json").read_text()
+    assert (first / "labels.npz").read_bytes() == (second / "labels.npz").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_dataset_is_made_again_from_its_own_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = "generate rope --examples 2 --seed 1000001 --test --output first --points 64 --per-segment 8 --workers 1"
+    assert command_line.main(line.split()) == 0
+    assert command_line.main(["generate", "--config", "first/config.json", "--output", "second", "--workers", "1"]) == 0
+    for name in ("shard-00000.safetensors", "config.json", "manifest.json"):
+        assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()

@@ -1,0 +1,137 @@
+"""Progress of long work: one style, on a terminal and off it, with the time to the very end."""
+
+import io
+import re
+import sys
+from collections.abc import Callable
+
+import pytest
+from rich.console import Console
+
+from mereo.io import progress as module
+from mereo.io.progress import duration, progress, tracked
+from mereo.training.config import PRESETS
+from mereo.training.steps_shown import StepsShown, steps_between
+
+
+@pytest.fixture
+def wait(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Let a number of seconds pass, on a clock that only this moves; every step is worth a line."""
+    now = [100.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(module, "LINE_EVERY_S", 0.0)
+
+    def pass_by(seconds: float) -> None:
+        now[0] += seconds
+
+    return pass_by
+
+
+def test_lines_say_stage_rate_and_time_left(wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]) -> None:
+    with progress("generate", 30) as shown:
+        wait(2.0)
+        shown.advance(10)
+        wait(2.0)
+        shown.advance(10, "loss 1.5", tail_s=100.0)
+    printed = capsys.readouterr()
+    assert printed.out == "", "results alone are on standard output"
+    assert printed.err.splitlines() == [
+        "generate: 10 of 30 examples, 5.0 examples/s, 4 s left",
+        "generate: 20 of 30 examples, 5.0 examples/s, 2 min left, loss 1.5",
+        "generate: 20 examples in 4 s",
+    ]
+
+
+def test_lines_come_now_and_then(
+    wait: Callable[[float], None], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "LINE_EVERY_S", 10.0)
+    for _ in tracked("evaluate", 24, "views"):
+        wait(1.0)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(" of")[0] for line in lines] == [
+        "evaluate: 10",
+        "evaluate: 20",
+        "evaluate: 24 views in 24 s",
+    ]
+
+
+def test_a_machine_that_becomes_slow_shows_in_the_rate(
+    wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress("train", 10_000, "steps", each=6) as shown:
+        for seconds in [1.0] * 200 + [10.0] * 10:
+            wait(seconds)
+            shown.advance()
+    lines = capsys.readouterr().err.splitlines()
+    fast, slow = lines[150], lines[-2]
+    assert ", 6.0 examples/s, " in fast and ", 0.6 examples/s, 27 h 12 min left" in slow
+
+
+def test_pauses_count_for_the_end_and_not_for_the_rate(
+    wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress("train", 4, "steps", each=2) as shown:
+        wait(1.0)
+        shown.advance()
+        with shown.paused():
+            wait(50.0)
+        wait(1.0)
+        shown.advance()
+    *_, last, end = capsys.readouterr().err.splitlines()
+    assert last == "train: 2 of 4 steps, 2.0 examples/s, 2 s left" and end == "train: 2 steps in 52 s"
+
+
+def test_a_failure_is_not_called_done_and_nothing_to_do_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match="broken"), progress("generate", 3) as shown:
+        shown.advance()
+        raise ValueError("broken")
+    for _ in tracked("evaluate", 0, "views"):
+        pass
+    for _ in tracked("evaluate", 2, "views", quiet=True):
+        pass
+    assert capsys.readouterr().err == ""
+
+
+def test_a_terminal_gets_a_bar_and_what_is_printed_stays_above_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = io.StringIO()
+    monkeypatch.setattr(
+        module, "Console", lambda **_: Console(file=drawn, force_terminal=True, width=100, legacy_windows=False)
+    )
+    with progress("generate", 4) as shown:
+        shown.advance(2)
+        print("a result", file=sys.stdout)
+        shown.advance(2)
+    assert re.search(r"generate.*━.*4 of 4 examples, .* examples/s, 0 s left", drawn.getvalue())
+    assert "a result" not in drawn.getvalue() and capsys.readouterr().out == "a result\n", "it may go into a file"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (89, "89 s"), (91, "2 min"), (7100, "118 min"), (7300, "2 h 02 min")]
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def test_time_left_of_a_training_has_all_that_is_to_be_scored(
+    wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Steps of 2 s, 20 validations of 32 answers and 1000 for the offsets, 0.1 s each as the first ones took."""
+    config, total = PRESETS["tiny"], 200
+    shown = StepsShown(config, total, 32)
+    with shown.showing(0):
+        for step in range(1, 31):
+            wait(2.0)
+            shown.took(step, 1.0)
+            if step % steps_between(total) == 0:
+                with shown.apart(32):
+                    wait(3.2)
+    lines = capsys.readouterr().err.splitlines()
+    # before the first scores: half of a step's time for an example
+    assert lines[0].endswith(f", {duration(199 * 2 + (20 * 32 + 1000) * 2 / 32 / 2)} left, loss 1.0000")
+    assert lines[-2].endswith(f", {duration(170 * 2 + (18 * 32 + 1000) * 0.1)} left, loss 1.0000"), "one is just due"
