@@ -41,8 +41,9 @@ class Case:
 def boundaries(calls: list[str], every_call: bool) -> list[tuple[int, bool]]:
     """Sample of the moments at which a command is killed: the number of a call, and whether just after it.
 
-    With ``every_call`` before and after the first call of each kind (function and name, but for the numbers in it), and
-    after every third (``RARELY``) of the others that give a file its name; otherwise just after each of ``calls``.
+    With ``every_call`` just after the first call of each kind (function and name, but for the numbers in it), before it
+    too where it gives a file its name, and after every third (``RARELY``) further one that does; otherwise just after
+    each of ``calls``.
     """
     if not every_call:
         return [(number, True) for number in range(len(calls))]
@@ -50,8 +51,10 @@ def boundaries(calls: list[str], every_call: bool) -> list[tuple[int, bool]]:
     for number, call in enumerate(calls):
         function, place = call.split(" ", 1)
         first.setdefault(f"{function} {re.sub('[0-9a-f]{8}|[0-9]+', '0', Path(place).name)}", number)
-    moves = [n for n, call in enumerate(calls) if n not in first.values() and call.split(" ", 1)[0] in MOVES]
-    return [(n, after) for n in first.values() for after in (False, True)] + [(n, True) for n in moves[::RARELY]]
+    moves = [number for number, call in enumerate(calls) if call.split(" ", 1)[0] in MOVES]
+    further = [number for number in moves if number not in first.values()][::RARELY]
+    before = [(number, False) for number in first.values() if number in moves]
+    return [*before, *((number, True) for number in (*first.values(), *further))]
 
 
 def check_boundaries(commands: Commands, case: Case, inputs: Path, folder: Path, *, every_call: bool) -> None:
