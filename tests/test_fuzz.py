@@ -30,8 +30,9 @@ COUNT = 60
 """Inputs of a kind in the fast test."""
 
 DEAR = {
-    "bar.yaml": 12,
-    "left.stl": 12,
+    "bar.yaml": 10,
+    "left.stl": 6,
+    "truth.json": 12,
     "weights.safetensors": 4,
     "checkpoint.safetensors": 20,
     "states.safetensors": 30,
@@ -76,7 +77,7 @@ def test_documents_with_another_value_somewhere(name: str, tmp_path_factory: pyt
     whole = load(name, path.read_text(encoding="utf-8"))
     names = (path.parent.name,) if target.folder else ()
 
-    @settings(max_examples=8 if name == "bar.yaml" else 40, deadline=None, database=None, derandomize=True,
+    @settings(max_examples=8 if name in DEAR else 30, deadline=None, database=None, derandomize=True,
               suppress_health_check=list(HealthCheck))  # fmt: skip
     @given(st.sampled_from(list(places(whole))), VALUES | st.just(...))
     def holds(place: tuple[str | int, ...], value: Any) -> None:
