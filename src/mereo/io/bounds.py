@@ -146,7 +146,7 @@ def _is_number(value: object, kind: type) -> bool:
 
 
 def _text(value: object) -> str:
-    text = " ".join(map(str, value)) if isinstance(value, tuple) else repr(value)
+    text = " ".join(map(repr, value)) if isinstance(value, tuple) else repr(value)
     return text if len(text) <= 60 else f"{text[:60]}..."
 
 
