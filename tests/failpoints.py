@@ -26,6 +26,10 @@ CALLS = {**MOVES, "mkdir": "os.mkdir", "unlink": "os.remove", "remove": "os.remo
 """All functions that change what is in a folder, but for opening a new file."""
 
 
+NETWORKS = ("train", "reconstruct", "evaluate", "export")
+"""Commands that load torch's compiler, whether they compile or not."""
+
+
 @dataclass(frozen=True)
 class Ended:
     """End of a command: its exit code (minus the signal), what it said, and the calls that it made, by function."""
@@ -71,7 +75,6 @@ def _serve() -> None:
     import matplotlib.pyplot  # noqa: F401 (loaded before the forks, as all that takes long)
     import scipy.interpolate  # noqa: F401
     import torch
-    import torch._dynamo  # 800 modules, for any forward pass that is decorated
     from toy_data import make_small_datasets
 
     import mereo.__main__ as command_line
@@ -91,6 +94,8 @@ def _serve() -> None:
     traced = list[onnx_export.Graphs]()
     for line in sys.stdin:
         asked = json.loads(line)
+        if asked["arguments"][0] in NETWORKS:
+            import torch._dynamo  # 800 modules
         if asked["arguments"][0] == "export" and not traced:  # seconds of work that write nothing, of one network
             traced.append(onnx_export.export_graphs(load_model(asked["arguments"][1])))
             onnx_export.export_graphs = lambda _: traced[0]
