@@ -3,10 +3,10 @@
     python benchmarks/soak.py --minutes 120 --output out/soak
 
 The stream watches a folder in which the same few frames are written again and again; a client of the viewer opens its
-page, waits for the first message of the scene and leaves. All is on this machine's loopback address, at the given rates
-and for the given time, and the disk holds as much at the end as at the start. It writes soak.csv (a row for each
-command and interval) and soak.png, and prints for each command its memory, how much it grows by the hour (a line
-through the second half) and its latencies. Linux only: memory is read from /proc.
+page, waits for the first message of the scene and leaves it open until so many others are (--held). All is on this
+machine's loopback address, at the given rates and for the given time, and the disk holds as much at the end as at the
+start. It writes soak.csv (a row for each command and interval) and soak.png, and prints for each command its memory,
+how much it grows by the hour (a line through the second half) and its latencies. Linux only: memory is read from /proc.
 """
 
 import argparse
@@ -21,10 +21,12 @@ import sys
 import tempfile
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -116,8 +118,11 @@ def read_answers(watched: Watched) -> None:
         watched.latencies.put(json.loads(line)["latency_ms"] / 1e3)
 
 
-def page_opener(watched: Watched) -> Callable[[int], None]:
-    """Work that opens the viewer's page as a browser does, and leaves at the first message of the scene."""
+def page_opener(watched: Watched, held: int) -> Callable[[int], None]:
+    """Work that opens the viewer's page as a browser does, and leaves the oldest where more than ``held`` are open.
+
+    Pages that overlap are the harder test: what belongs to a page that was open for long is collected late.
+    """
     import viser
     from websockets.sync.client import connect
 
@@ -127,14 +132,17 @@ def page_opener(watched: Watched) -> Callable[[int], None]:
             break
     else:
         raise RuntimeError("mereo view has ended before it said its address")
-    address = f"127.0.0.1:{found[1]}"
+    address, pages = f"127.0.0.1:{found[1]}", deque[Any]()
 
     def open_page(_: int) -> None:
         start = time.perf_counter()
         protocol = [f"viser-v{viser.__version__}"]
-        with connect(f"ws://{address}", origin=f"http://{address}", subprotocols=protocol, max_size=None) as page:
-            page.recv(timeout=60)
-            watched.latencies.put(time.perf_counter() - start)
+        page = connect(f"ws://{address}", origin=f"http://{address}", subprotocols=protocol, max_size=None)
+        page.recv(timeout=60)
+        watched.latencies.put(time.perf_counter() - start)
+        pages.append(page)
+        if len(pages) > held:
+            pages.popleft().close()
 
     return open_page
 
@@ -150,7 +158,7 @@ def soak(options: argparse.Namespace) -> list[Watched]:
         command("view", "--weights", options.weights, "--port", "0", "--resolution", "48") as view,
     ):
         both = [Watched("mereo stream", stream), Watched("mereo view", view)]
-        opener = page_opener(both[1])
+        opener = page_opener(both[1], options.held)
         for target, arguments in (
             (read_answers, (both[0],)),
             (every, (1 / options.rate, end, write_frames(Path(folder), options.weights))),
@@ -206,6 +214,7 @@ def main() -> None:
     parser.add_argument("--interval", type=float, default=10.0, help="seconds between two rows")
     parser.add_argument("--rate", type=float, default=2.0, help="frames per second that are written, at most 30")
     parser.add_argument("--pages", type=float, default=0.5, help="pages per second that are opened, at most 10")
+    parser.add_argument("--held", type=int, default=20, help="pages that are open at the same time, at most 200")
     parser.add_argument("--weights", default="rope", help="shipped weights that come with a frame")
     parser.add_argument("--resolution", type=int, default=32)
     parser.add_argument("--output", type=Path, default=Path("out/soak"), help="folder for soak.csv and soak.png")
@@ -213,6 +222,8 @@ def main() -> None:
     options = parser.parse_args()
     if not (0 < options.minutes <= 10_000 and 0 < options.rate <= 30 and 0 < options.pages <= 10):
         parser.error("--minutes is up to 10000, --rate up to 30 and --pages up to 10, and none is 0")
+    if not (0 <= options.held <= 200):
+        parser.error("--held is from 0 to 200")
     places = [options.output / name for name in ("soak.csv", "soak.png")]
     for place in places:
         check_file_place(place, force=options.force)

@@ -4,6 +4,7 @@ A refusal is an error that the command line knows as its user's (exit code 2), w
 file. Nothing is written. What else comes out is a fault of mereo.
 """
 
+import faulthandler
 import os
 import resource
 import signal
@@ -48,7 +49,7 @@ class Fault:
 
 @contextmanager
 def limits(seconds: float = MOST_SECONDS, gigabytes: float = MOST_GB) -> Iterator[None]:
-    """Let a block have so much time and so much more memory than there is now."""
+    """Let a block have so much time and so much more memory than there is now; after thrice the time all ends."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     pages = Path("/proc/self/statm")
     if pages.exists():
@@ -56,9 +57,11 @@ def limits(seconds: float = MOST_SECONDS, gigabytes: float = MOST_GB) -> Iterato
         resource.setrlimit(resource.RLIMIT_AS, (now + int(gigabytes * 1e9), hard))
     before = signal.signal(signal.SIGALRM, _stop)
     signal.setitimer(signal.ITIMER_REAL, seconds)
+    faulthandler.dump_traceback_later(3 * seconds, exit=True)  # where a library holds up the signal for ever
     try:
         yield
     finally:
+        faulthandler.cancel_dump_traceback_later()
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

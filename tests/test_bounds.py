@@ -134,6 +134,7 @@ def test_settings_of_a_file_have_the_types_of_their_fields() -> None:
         ("encode_positions", 1, "true or false"),
         ("width", "64", "a whole number, from 1 to 8192"),
         ("mlp1", 64, "whole numbers, each from 1 to 8192"),
+        ("mlp1", (64, "64 \n"), "whole numbers, each from 1 to 8192"),
     ):
         with pytest.raises(ValueError, match=f"network.{name} is .*; it must be {rule}"):
             NetworkConfig.from_dict({name: value})

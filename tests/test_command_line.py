@@ -159,27 +159,6 @@ def test_wrong_shard_is_explained(shard: str) -> None:
         commands.part_of(shard)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "paint",
-        "scene",
-        "train",
-        "train data --output run --preset huge",
-        "generate rope --examples many --output out",
-        "generate rope --examples 1 --output out --sampler dense",
-        "reconstruct scan.ply --weights bunny --output out --frame world",
-    ],
-)
-def test_wrong_usage_exits_with_2(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        command_line.parse(text.split())
-    assert caught.value.code == 2
-    printed = capsys.readouterr()
-    assert "--help" in printed.out + printed.err
-    assert "Traceback" not in printed.err
-
-
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 

@@ -26,12 +26,13 @@ from mereo import __main__ as command_line
 
 SEED = int(os.environ.get("MEREO_FUZZ_SEED", "0"))
 MINUTES = float(os.environ.get("MEREO_FUZZ_MINUTES", "30"))
-COUNT = 60
+COUNT = 45
 """Inputs of a kind in the fast test."""
 
 DEAR = {
-    "bar.yaml": 12,
-    "left.stl": 12,
+    "bar.yaml": 8,
+    "left.stl": 4,
+    "truth.json": 6,
     "weights.safetensors": 4,
     "checkpoint.safetensors": 20,
     "states.safetensors": 30,
@@ -76,7 +77,7 @@ def test_documents_with_another_value_somewhere(name: str, tmp_path_factory: pyt
     whole = load(name, path.read_text(encoding="utf-8"))
     names = (path.parent.name,) if target.folder else ()
 
-    @settings(max_examples=8 if name == "bar.yaml" else 40, deadline=None, database=None, derandomize=True,
+    @settings(max_examples=8 if name in DEAR else 20, deadline=None, database=None, derandomize=True,
               suppress_health_check=list(HealthCheck))  # fmt: skip
     @given(st.sampled_from(list(places(whole))), VALUES | st.just(...))
     def holds(place: tuple[str | int, ...], value: Any) -> None:

@@ -44,6 +44,10 @@ def at(place: int, piece: bytes) -> Callable[[bytes], bytes]:
     return lambda content: content[:place] + piece + content[place + len(piece) :]
 
 
+def without_focal_length(content: bytes) -> bytes:
+    return content.replace(struct.pack("<d", 10.0), struct.pack("<d", np.nan))
+
+
 def json_with(**values: object) -> Callable[[bytes], bytes]:
     return lambda content: json.dumps(json.loads(content) | values).encode()
 
@@ -65,6 +69,24 @@ def changed_box(content: bytes) -> bytes:
     return json.dumps(facts).encode()
 
 
+def pair_at_infinity(content: bytes) -> bytes:
+    """Finite as it is written, but not its products: LAPACK's decomposition of these never ended."""
+    facts = json.loads(content)
+    facts["object"]["scan"][3][0] = 1e308
+    return json.dumps(facts).encode()
+
+
+def labels_of_infinity(content: bytes) -> bytes:
+    nibabel = pytest.importorskip("nibabel")
+    return bytes(nibabel.Nifti1Image(np.full((4, 4, 4), np.inf, "f4"), np.eye(4)).to_bytes())
+
+
+def of_python_2(content: bytes) -> bytes:
+    """An array whose header has a long integer of Python 2, of which numpy warns; the others are missing."""
+    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1L,), }\n"
+    return npz(**{"depth.npy": npy(header) + bytes(8)})
+
+
 EMPTY = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (2147483647, 0, 3), }\n")
 CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
@@ -82,6 +104,11 @@ CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "a unit below zero": ("manifest.json", json_with(unit_m=-1), "its 'unit_m': Input should be"),
     "another model": ("state.json", json_with(model="0" * 64), "state.json does not lead to a registration: "),
     "a pose that no rotation fits": ("start.json", json_with(object=np.ones((4, 4)).tolist()), "start.json cannot"),
+    "a point at infinity": ("start.json", pair_at_infinity, "scan of the start of the object must be rows of 3 finite"),
+    "a cloud as wide as numbers": ("cloud.npy", lambda c: npy_of(np.full((40, 3), 1e300)), "or beyond 1e.12"),
+    "a camera of no size": ("frames.mcap", without_focal_length, "is no camera .focal"),
+    "labels beyond all numbers": ("labels.nii", labels_of_infinity, "holds values that are no labels"),
+    "arrays as of Python 2": ("view.npz", of_python_2, "view.npz is not a sample view of mereo"),
     "a run whose recipe is a number": ("config.json", json_with(train=3), "holds no settings of a training"),
     "a score that is a word": ("metrics.json", json_with(iou="high"), "metrics.json is not what .*'iou': Input should"),
     "scores of nothing": ("metrics.json", lambda c: c.replace(b"examples", b"e"), "says neither its scans nor its"),

@@ -97,6 +97,11 @@ MIRROR = POSE @ np.diag([-1.0, 1, 1, 1])
         ({"object": np.diag([1.0, 2, 1, 1]).tolist()}, None, "shears or stretches"),
         ({"object": POSE.T.tolist()}, SCALE, "has the last row .*; it must be 0 0 0 1: is it transposed?"),
         ({"object": POSE[:3].tolist()}, SCALE, "the start of the object must be 4 rows of 4 finite numbers"),
+        (
+            {"object": {"model": SPREAD.tolist(), "scan": (1e300 * SPREAD).tolist()}},
+            SCALE,
+            "finite numbers up to 1e.12",
+        ),
         ({"object": [[float("nan")] * 4] * 4}, SCALE, "the start of the object must be 4 rows of 4 finite numbers"),
     ],
 )

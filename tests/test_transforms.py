@@ -35,6 +35,12 @@ def test_a_fit_of_noisy_pairs_is_the_one_of_scipy_and_nothing_near_it_is_better(
         assert error(rigid(turn, rng.normal(size=3) * 0.01) @ found) > error(found)
 
 
+def test_a_fit_of_points_whose_products_are_infinite_ends() -> None:
+    points = np.diag([1e300, 1.0, 1.0])
+    with np.errstate(over="ignore"), pytest.raises(ValueError, match="so far apart that their products are"):
+        fit_rigid(points, points)
+
+
 def test_a_weight_is_a_number_of_repetitions(rng: np.random.Generator) -> None:
     source, target, times = rng.normal(size=(6, 3)), rng.normal(size=(6, 3)), np.array([1, 0, 3, 2, 1, 5])
     weighted = fit_rigid(source, target, times.astype(float))

@@ -1,10 +1,12 @@
 """`mereo view`: its pages in a real browser, and its command."""
 
+import gc
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import urllib.request
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -20,7 +22,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.training.config import PRESETS
-from mereo.visualization.viewer import display, html
+from mereo.visualization.viewer import display, html, serve
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
@@ -111,6 +113,38 @@ def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object)
         assert answer.status == 200
     with pytest.raises(OSError, match=f"port {port} is taken or not allowed; choose another one with --port"):
         display.start_server(port, "mereo")
+
+
+@needs_viser
+def test_pages_that_were_closed_leave_nothing_behind(server: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    from viser import __version__ as version
+    from websockets.asyncio.server import ServerConnection
+    from websockets.sync.client import connect
+
+    def connections() -> int:
+        return sum(type(known) is ServerConnection for known in gc.get_objects())
+
+    monkeypatch.setattr(serve, "COLLECT_EVERY_S", 0.05)
+    address = f"127.0.0.1:{server.get_port()}"  # type: ignore[attr-defined]
+    end = threading.Event()
+    keeper = threading.Thread(target=serve.keep_open, args=(end,))
+    gc.collect()
+    gc.disable()  # or some of the pages might be collected by chance
+    try:
+        frozen, before = gc.get_freeze_count(), connections()
+        for _ in range(12):
+            with connect(f"ws://{address}", origin=f"http://{address}", subprotocols=[f"viser-v{version}"]) as page:
+                page.recv(timeout=20)
+        assert connections() >= before + 6
+        keeper.start()
+        until(lambda: connections() <= before)
+        assert gc.get_freeze_count() > frozen
+        end.set()
+        keeper.join(20)
+    finally:
+        gc.enable()
+        end.set()
+    assert gc.get_freeze_count() == 0
 
 
 @needs_viser

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,11 @@ CASES = {
     ),
     "scene preview": Case("scene preview rope --output out.png", again="--force"),
     "scene modes": Case("scene modes INPUTS/tiny.safetensors --output out.png", again="--force"),
-    "scene check": Case("scene check out.yaml --repair", first="scene new INPUTS/open.ply --output out.yaml"),
+    "scene check": Case(
+        "scene check out.yaml --repair",
+        again="move or remove it",
+        first="scene new INPUTS/open.ply --output out.yaml",
+    ),
     "export": Case("export INPUTS/tiny.safetensors --output out --format torch", again="--force", dear=True),
 }
 
@@ -119,6 +124,8 @@ def check_full_disk(commands: Commands, case: Case, inputs: Path, place: Path, r
         after = {name: after[name] for name in before}
     assert after == before
     assert not list(place.rglob("*.partial"))
+    if case.only_once:
+        return
     done = commands.run(place, arguments)
     if done.code:
         assert case.again and case.again in done.said, done.said
@@ -138,6 +145,13 @@ def test_a_full_disk_is_said_and_leaves_nothing(name: str, commands: Commands, i
 def test_whatever_room_a_disk_has(name: str, room: int, commands: Commands, inputs: Path, small_disk: Path) -> None:
     """No room at all, and some for folders, locks and the smallest files."""
     check_full_disk(commands, CASES[name], inputs, small_disk, room)
+
+
+@pytest.mark.slow
+def test_a_disk_that_has_no_room_for_an_onnx_graph(commands: Commands, inputs: Path, small_disk: Path) -> None:
+    pytest.importorskip("onnxscript", reason="the extra onnx is not installed")
+    arguments = CASES["export"].arguments.replace("torch", "onnx")
+    check_full_disk(commands, replace(CASES["export"], arguments=arguments, only_once=True), inputs, small_disk, 8_192)
 
 
 # --- every call -------------------------------------------------------------------------------------------------------

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from failpoints import MOVES, Commands
 
+from mereo.io.scratch_folders import LOCK
+
 FOREIGN = ("thesis.tex", ".out.mine.partial/mine.txt", ".out.00000000.partial/mine.txt")
 """Files of somebody else beside an output, two in folders that look like mereo's own."""
 
@@ -29,6 +31,7 @@ class Case:
         timed: files that hold durations.
         first: a command that writes the result which this one replaces.
         dear: it takes seconds, so it is killed less often.
+        only_once: it takes so long that it is not repeated after a full disk.
     """
 
     arguments: str
@@ -36,22 +39,36 @@ class Case:
     timed: tuple[str, ...] = ()
     first: str = ""
     dear: bool = False
+    only_once: bool = False
 
 
 def boundaries(calls: list[str], every_call: bool) -> list[tuple[int, bool]]:
     """Sample of the moments at which a command is killed: the number of a call, and whether just after it.
 
-    With ``every_call`` before and after the first call of each kind (function and name, but for the numbers in it), and
-    after every third (``RARELY``) of the others that give a file its name; otherwise just after each of ``calls``.
+    With ``every_call`` just after the first call of each kind, just before the first of each function that gives a file
+    its name, and after every third (``RARELY``) further one of those; otherwise just after each of ``calls``. Just
+    before another is what just after the one before it is, but for a scratch folder.
     """
     if not every_call:
         return [(number, True) for number in range(len(calls))]
-    first: dict[str, int] = {}
-    for number, call in enumerate(calls):
-        function, place = call.split(" ", 1)
-        first.setdefault(f"{function} {re.sub('[0-9a-f]{8}|[0-9]+', '0', Path(place).name)}", number)
-    moves = [n for n, call in enumerate(calls) if n not in first.values() and call.split(" ", 1)[0] in MOVES]
-    return [(n, after) for n in first.values() for after in (False, True)] + [(n, True) for n in moves[::RARELY]]
+    functions, kinds, further = dict[str, int](), dict[str, int](), list[int]()
+    for number, (function, place) in enumerate(call.split(" ", 1) for call in calls):
+        kind = f"{function} {_kind(function, Path(place))}"
+        if kinds.setdefault(kind, number) != number and function in MOVES:
+            further.append(number)
+        if function in MOVES:
+            functions.setdefault(function, number)
+    before = [(number, False) for number in functions.values()]
+    return [*before, *((number, True) for number in (*kinds.values(), *further[::RARELY]))]
+
+
+def _kind(function: str, place: Path) -> str:
+    """What makes two calls the same: the name that a file gets but for its numbers; of others only what it is."""
+    if function in MOVES:
+        return re.sub("[0-9a-f]{8}|[0-9]+", "0", place.name)
+    if place.is_absolute():
+        return "what is not mereo's, such as a cache of torch"
+    return place.suffix if place.suffix == ".partial" else "lock" if place.name == LOCK else "file or folder"
 
 
 def check_boundaries(commands: Commands, case: Case, inputs: Path, folder: Path, *, every_call: bool) -> None:

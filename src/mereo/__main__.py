@@ -6,8 +6,9 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping
-from contextlib import redirect_stderr, suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import field, make_dataclass
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
@@ -21,6 +22,7 @@ from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.learn import LearnCommand
 from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
+from mereo.cli.usage import noted_events, usage_sentence
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import use_threads
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
@@ -53,6 +55,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"mereo {version()}")
         return 0
     warnings.formatwarning = _warning_line
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal that lacks a character gets another one, and no error
+        sys.stdout.reconfigure(errors="replace")
     try:
         with stop_signals():
             command = parse(arguments)
@@ -112,24 +116,36 @@ def _stop(message: str, code: int) -> int:
 
 
 def parse(arguments: list[str]) -> Command:
-    """Command that these arguments mean; exits with 2 after a message when they mean none.
+    """Command that these arguments mean; exits with 0 after a help that they ask for.
 
-    Raises ``ValueError`` for settings that are refused, such as a number out of its bounds.
+    Raises ``ValueError`` for arguments that mean none, and for settings that are refused, such as a number out of its
+    bounds.
     """
     said = io.StringIO()
-    try:
-        with redirect_stderr(said):
-            command = _read(arguments)
-    except SystemExit as end:
-        refused = end.__context__
-        while refused is not None and not (isinstance(refused, ValueError) and is_foreseen(refused)):
-            refused = refused.__context__
-        if refused is not None:  # tyro frames the sentence of our own settings; it is enough by itself
-            raise refused from None
-        print(said.getvalue(), end="", file=sys.stderr)
-        raise
+    with noted_events() as events:
+        try:
+            with redirect_stderr(said):
+                command = _read(arguments)
+        except SystemExit as end:
+            if not end.code:
+                raise
+            refused = end.__context__
+            while refused is not None and not (isinstance(refused, ValueError) and is_foreseen(refused)):
+                refused = refused.__context__
+            if refused is None:
+                refused = ValueError(usage_sentence(arguments, events, said.getvalue(), _help))
+            raise refused from None  # tyro frames what it says; the sentence is enough by itself
     check_bounds(command, "--")
     return command
+
+
+@cache
+def _help(*words: str) -> str:
+    """Help on the command of these words."""
+    said = io.StringIO()
+    with redirect_stdout(said), suppress(SystemExit):
+        _read([*words, "--help"])
+    return said.getvalue()
 
 
 def _read(arguments: list[str]) -> Command:

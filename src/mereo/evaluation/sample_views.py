@@ -12,7 +12,7 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.labels import LabelGrid
 from mereo.io.atomic_files import atomic_file
-from mereo.io.errors import reason
+from mereo.io.errors import quiet, reason
 from mereo.io.size_limits import read_arrays
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
@@ -95,7 +95,8 @@ def load_view(name: str | Path) -> SampleView:
         known = ", ".join(shipped_views()) or "none"
         raise FileNotFoundError(f"there is no sample view {str(name)!r}; give a .npz file or a shipped name: {known}")
     try:
-        return _view_of(read_arrays(path))
+        with quiet():
+            return _view_of(read_arrays(path))
     except MemoryError:
         raise
     except Exception as error:  # whatever a damaged archive makes of zlib, tokenize and numpy

@@ -8,6 +8,10 @@ MIN_POINTS = 32
 """Fewer observed points say too little about an object: they are refused, drawn again, or left as they were."""
 
 
+LARGEST = 1e12
+"""Coordinate in any unit that is beyond every scan; products of larger ones may be infinite."""
+
+
 CloudAxes = Literal["camera", "scanner"]
 """Axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner."""
 

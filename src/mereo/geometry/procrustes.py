@@ -6,7 +6,7 @@ A motion is ``y = R x + t``. Notation: n points, s sets of points; ``T_a_b`` map
 import numpy as np
 from jaxtyping import Float
 
-from mereo.geometry.transforms import fit_rigid
+from mereo.geometry.transforms import finite_svd, fit_rigid
 
 ROUNDS = 20
 """Rounds of reweighting in ``robust_rigid``; it has converged by then."""
@@ -14,7 +14,7 @@ ROUNDS = 20
 
 def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray, "*s 3 3"]:
     """Rotations R that maximize ``trace(R H)`` for ``H = sum_i x_i y_i^T``, centred: they bring x onto y (Kabsch)."""
-    left, _, right = np.linalg.svd(covariance)
+    left, _, right = finite_svd(covariance)
     proper = np.sign(np.linalg.det(left) * np.linalg.det(right))
     left = left.copy()
     left[..., 2] *= np.where(proper == 0, 1.0, proper)[..., None]

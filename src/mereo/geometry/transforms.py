@@ -48,6 +48,19 @@ def look_at(
     return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)
 
 
+def finite_svd(
+    matrix: Float[np.ndarray, "*b m n"],
+) -> tuple[Float[np.ndarray, "*b m m"], Float[np.ndarray, "*b k"], Float[np.ndarray, "*b n n"]]:
+    """Singular value decomposition ``U, S, V^T`` of numpy, which for some matrices with an infinity never returns.
+
+    Raises ``ValueError`` for a matrix that is not finite.
+    """
+    if not np.isfinite(matrix).all():
+        raise ValueError("points are infinite or so far apart that their products are; scale them to another unit")
+    u, s, v = np.linalg.svd(matrix)
+    return u, s, v
+
+
 def fit_rigid(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> Float[np.ndarray, "4 4"]:
@@ -60,6 +73,6 @@ def fit_rigid(
     """
     middle, aim = (np.average(points, axis=0, weights=weights) for points in (source, target))
     offsets = target - aim if weights is None else weights[:, None] * (target - aim)
-    u, _, v = np.linalg.svd(offsets.T @ (source - middle))
+    u, _, v = finite_svd(offsets.T @ (source - middle))
     rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
     return rigid(rotation, aim - rotation @ middle)

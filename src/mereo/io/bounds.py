@@ -117,6 +117,11 @@ def _kinds(settings: type) -> dict[str, Any]:
     return get_type_hints(settings, include_extras=True)
 
 
+def rule_of(kind: Any) -> str | None:
+    """Rule for the values of an annotated kind: "a whole number, from 1 to 65536"; None where there is none."""
+    return _broken_rule(kind, math.nan)
+
+
 def _broken_rule(kind: Any, value: Any) -> str | None:
     """Rule that a value breaks; None where it breaks none, or its kind has none."""
     if get_origin(kind) is Literal:
@@ -142,7 +147,7 @@ def _is_number(value: object, kind: type) -> bool:
 
 
 def _text(value: object) -> str:
-    text = " ".join(map(str, value)) if isinstance(value, tuple) else repr(value)
+    text = " ".join(map(repr, value)) if isinstance(value, tuple) else repr(value)
     return text if len(text) <= 60 else f"{text[:60]}..."
 
 

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.io.errors import readable
+from mereo.io.errors import quiet, readable
 from mereo.io.size_limits import ENGINES, check_bytes, check_stream
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
@@ -74,7 +74,8 @@ def read_label_volume(path: Path) -> LabelVolume:
         values, transform, names = _nifti(library, path) if nifti else _nrrd(library, path)
     if values.ndim != 3:
         raise ValueError(f"{path} has {values.ndim} dimensions; a label volume has 3: export one label map, not layers")
-    labels = np.rint(values).astype(np.int64)
+    with quiet():  # what becomes of NaN and of numbers beyond all is not what it was
+        labels = np.rint(values).astype(np.int64)
     if not (np.array_equal(labels, values) and labels.min(initial=0) >= 0):
         raise ValueError(f"{path} holds values that are no labels; they must be whole numbers from 0: threshold it")
     return LabelVolume(labels, transform, names)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.conventions import LARGEST
 from mereo.io.depth_formats import DEPTH_READERS, Raw, metres, read_raw_depth
 from mereo.io.errors import readable
 from mereo.io.point_cloud_formats import CLOUD_READERS
@@ -30,8 +31,8 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
         path: the file; its suffix names the format. Arrays are [n, 3] or organized [h, w, 3]; text has x, y, z in its
             first three columns or in the columns its header calls x, y, z; NPZ holds ``points`` or one such array; ZDF
             is Zivid's, in millimetres.
-        drop_invalid: leave out points that are NaN or infinite, and points at exactly (0, 0, 0): sensors mark missing
-            measurements with either.
+        drop_invalid: leave out points that are NaN, infinite or beyond 1e12, and points at exactly (0, 0, 0): sensors
+            mark missing measurements so.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -56,15 +57,17 @@ def valid_points(points: Float[np.ndarray, "n 3"], path: str | Path, drop_invali
     """Points that are measurements; ``path`` says where they come from. Raises as ``read_point_cloud`` does."""
     if len(points) == 0:
         raise ValueError(f"{path} holds 0 points; the object must be visible: check the export")
-    finite = np.isfinite(points).all(axis=1)
+    finite = (np.abs(points) <= LARGEST).all(axis=1)
     usable = finite & (points != 0).any(axis=1)
     lost = len(points) - int(usable.sum())
     if lost == len(points):
         raise ValueError(
-            f"all {lost} points of {path} are NaN, infinite or zero; the object must be visible: record it again"
+            f"all {lost} points of {path} are NaN, infinite, zero or beyond {LARGEST:g}; the object must be visible: "
+            "record it again"
         )
     if lost and not drop_invalid:
-        kind = "NaN or infinite" if not finite.all() else "exactly (0, 0, 0)"
+        beyond = f"beyond {LARGEST:g}" if np.isfinite(points).all() else "NaN or infinite"
+        kind = "exactly (0, 0, 0)" if finite.all() else beyond
         raise ValueError(
             f"{path} has {lost} of {len(points)} points without a measurement ({kind}); all must be finite positions: "
             "leave them out with --drop-invalid"

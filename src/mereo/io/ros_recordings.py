@@ -194,7 +194,16 @@ def _camera(reader: Any, topic: str, path: Path) -> Camera:
     def shared(info: str) -> int:
         return next((i for i, (a, b) in enumerate(zip(info.split("/"), names, strict=False)) if a != b), len(names))
 
-    info = _first(reader, max(infos, key=shared))
+    nearest = max(infos, key=shared)
+    try:
+        return _camera_of(_first(reader, nearest), topic, path)
+    except Exception as error:  # whatever a broken message makes of the parser
+        raise ValueError(
+            f"{path}, {nearest} is no camera ({reason(error)}): give --intrinsics FILE, or record it again"
+        ) from error
+
+
+def _camera_of(info: Any, topic: str, path: Path) -> Camera:
     matrix = getattr(info, "k", None) if hasattr(info, "k") else info.K
     fields: dict[str, Any] = {"width": info.width, "height": info.height, "K": np.asarray(matrix)}
     if "image_rect" in topic:

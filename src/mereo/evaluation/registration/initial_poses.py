@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from mereo.evaluation.registration.placement import Start, scale_of
 from mereo.evaluation.registration.visible_surface import diagonal
-from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.conventions import LARGEST, CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import fit_rigid, inverse_rigid, rigid, transform_points
@@ -111,9 +111,9 @@ def _numbers(value: Any, shape: tuple[int, int], what: str) -> np.ndarray:
     except (ValueError, TypeError):
         array = np.zeros(0)
     fits = array.ndim == 2 and array.shape[1] == shape[1] and shape[0] in (-1, len(array))
-    if not (fits and np.isfinite(array).all()):
+    if not (fits and (np.abs(array) <= LARGEST).all()):
         rows = "4 rows of 4" if shape == (4, 4) else "rows of 3"
-        raise ValueError(f"{what} must be {rows} finite numbers: correct the start file")
+        raise ValueError(f"{what} must be {rows} finite numbers up to {LARGEST:g}: correct the start file")
     return array
 
 

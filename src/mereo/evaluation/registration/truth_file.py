@@ -12,7 +12,7 @@ import numpy as np
 from mereo.evaluation.registration.placement import Placement
 from mereo.evaluation.registration.visible_surface import diagonal, moved
 from mereo.evaluation.scans import PosedScan
-from mereo.geometry.conventions import UNITS_M, CloudAxes
+from mereo.geometry.conventions import LARGEST, UNITS_M, CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import write_json
 from mereo.io.errors import readable
@@ -22,9 +22,6 @@ from mereo.scenes.scene import SCENES, Scene
 
 TRUTH = "truth.json"
 """Name of the file."""
-
-LARGEST = 1e12
-"""Number in any unit that is beyond every scan; products of larger ones may be infinite."""
 
 MOST_CHARACTERS = 1000
 """Length of the scan's name."""

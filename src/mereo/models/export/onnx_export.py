@@ -10,6 +10,7 @@ All coordinates are normalized, the cloud in farthest-point order; ``mereo_onnx.
 does both in numpy. n and q are open: n from the network's own number of points up. See docs/design/0015-export.md.
 """
 
+import io
 import logging
 import shutil
 import warnings
@@ -178,9 +179,11 @@ def _require_onnx() -> None:
 
 def write_torch(graphs: Graphs, directory: Path) -> None:
     """Write ``encoder.pt2`` and ``query.pt2``, for ``torch.export.load``."""
-    with _quiet():
-        torch.export.save(graphs.encoder, directory / "encoder.pt2")
-        torch.export.save(graphs.query, directory / "query.pt2")
+    for name, graph in (("encoder", graphs.encoder), ("query", graphs.query)):
+        content = io.BytesIO()  # torch ends the process where it writes a file itself and the disk is full
+        with _quiet():
+            torch.export.save(graph, content)
+        (directory / f"{name}.pt2").write_bytes(content.getbuffer())
 
 
 @contextmanager
