@@ -11,8 +11,7 @@ from mereo.fitting.answer import Answer, answer
 from mereo.fitting.carry import Carried, Placed, place
 from mereo.fitting.carry import carry as carry_one
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import Registrar, describe, registrar_for
-from mereo.fitting.registration_state import write_state
+from mereo.fitting.register import Registrar, registrar_for
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.attachments import read_attachments
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
@@ -25,7 +24,7 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import files_of
-from mereo.visualization.result_files import write_files
+from mereo.visualization.result import Result
 
 
 def reconstruct_file(
@@ -89,27 +88,16 @@ def reconstruct_file(
             stated_unit=None if registrar is None else registrar.stated_unit(frame.unit_m),
             keep_all=isolation.keep_all,
         )
-        result = found.reconstruction
-        seen = seen.read_as(result.reading)
+        whole = Result.of(found, seen, model, registrar, resolution)
+        result, seen = found.reconstruction, whole.seen
         if result.reading.dropped:
             print(result.reading)
         warning = size_warning(seen, model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
-        facts: dict[str, object] = {
-            "title": frame.source,
-            "weights": str(weights),
-            "resolution": resolution,
-            "points": len(seen.cloud),
-        }
         if registrar is not None:
-            facts["registration"] = facts_of(found)
-        facts |= {"device": model.device.type, "precision": model.working_precision}
-        carried = carried_along(placed, found)
-        if carried:
-            facts["carried"] = [one.facts() for one in carried]
-        write_files(directory, result, seen.cloud, frame.axes, files, frame.unit_m, {**facts, **seen.facts()}, carried)
-        write_state(directory, found, registrar, str(weights), frame.axes, frame.unit_m)
+            print_source(found)
+        whole.write(directory, files, carried_along(placed, found))
     print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {sum(result.timings_s.values()):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return result
@@ -133,19 +121,18 @@ def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...
     return carried
 
 
-def facts_of(found: Answer) -> dict[str, object]:
-    """Facts about where an answer comes from, for the summary; also printed in one line."""
-    source, registration = "registration" if found.taken else "network", found.registration
+def print_source(found: Answer) -> None:
+    """Print where an answer comes from, and whether it can be believed."""
+    registration = found.registration
     if registration is None:
         print(f"the network's answer, as no registration was found: {found.refusal}")
-        return {"answer": source, "refusal": found.refusal}
+        return
     explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
         print("that is too little to believe it: --fit auto keeps the network's answer")
     elif found.taken and registration.doubt is not None:
         print(registration.doubt)
-    return {"answer": source, **describe(registration)}
 
 
 def print_segments(result: Reconstruction, title: str) -> None:

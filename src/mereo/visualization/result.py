@@ -1,0 +1,309 @@
+"""Result of one frame: an answer with what it was given, to be looked at, saved, and opened in the browser.
+
+frame, model -answer-> Result -save-> a folder as of `mereo reconstruct`, or one file
+-show-> a page in the browser
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.fitting import answer as fitting
+from mereo.fitting.answer import Answer
+from mereo.fitting.carry import Carried
+from mereo.fitting.config import FitChoice
+from mereo.fitting.register import Registrar, describe, registrar_for
+from mereo.fitting.registration_state import write_state
+from mereo.geometry.camera import DepthImage, PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.scanner_axes import camera_axes
+from mereo.geometry.transforms import transform_points
+from mereo.io.atomic_files import atomic_file
+from mereo.io.config import DEFAULT_FILES, FilesConfig, Format
+from mereo.io.output_folders import new_directory
+from mereo.io.ros_recordings import is_recording
+from mereo.io.sensor_frame import SensorFrame
+from mereo.io.writers.formats import chosen_formats
+from mereo.models.model import Model
+from mereo.models.weights import load_model
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import Observation, SizeWarning, find_object, size_warning
+from mereo.scenes.scene import Scene
+from mereo.visualization.result_files import write_files, write_one
+from mereo.visualization.result_html import result_html
+from mereo.visualization.units import Unit
+
+if TYPE_CHECKING:
+    from mereo.visualization.viewer.open_page import OpenPage
+
+ARRAY = Path("cloud")
+"""Name of a frame that is no file's."""
+
+SINGLE = (".glb", ".ply", ".npz", ".vti", ".nii.gz", ".seg.nrrd", ".json", ".html", ".png")
+"""Suffixes of the files that ``Result.save`` writes alone."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(Answer):
+    """Answer to one frame with all that it was made from; what it found is as in ``Answer``.
+
+    Attributes:
+        seen: the object in the frame: the points that were taken for its, in the frame's axes and unit.
+        model: the weights.
+        registrar: of the object's own model; None where the network alone was asked.
+        resolution: cells along the longest side of the object's box.
+        unit_stated: whether the metres in the frame's unit were given, by its file or by the caller.
+    """
+
+    seen: Observation = field(kw_only=True)
+    model: Model = field(kw_only=True)
+    registrar: Registrar | None = field(default=None, kw_only=True)
+    resolution: int = field(default=128, kw_only=True)
+    unit_stated: bool = field(default=True, kw_only=True)
+
+    @classmethod
+    def of(
+        cls,
+        found: Answer,
+        seen: Observation,
+        model: Model,
+        registrar: Registrar | None,
+        resolution: int,
+        unit_stated: bool = True,
+    ) -> "Result":
+        """Result of an answer; the arguments are the attributes of the same names, ``seen`` with strays or without."""
+        given = {item.name: getattr(found, item.name) for item in fields(Answer)}
+        return cls(
+            **given,
+            seen=seen.read_as(found.reconstruction.reading),
+            model=model,
+            registrar=registrar,
+            resolution=resolution,
+            unit_stated=unit_stated,
+        )
+
+    @property
+    def unit(self) -> Unit:
+        """Unit of all lengths, for people: by the true size of the registered model, or as it was stated."""
+        if self.taken and self.registration is not None:
+            source = self.registration.model.source_frame
+            if source is not None and source.unit_m is not None:
+                return Unit(source.unit_m / self.registration.scene_unit)
+        return Unit(self.seen.frame.unit_m if self.unit_stated else None)
+
+    def facts(self, carried: Sequence[Carried] = ()) -> dict[str, object]:
+        """What the summary of a folder of results says first."""
+        told: dict[str, object] = {
+            "title": self.seen.frame.source,
+            "weights": self.model.name,
+            "resolution": self.resolution,
+            "points": len(self.seen.cloud),
+        }
+        if self.registrar is not None:
+            told["registration"] = registration_facts(self)
+        told |= {"device": self.model.device.type, "precision": self.model.working_precision}
+        if carried:
+            told["carried"] = [one.facts() for one in carried]
+        return {**told, **self.seen.facts()}
+
+    def write(self, directory: Path, files: FilesConfig = DEFAULT_FILES, carried: Sequence[Carried] = ()) -> None:
+        """Write what `mereo reconstruct` does into a directory that is there."""
+        frame = self.seen.frame
+        facts = self.facts(carried)
+        write_files(directory, self.reconstruction, self.seen.cloud, frame.axes, files, frame.unit_m, facts, carried)
+        write_state(directory, self, self.registrar, self.model.name, frame.axes, frame.unit_m)
+
+    def save(
+        self,
+        path: str | Path,
+        *,
+        formats: Sequence[Format] | None = None,
+        millimetres: bool = False,
+        force: bool = False,
+    ) -> Path:
+        """Write a folder of results as `mereo reconstruct` does, or one file; returns its path.
+
+        Args:
+            path: a folder to create; or a file whose suffix says what it is: .glb, .ply (surfaces), .npz, .vti,
+                .nii.gz, .seg.nrrd (labels), .json (the figures), .html (the report), .png (the preview).
+            formats: files of a folder beside report and preview, as ``--formats``; "points" needs
+                ``answer(..., label_points=True)``.
+            millimetres: write .ply, .vti and other files that have no unit in millimetres, not in the frame's unit.
+            force: replace a folder that mereo wrote, and nothing else is in, or a file that no input is.
+
+        Raises ``FileExistsError`` for what exists, unless ``force`` may replace it; ``ValueError`` for a suffix or a
+        format that there is none of, and ``ImportError`` where a format's extra is missing.
+        """
+        path = Path(path)
+        suffix = file_suffix(path)
+        if suffix == "":
+            files = FilesConfig(DEFAULT_FILES.formats if formats is None else tuple(formats), millimetres)
+            chosen_formats(files.formats)
+            with new_directory(path, force, self._read()) as directory:
+                self.write(directory, files)
+        elif formats is not None:
+            raise ValueError(f"{path} is one file, whose suffix says its format: leave out formats, or name a folder")
+        else:
+            frame = self.seen.frame
+            with atomic_file(path, force=force, inputs=self._read()) as partial:
+                files, facts = FilesConfig((), millimetres), self.facts()
+                cloud = self.seen.cloud
+                write_one(partial, suffix, self.reconstruction, cloud, frame.axes, files, frame.unit_m, facts)
+        return path
+
+    def show(self, *, port: int | None = None, host: str = "127.0.0.1", block: bool | None = None) -> "OpenPage":
+        """Open the viewer on this result, as `mereo view` does, and print its address.
+
+        Args:
+            port: where the page is; by default any that is free.
+            host: address of this machine that the page is at; only this machine reaches the default.
+            block: wait until Ctrl-C; by default everywhere but in a notebook or an interactive session, where the page
+                stays open until ``close()`` of what is returned, which a notebook shows as a frame.
+
+        Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
+        """
+        from mereo.visualization.viewer.serve import view_result
+
+        return view_result(self, port=port or 0, host=host).stay(block)
+
+    def _read(self) -> list[Path]:
+        """Files that this was made from."""
+        places = [self.seen.frame.path, Path(self.model.name)]
+        return [place for place in places if place.is_file() or is_recording(place)]
+
+    def __repr__(self) -> str:
+        segments = self.reconstruction.segments
+        found = f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)} segments"
+        return f"Result({self.seen.frame.source!r}: {found}; {self.source}; {self.reconstruction.seconds:.1f} s)"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the points seen on what was found, from two sides, and the segments in figures."""
+        to_camera = camera_axes(self.seen.frame.axes)
+        points = transform_points(to_camera, self.seen.cloud.points)
+        surfaces = self.reconstruction.surfaces.transformed(to_camera)
+        doubt = self.registration.doubt if self.taken and self.registration is not None else None
+        lines = [self.source, *([] if doubt is None else [doubt])]
+        return result_html(self.seen.frame.source, lines, points, surfaces, self.reconstruction.segments, self.unit)
+
+
+def answer(
+    frame: SensorFrame | Observation | PointCloud | DepthImage | Float[np.ndarray, "n 3"],
+    model: Model | str | Path,
+    fit: FitChoice | Registrar | None = "auto",
+    resolution: int = 128,
+    *,
+    axes: CloudAxes | None = None,
+    unit_m: float | None = None,
+    isolation: IsolationConfig | None = None,
+    scene: Scene | str | None = None,
+    scene_unit: float | None = None,
+    label_points: bool = False,
+) -> Result:
+    """Answer to one frame: the registered model itself where it explains the frame, else the network's surfaces.
+
+    Args:
+        frame: from ``load_frame``; or points on the object or a depth image, any unit and density.
+        model: the weights, or their shipped name or file.
+        fit: "auto" takes the registered model where it explains the frame; "modes" and "full" in any case, full by
+            fitting the draws of the scene as well; "off" leaves the network's answer. Or a registrar of the same
+            object, set up once for many frames.
+        resolution: cells along the longest side of the object's box.
+        axes: of points: "camera" (default) is x right, y down, z forward; "scanner" is y up, z toward the scanner.
+        unit_m: metres per unit of points or of a depth image; believed where the network's own estimate of the size
+            agrees, and found together with the pose without it.
+        isolation: what of the frame is left out; lengths in metres.
+        scene: whose draws are fitted, where it is not the built-in one of the weights.
+        scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
+        label_points: also say on which segment each point of the object lies.
+
+    Warns with ``SizeWarning`` where what is seen cannot be the object. Raises ``ValueError`` for unusable clouds, where
+    nothing is found, for axes or a unit of a frame that states its own, and for other fits than "auto" where the model
+    cannot be registered.
+    """
+    network = model if isinstance(model, Model) else load_model(model)
+    seen, stated = _observed(frame, axes, unit_m, isolation)
+    if isinstance(fit, Registrar):
+        if scene is not None:
+            raise ValueError("both a registrar and a scene are given; a registrar has its own: drop the scene")
+        registrar: Registrar | None = fit
+    else:
+        registrar = registrar_for(network, _choice(fit), scene)
+    found = fitting.answer(
+        seen.cloud,
+        network,
+        registrar,
+        resolution,
+        seen.frame.axes,
+        label_points,
+        scene_unit,
+        None if registrar is None or not stated else registrar.stated_unit(seen.frame.unit_m),
+        keep_all=isolation is not None and isolation.keep_all,
+    )
+    result = Result.of(found, seen, network, registrar, resolution, stated)
+    warning = size_warning(result.seen, network.provenance) if stated else None
+    if warning is not None:
+        warnings.warn(warning, SizeWarning, stacklevel=2)
+    if not stated and result.unit.metres is not None:
+        named = replace(result.seen.frame, unit_m=result.unit.metres)
+        result = replace(result, seen=replace(result.seen, frame=named))
+    return result
+
+
+def _choice(fit: FitChoice | None) -> FitChoice:
+    if fit is not None and fit not in get_args(FitChoice):
+        raise ValueError(f"fit is {fit!r}; it must be one of {', '.join(get_args(FitChoice))}: correct the spelling")
+    return "off" if fit is None else fit
+
+
+def _observed(
+    frame: SensorFrame | Observation | PointCloud | DepthImage | Float[np.ndarray, "n 3"],
+    axes: CloudAxes | None,
+    unit_m: float | None,
+    isolation: IsolationConfig | None,
+) -> tuple[Observation, bool]:
+    """The object in whatever a caller has of a frame, and whether its unit was stated."""
+    if isinstance(frame, SensorFrame | Observation):
+        if axes is not None or unit_m is not None:
+            raise ValueError(
+                "axes or a unit are given for a frame that states its own; give them where it is read: "
+                "mereo.load_frame(..., frame='scanner', unit_m=0.001)"
+            )
+        if isinstance(frame, Observation):
+            return frame, True
+        return find_object(frame, isolation or IsolationConfig()), True
+    if unit_m is not None and not 0 < unit_m < np.inf:
+        raise ValueError(f"the unit is {unit_m} m; it must be positive: give 0.001 for millimetres")
+    if isolation is not None and unit_m is None and isolation != IsolationConfig(keep_all=isolation.keep_all):
+        raise ValueError("isolation is in metres, and the unit of the points is not known: give unit_m")
+    depth = frame if isinstance(frame, DepthImage) else None
+    cloud = frame if isinstance(frame, PointCloud) else None
+    if cloud is None:
+        cloud = depth.to_points() if depth is not None else PointCloud(np.asarray(frame, dtype=np.float64))
+    read = SensorFrame(ARRAY, cloud, 1.0 if unit_m is None else unit_m, axes or "camera", depth)
+    return find_object(read, isolation or IsolationConfig()), unit_m is not None
+
+
+def registration_facts(found: Answer) -> dict[str, object]:
+    """Facts about where an answer comes from, for a summary."""
+    source = "registration" if found.taken else "network"
+    if found.registration is None:
+        return {"answer": source, "refusal": found.refusal}
+    return {"answer": source, **describe(found.registration)}
+
+
+def file_suffix(path: Path) -> str:
+    """Suffix of ``SINGLE`` that a path has, "" for a folder; raises ``ValueError`` for what looks like another file."""
+    for suffix in SINGLE:
+        if path.name.lower().endswith(suffix):
+            return suffix
+    if path.suffix[1:2].isalpha() and not path.is_dir():
+        raise ValueError(
+            f"{path} has the suffix {path.suffix!r}; one file is {', '.join(SINGLE)}: choose one of these, or name a "
+            "folder without a suffix, which takes all formats"
+        )
+    return ""
