@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from mereo.synthesis.config import GenerateConfig as GenerateConfig
     from mereo.synthesis.examples import synthesize as synthesize
     from mereo.training.config import TrainConfig as TrainConfig
+    from mereo.visualization.answering import answer as answer
     from mereo.visualization.result import Result as Result
-    from mereo.visualization.result import answer as answer
     from mereo.visualization.result_files import write_reconstruction as write_reconstruction
     from mereo.visualization.viewer.serve import view as view
 
@@ -60,7 +60,7 @@ _HOME = {
     "Segment": "geometry.mesh",
     "SegmentedMesh": "geometry.mesh",
     "TrainConfig": "training.config",
-    "answer": "visualization.result",
+    "answer": "visualization.answering",
     "evaluate": "learning.steps",
     "export": "learning.steps",
     "generate": "learning.steps",

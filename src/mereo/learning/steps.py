@@ -110,6 +110,7 @@ def evaluate(
     fit: FitChoice = "auto",
     inference: InferenceConfig = EXACT,
     cells: int = scoring.CELLS,
+    progress: bool = True,
 ) -> Evaluation:
     """Scores of weights on test examples of their scene, or on real scans: `mereo evaluate`.
 
@@ -124,6 +125,7 @@ def evaluate(
         fit: whose answer is scored: "auto" what a user gets by default, with all others beside it.
         inference: where and how exactly the network computes, for weights that are loaded here.
         cells: of the grid along each axis, on which answers are compared with the truth; 100 is the paper's.
+        progress: show the time left, where nothing is written.
 
     Raises ``ValueError`` for a training seed, no examples, another object than the model's, and settings with scans,
     which are real; ``FileExistsError`` for an output with content.
@@ -142,7 +144,7 @@ def evaluate(
             loaded, output, examples=examples, seed=seed, scene=place, cells=cells, settings=settings, choice=fit
         )
     return scoring.evaluate(
-        loaded, place, examples=examples, seed=seed, cells=cells, progress=True, settings=settings, choice=fit
+        loaded, place, examples=examples, seed=seed, cells=cells, progress=progress, settings=settings, choice=fit
     )
 
 
