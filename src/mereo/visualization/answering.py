@@ -11,6 +11,7 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Float
 
+from mereo.evaluation.sample_views import load_frame
 from mereo.fitting import answer as fitting
 from mereo.fitting.config import FitChoice
 from mereo.fitting.register import Registrar, registrar_for
@@ -29,7 +30,7 @@ ARRAY = Path("cloud")
 
 
 def answer(
-    frame: SensorFrame | Observation | PointCloud | DepthImage | Float[np.ndarray, "n 3"],
+    frame: SensorFrame | Observation | PointCloud | DepthImage | Float[np.ndarray, "n 3"] | str | Path,
     model: Model | str | Path,
     fit: FitChoice | Registrar | None = "auto",
     resolution: int = 128,
@@ -44,7 +45,8 @@ def answer(
     """Answer to one frame: the registered model itself where it explains the frame, else the network's surfaces.
 
     Args:
-        frame: from ``load_frame``; or points on the object or a depth image, any unit and density.
+        frame: from ``load_frame``, or a file or shipped name for it; or points on the object or a depth image, any unit
+            and density.
         model: the weights, or their shipped name or file.
         fit: "auto" takes the registered model where it explains the frame; "modes" and "full" in any case, full by
             fitting the draws of the scene as well; "off" leaves the network's answer. Or a registrar of the same
@@ -63,7 +65,8 @@ def answer(
     cannot be registered.
     """
     network = model if isinstance(model, Model) else load_model(model)
-    seen, stated = _observed(frame, axes, unit_m, isolation)
+    given = load_frame(frame) if isinstance(frame, str | Path) else frame
+    seen, stated = _observed(given, axes, unit_m, isolation)
     if isinstance(fit, Registrar):
         if scene is not None:
             raise ValueError("both a registrar and a scene are given; a registrar has its own: drop the scene")
