@@ -6,7 +6,7 @@ SensorFrame, points or a depth image -answer-> Result
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import cast, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -94,10 +94,10 @@ def answer(
     return result
 
 
-def _choice(fit: FitChoice | None) -> FitChoice:
+def _choice(fit: str | None) -> FitChoice:
     if fit is not None and fit not in get_args(FitChoice):
         raise ValueError(f"fit is {fit!r}; it must be one of {', '.join(get_args(FitChoice))}: correct the spelling")
-    return "off" if fit is None else fit
+    return cast(FitChoice, fit or "off")
 
 
 def _observed(

@@ -129,8 +129,8 @@ class Result(Answer):
         path = Path(path)
         suffix = file_suffix(path)
         if suffix == "":
-            files = FilesConfig(DEFAULT_FILES.formats if formats is None else tuple(formats), millimetres)
-            chosen_formats(files.formats)
+            wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
+            files = FilesConfig(wanted, millimetres)
             with new_directory(path, force, self._read()) as directory:
                 self.write(directory, files)
         elif formats is not None:
