@@ -2,10 +2,11 @@
 
 The home page is README.md, and CONTRIBUTING.md, CHANGELOG.md and LICENSE are pages too; so that links between them and
 the rest work in the repository as well as here, their targets are rewritten. ``src/mereo`` gives a page for each of its
-folders with all that is public there, and one for each model card.
+folders with all that is public there, and one for each model card. The tour is an executed notebook, ``tour.ipynb``.
 """
 
 import ast
+import importlib.util
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,8 @@ COPIES = {
     "LICENSE": "licence.md",
 }
 """Files of the repository's root, and the pages that they become."""
+
+TOUR = "tour.md"
 
 ASSET = re.compile(r"""<(?:script|img|link|iframe|source)\b[^>]*?\b(?:src|href)=["']?(?:https?:)?//[^>]*>""")
 """What a browser would fetch from another host. Links to follow are not meant, nor the page's own address."""
@@ -51,6 +54,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """The page with links to the tour's page; the repository shows the notebook itself, which the tour offers."""
+    return markdown if page.file.src_uri == TOUR else markdown.replace("](tour.ipynb)", f"]({TOUR})")
+
+
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     """The page as it is; what loads anything from another host is an error."""
     if foreign := ASSET.search(output):
@@ -68,6 +76,18 @@ def _pages() -> Iterator[tuple[str, str]]:
         yield _page_of(package), _reference(package)
     for card in _cards():
         yield f"models/{card.name}", card.read_text()
+    yield TOUR, _tour()
+
+
+def _tour() -> str:
+    """The notebook as a page; ``notebook.py`` beside this file makes it, and MkDocs imports no neighbours of hooks."""
+    spec = importlib.util.spec_from_file_location("notebook", Path(__file__).with_name("notebook.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    text: str = tool.page(tool.read())
+    return text
 
 
 def _from_root(text: str) -> str:

@@ -108,8 +108,7 @@ def test_commands_parse(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
             parse(shlex.split(line, comments=True)[1:])
         except (ValueError, SystemExit) as error:
             if not (isinstance(error, SystemExit) and not error.code):  # printing the completion ends with none
-                pytest.fail(f"{line}
-{error}")
+                pytest.fail(f"{line}\n{error}")
 
 
 def test_imports_in_python_blocks_exist() -> None:

@@ -22,7 +22,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.training.config import PRESETS
-from mereo.visualization.viewer import display, html, serve
+from mereo.visualization.viewer import display, html
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
@@ -124,10 +124,10 @@ def test_pages_that_were_closed_leave_nothing_behind(server: object, monkeypatch
     def connections() -> int:
         return sum(type(known) is ServerConnection for known in gc.get_objects())
 
-    monkeypatch.setattr(serve, "COLLECT_EVERY_S", 0.05)
+    monkeypatch.setattr(open_page, "COLLECT_EVERY_S", 0.05)
     address = f"127.0.0.1:{server.get_port()}"  # type: ignore[attr-defined]
     end = threading.Event()
-    keeper = threading.Thread(target=serve.keep_open, args=(end,))
+    keeper = threading.Thread(target=open_page.keep_open, args=(end,))
     gc.collect()
     gc.disable()  # or some of the pages might be collected by chance
     try:

@@ -12,23 +12,35 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mereo.evaluation.scoring import evaluate as evaluate
-    from mereo.fitting.answer import answer as answer
+    from mereo.evaluation.sample_views import load_frame as load_frame
     from mereo.fitting.register import Registrar as Registrar
     from mereo.geometry.camera import Camera as Camera
     from mereo.geometry.camera import DepthImage as DepthImage
     from mereo.geometry.camera import PointCloud as PointCloud
     from mereo.geometry.mesh import Segment as Segment
     from mereo.geometry.mesh import SegmentedMesh as SegmentedMesh
+    from mereo.io.config import InputConfig as InputConfig
     from mereo.io.intrinsics import read_camera as read_camera
     from mereo.io.readers import read_depth_image as read_depth_image
     from mereo.io.readers import read_point_cloud as read_point_cloud
+    from mereo.learning.steps import evaluate as evaluate
+    from mereo.learning.steps import export as export
+    from mereo.learning.steps import generate as generate
+    from mereo.learning.steps import learn as learn
+    from mereo.learning.steps import train as train
+    from mereo.models.config import InferenceConfig as InferenceConfig
     from mereo.models.model import Model as Model
     from mereo.models.weights import load_model as load_model
+    from mereo.reconstruction.config import IsolationConfig as IsolationConfig
     from mereo.reconstruction.pipeline import reconstruct as reconstruct
     from mereo.scenes.registry import load_scene as load_scene
+    from mereo.synthesis.config import GenerateConfig as GenerateConfig
     from mereo.synthesis.examples import synthesize as synthesize
+    from mereo.training.config import TrainConfig as TrainConfig
+    from mereo.visualization.answering import answer as answer
+    from mereo.visualization.result import Result as Result
     from mereo.visualization.result_files import write_reconstruction as write_reconstruction
+    from mereo.visualization.viewer.serve import view as view
 
 # Here and not where torch is used, because this runs before every import of torch that mereo makes. A thread that spins
 # at a barrier holds the core that the thread it waits for needs: beside other work each barrier may cost a time slice.
@@ -37,13 +49,23 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 _HOME = {
     "Camera": "geometry.camera",
     "DepthImage": "geometry.camera",
+    "GenerateConfig": "synthesis.config",
+    "InferenceConfig": "models.config",
+    "InputConfig": "io.config",
+    "IsolationConfig": "reconstruction.config",
     "Model": "models.model",
     "PointCloud": "geometry.camera",
     "Registrar": "fitting.register",
+    "Result": "visualization.result",
     "Segment": "geometry.mesh",
     "SegmentedMesh": "geometry.mesh",
-    "answer": "fitting.answer",
-    "evaluate": "evaluation.scoring",
+    "TrainConfig": "training.config",
+    "answer": "visualization.answering",
+    "evaluate": "learning.steps",
+    "export": "learning.steps",
+    "generate": "learning.steps",
+    "learn": "learning.steps",
+    "load_frame": "evaluation.sample_views",
     "load_model": "models.weights",
     "load_scene": "scenes.registry",
     "read_camera": "io.intrinsics",
@@ -51,6 +73,8 @@ _HOME = {
     "read_point_cloud": "io.readers",
     "reconstruct": "reconstruction.pipeline",
     "synthesize": "synthesis.examples",
+    "train": "learning.steps",
+    "view": "visualization.viewer.serve",
     "write_reconstruction": "visualization.result_files",
 }
 """Module of each public name, below ``mereo``."""

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from rich.console import Console
 from rich.table import Table
 
-from mereo.cli.reconstruct import facts_of
+from mereo.cli.reconstruct import print_source
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import grid_confusion
@@ -35,6 +35,7 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import Reconstruction, extract, segment_names
 from mereo.scenes.assets import AssetUnavailable
+from mereo.visualization.result import registration_facts
 from mereo.visualization.result_files import write_files
 
 REAL_SCAN = "bun000"
@@ -173,7 +174,8 @@ def _write(case: Case, found: Answer, registrar: Registrar | None, folder: Path)
     if registrar is None:
         print(f"the network's answer: the weights {case.weights!r} carry no statistical model that could be registered")
     else:
-        facts["registration"] = facts_of(found)
+        print_source(found)
+        facts["registration"] = registration_facts(found)
     with new_directory(folder, force=True) as directory:
         write_files(directory, found.reconstruction, case.cloud, case.frame, DEFAULT_FILES, 1.0, facts)
         write_state(directory, found, registrar, case.weights, case.frame, 1.0)

@@ -14,23 +14,22 @@ from mereo.fitting.answer import Answer, answer
 from mereo.fitting.carry import Carried, Placed, place
 from mereo.fitting.carry import carry as carry_one
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import Registrar, describe, registrar_for
-from mereo.fitting.registration_state import write_state
+from mereo.fitting.register import Registrar, registrar_for
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
 from mereo.io.output_folders import new_directory
-from mereo.io.sensor_frame import SensorFrame, read_frame
+from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import Observation, SizeWarning, find_object, size_warning
+from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import files_of
-from mereo.visualization.result_files import write_files
+from mereo.visualization.result import Result
 
 
 @dataclass(frozen=True)
@@ -132,16 +131,18 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> An
             stated_unit=None if job.registrar is None else job.registrar.stated_unit(frame.unit_m),
             keep_all=job.isolation.keep_all,
         )
-        seen = seen.read_as(found.reconstruction.reading)
+        whole = Result.of(found, seen, job.model, job.registrar, job.resolution)
         if found.reconstruction.reading.dropped:
             print(found.reconstruction.reading)
-        warning = size_warning(seen, job.model.provenance)
+        warning = size_warning(whole.seen, job.model.provenance)
         if warning is not None:
             warnings.warn(warning, SizeWarning, stacklevel=2)
-        _write(directory, job, frame, seen, found, placed)
+        if job.registrar is not None:
+            print_source(found)
+        whole.write(directory, job.files, carried_along(placed, found))
         if job.options is not None:
             write_json(directory / CONFIG, {**job.options, "inputs": [str(Path(input).absolute())]})
-    result = found.reconstruction
+    result, seen = found.reconstruction, whole.seen
     print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
     print(f"wrote {output} in {seconds_of(found):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return found
@@ -150,27 +151,6 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> An
 def seconds_of(found: Answer) -> float:
     """Seconds that an answer took, without reading and writing."""
     return sum(found.reconstruction.timings_s.values())
-
-
-def _write(
-    directory: Path, job: FrameJob, frame: SensorFrame, seen: Observation, found: Answer, placed: tuple[Placed, ...]
-) -> None:
-    """Write the answer's files, and say where it comes from."""
-    facts: dict[str, object] = {
-        "title": frame.source,
-        "weights": str(job.weights),
-        "resolution": job.resolution,
-        "points": len(seen.cloud),
-    }
-    if job.registrar is not None:
-        facts["registration"] = facts_of(found)
-    facts |= {"device": job.model.device.type, "precision": job.model.working_precision}
-    carried = carried_along(placed, found)
-    if carried:
-        facts["carried"] = [one.facts() for one in carried]
-    facts |= seen.facts()
-    write_files(directory, found.reconstruction, seen.cloud, frame.axes, job.files, frame.unit_m, facts, carried)
-    write_state(directory, found, job.registrar, str(job.weights), frame.axes, frame.unit_m)
 
 
 def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...]:
@@ -191,19 +171,18 @@ def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...
     return carried
 
 
-def facts_of(found: Answer) -> dict[str, object]:
-    """Facts about where an answer comes from, for the summary; also printed in one line."""
-    source, registration = "registration" if found.taken else "network", found.registration
+def print_source(found: Answer) -> None:
+    """Print where an answer comes from, and whether it can be believed."""
+    registration = found.registration
     if registration is None:
         print(f"the network's answer, as no registration was found: {found.refusal}")
-        return {"answer": source, "refusal": found.refusal}
+        return
     explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
         print("that is too little to believe it: --fit auto keeps the network's answer")
     elif found.taken and registration.doubt is not None:
         print(registration.doubt)
-    return {"answer": source, **describe(registration)}
 
 
 def print_segments(result: Reconstruction, title: str) -> None:

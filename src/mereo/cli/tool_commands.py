@@ -5,7 +5,6 @@ See ``mereo.cli.commands`` for how commands are written.
 
 import os
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -103,24 +102,20 @@ class ViewCommand:
 
     def run(self) -> None:
         """Open the page of a frame or of a scene, and keep it until Ctrl-C."""
-        from mereo.fitting.state_file import is_state
-        from mereo.visualization.viewer.serve import view_frame, view_scene, view_state
+        from mereo.visualization.viewer.serve import view
 
-        input, state = (None, self.input) if self.state is None and is_state(self.input) else (self.input, self.state)
-        if self.scene is not None:
-            if input is not None:
-                raise ValueError(f"both {input} and --scene {self.scene} are given; one can be shown: drop one")
-            view_scene(self.scene, self.weights, state=state, port=self.port, host=self.host, inference=self.inference)
-            return
-        show = partial(view_frame, resolution=self.resolution) if state is None else partial(view_state, state)
-        show(
-            input,
+        view(
+            self.input,
             self.weights,
+            scene=self.scene,
+            state=self.state,
             port=self.port,
             host=self.host,
+            resolution=self.resolution,
             reading=self.reading,
             isolation=self.isolation,
             inference=self.inference,
+            block=True,
         )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from mereo.evaluation.candidates import AnswerName, Candidate, RegistrationErrors
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color
 
@@ -76,6 +77,11 @@ class Evaluation:
     sources: tuple[str, ...] = ()
     errors: RegistrationErrors | None = None
     unit_mm: float | None = None
+
+    def __repr__(self) -> str:
+        scores, count = self.scores, counted(len(self.examples), "example")
+        miou = "" if np.isnan(scores.miou) else f", mIoU {scores.miou:.3f}"
+        return f"Evaluation({count}: IoU {scores.iou:.3f}{miou}; {listed(self.names)})"
 
     @property
     def scores(self) -> Scores:

@@ -5,6 +5,7 @@ A few views, rendered from test seeds, come with the package, so that a fresh cl
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.labels import LabelGrid
 from mereo.io.atomic_files import atomic_file
+from mereo.io.config import InputConfig
 from mereo.io.errors import quiet, reason
+from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.size_limits import read_arrays
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
@@ -21,6 +24,9 @@ from mereo.synthesis.examples import sample_view
 
 SHIPPED = Path(__file__).parents[1] / "frames"
 
+
+GUESSED_UNIT_M = 0.01
+"""Metres per scene unit of shipped frames of objects whose true size is not known."""
 
 DEPTH_STEP = 0.005
 """Step of the stored depth in scene units, a twentieth of the sensor's noise."""
@@ -35,12 +41,14 @@ class SampleView:
         seed: test seed of which it is example 0.
         depth: the noisy depth image, scene units.
         truth: true labels on a grid, in the camera frame.
+        unit_m: metres per scene unit; None where the object's true size is not known.
     """
 
     scene: str
     seed: int
     depth: DepthImage
     truth: TruthGrid
+    unit_m: float | None = None
 
 
 def make_view(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> SampleView:
@@ -48,14 +56,16 @@ def make_view(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> Samp
 
     Raises ``ValueError`` where the depth is too large for the file.
     """
-    view = sample_view(load_scene(scene).for_seed(seed), GenerateConfig(), example_rng(seed, 0))
+    loaded = load_scene(scene)
+    view = sample_view(loaded.for_seed(seed), GenerateConfig(), example_rng(seed, 0))
     rounded = np.rint(view.depth.depth / DEPTH_STEP)
     if rounded.max() > 65535:
         raise ValueError(
             f"scene {scene!r} is {view.depth.depth.max():.4g} units away; a sample view stores up to "
             f"{65535 * DEPTH_STEP:g}: move its camera workspace closer"
         )
-    return SampleView(scene, seed, DepthImage(rounded * DEPTH_STEP, view.depth.camera), truth_grid(view.mesh, cells))
+    depth = DepthImage(rounded * DEPTH_STEP, view.depth.camera)
+    return SampleView(scene, seed, depth, truth_grid(view.mesh, cells), loaded.unit_m)
 
 
 def save_view(path: str | Path, view: SampleView) -> None:
@@ -76,6 +86,7 @@ def save_view(path: str | Path, view: SampleView) -> None:
             origin=grid.origin,
             spacing=grid.spacing,
             names=np.asarray(grid.names),
+            unit_m=np.array(np.nan if view.unit_m is None else view.unit_m),
         )
 
 
@@ -103,10 +114,42 @@ def load_view(name: str | Path) -> SampleView:
         raise ValueError(f"{path} is not a sample view of mereo ({reason(error)}); write it with `save_view`") from None
 
 
+def load_frame(name: str | Path, reading: InputConfig | None = None, **options: Any) -> SensorFrame:
+    """Frame of a depth camera or scanner: a shipped one by its name, or a file as `mereo reconstruct` reads it.
+
+    Args:
+        name: of a shipped frame (``shipped_views``), a rendered depth image in metres; or a depth image, a point cloud
+            or a ROS recording.
+        reading: how a file is read.
+        options: fields of ``InputConfig`` instead of it: ``intrinsics``, ``depth_scale``, ``mask``, ``frame``,
+            ``drop_invalid``, ``unit_m``, ``topic``, ``frame_index``.
+
+    A shipped object whose true size is not known is taken to have scene units of ``GUESSED_UNIT_M``.
+
+    Raises ``FileNotFoundError`` where there is none, ``TypeError`` for options that are none, and ``ValueError`` as
+    ``read_frame`` does, for options with a shipped frame, and for both ``reading`` and options.
+    """
+    if options and reading is not None:
+        raise ValueError(f"both a reading and {', '.join(options)} are given; one says it all: drop the other")
+    path, shipped = Path(name), str(name) in shipped_views()
+    if path.is_file() or not shipped:
+        if not path.exists() and path.suffix == "":
+            known = ", ".join(shipped_views())
+            raise FileNotFoundError(f"there is no frame {str(name)!r}; give a file or one of the shipped: {known}")
+        return read_frame(path, reading or InputConfig(**options))
+    if options or reading is not None:
+        raise ValueError(f"the shipped frame {str(name)!r} is in metres and needs no options: leave them out")
+    view = load_view(name)
+    image = DepthImage(view.depth.depth * (view.unit_m or GUESSED_UNIT_M), view.depth.camera)
+    return SensorFrame(SHIPPED / f"{name}.npz", image.to_points(), 1.0, "camera", image, "shipped frame")
+
+
 def _view_of(stored: dict[str, np.ndarray]) -> SampleView:
     height, width = stored["depth"].shape
     camera = Camera(width, height, *(float(value) for value in stored["intrinsics"]))
     names = tuple(str(name) for name in stored["names"])
     grid = LabelGrid(stored["labels"], stored["origin"], stored["spacing"], names)
     depth = DepthImage(stored["depth"] * float(stored["depth_step"]), camera)
-    return SampleView(str(stored["scene"]), int(stored["seed"]), depth, TruthGrid(grid, stored["kept"]))
+    unit_m = float(stored.get("unit_m", np.nan))  # files from before it was kept do not say
+    truth, known = TruthGrid(grid, stored["kept"]), np.isfinite(unit_m)
+    return SampleView(str(stored["scene"]), int(stored["seed"]), depth, truth, unit_m if known else None)

@@ -40,6 +40,17 @@ class Answer:
     taken: bool = False
     refusal: str | None = None
 
+    def __repr__(self) -> str:
+        return f"Answer({self.source}; {self.reconstruction!r})"
+
+    @property
+    def source(self) -> str:
+        """Where the answer comes from, in a phrase."""
+        if self.registration is None:
+            return "network alone" if self.refusal is None else f"network alone: {self.refusal}"
+        told = self.registration.told
+        return told if self.taken else f"network alone: the {told}, too few"
+
 
 def answer(
     cloud: PointCloud | Float[np.ndarray, "n 3"],

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
 from mereo.fitting.playback import Drawn
+from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, signed_distance_and_direction
 from mereo.scenes.statistical_model import StatisticalModel, following
@@ -45,6 +46,9 @@ class Located:
     distance: Float[np.ndarray, " n"]
     direction: Float[np.ndarray, "n 3"]
     rest: Float[np.ndarray, "n 3"]
+
+    def __repr__(self) -> str:
+        return f"Located({counted(len(self.label), 'point')}, {int((self.label > 0).sum()):,} in a segment)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +96,16 @@ class Registration:
     drawn: Drawn | None = None
     residual: float | None = None
     ruled_out: float | None = None
+
+    def __repr__(self) -> str:
+        trust = "not believed, " if not self.accepted else "doubtful, " if self.doubt is not None else ""
+        unit = f"a scene unit is {self.scene_unit:.4g}"
+        return f"Registration({self.told}, {trust}{unit}; {self.seconds:.1f} s)"
+
+    @property
+    def told(self) -> str:
+        """Phrase on how well the frame is explained."""
+        return f"registered model ({self.method}) explains {self.explained:.1%} of the observed points"
 
     @property
     def doubt(self) -> str | None:

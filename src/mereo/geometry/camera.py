@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mereo.geometry.brief import counted, sides
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -78,6 +80,9 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    def __repr__(self) -> str:
+        return f"PointCloud({counted(len(self), 'point')}, {sides(self.points)})"
+
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
@@ -100,6 +105,11 @@ class DepthImage:
             )
         if not np.isfinite(self.depth).all() or (self.depth < 0).any():
             raise ValueError("the depth image has negative, NaN or infinite values; use 0 where nothing was measured")
+
+    def __repr__(self) -> str:
+        measured = self.depth[self.valid]
+        depths = f", depth {measured.min():.4g} to {measured.max():.4g}" if len(measured) else ""
+        return f"DepthImage({self.camera.width} x {self.camera.height} pixels, {len(measured):,} measured{depths})"
 
     @property
     def valid(self) -> Bool[np.ndarray, "h w"]:

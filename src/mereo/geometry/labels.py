@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Color
 
 
@@ -23,6 +24,10 @@ class LabelGrid:
     origin: Float[np.ndarray, "3"]
     spacing: Float[np.ndarray, "3"]
     names: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        voxels = " x ".join(map(str, self.labels.shape))
+        return f"LabelGrid({voxels} voxels, {self.spacing.max():.3g} apart; {listed(self.names)})"
 
     def axes(self) -> tuple[Float[np.ndarray, " x"], Float[np.ndarray, " y"], Float[np.ndarray, " z"]]:
         """Coordinates of the voxel centres along each axis."""
@@ -59,3 +64,6 @@ class SegmentedCloud:
     occupancy: Float[np.ndarray, " n"]
     names: tuple[str, ...]
     colors: tuple[Color, ...]
+
+    def __repr__(self) -> str:
+        return f"SegmentedCloud({counted(len(self.points), 'point')}; {listed(self.names)})"

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from mereo.geometry.brief import counted, listed, sides
 from mereo.geometry.read_only import read_only_view
 
 Color = tuple[int, int, int]
@@ -55,6 +56,10 @@ class Segment:
         # segments are shared by scenes, states and results: a change of one would be a change of all
         for name in ("vertices", "faces"):
             object.__setattr__(self, name, read_only_view(getattr(self, name)))
+
+    def __repr__(self) -> str:
+        size = f"{len(self.vertices):,} vertices, {counted(len(self.faces), 'face')}"
+        return f"Segment({self.name!r}, {size}, {sides(self.vertices)})"
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
@@ -112,6 +117,11 @@ class SegmentedMesh:
                     f"segment {inner!r} is declared nested in {outer!r} but does not come before it; the first of two "
                     f"segments owns what both hold: put {inner!r} first"
                 )
+
+    def __repr__(self) -> str:
+        faces = counted(sum(len(segment.faces) for segment in self.segments), "face")
+        size = sides(np.concatenate([segment.vertices for segment in self.segments]))
+        return f"SegmentedMesh({counted(len(self.segments), 'segment')}: {listed(self.names)}; {faces}, {size})"
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
@@ -48,6 +49,10 @@ class SensorFrame:
     axes: CloudAxes
     depth: DepthImage | None = None
     message: str = ""
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{side:.3g}" for side in np.ptp(self.cloud.points, axis=0) * self.unit_m)
+        return f"SensorFrame({self.source!r}, {counted(len(self.cloud), 'point')}, {size} m, {self.axes} axes)"
 
     @property
     def source(self) -> str:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.downsampling import random_subset
@@ -55,6 +56,9 @@ class EncodedCloud:
     normalizer: Normalizer
     cloud: Float[np.ndarray, "n 3"]
 
+    def __repr__(self) -> str:
+        return f"EncodedCloud({counted(len(self.cloud), 'point')})"
+
 
 @dataclass(frozen=True, eq=False)
 class Answer:
@@ -72,6 +76,9 @@ class Answer:
     distance: Float[np.ndarray, " n"]
     direction: Float[np.ndarray, "n 3"]
 
+    def __repr__(self) -> str:
+        return f"Answer({counted(len(self.label), 'point')}, {int((self.label > 0).sum()):,} in a segment)"
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -88,6 +95,7 @@ class Model:
         precision: of the products; float32 is exact, bfloat16 faster on GPUs and some CPUs (`mereo bench` says what it
             costs), auto takes bfloat16 there.
         statistical_model: of the object's states, which a registration fits; older weights have none.
+        name: how the weights were named when they were loaded, a shipped name or a file; "" for others.
     """
 
     network: Network
@@ -99,6 +107,15 @@ class Model:
     nested: tuple[tuple[str, str], ...] = ()
     precision: Precision = "float32"
     statistical_model: StatisticalModel | None = None
+    name: str = ""
+
+    def __repr__(self) -> str:
+        size = sum(value.numel() for value in self.network.parameters()) / 1e6
+        model = self.statistical_model
+        modes = "no statistical model" if model is None else counted(model.count, "mode")
+        segments = f"{counted(len(self.names), 'segment')}: {listed(self.names)}"
+        name = f"{self.name!r}, " if self.name else ""
+        return f"Model({name}{segments}; {size:.1f} M parameters, {modes}, on {self.device.type})"
 
     @property
     def segmented(self) -> bool:

@@ -158,6 +158,7 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
         domain=header.domain,
         nested=header.nested,
         statistical_model=_unpacked(path, states, header) if states else None,
+        name=str(name),
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.io.sensor_frame import SensorFrame, depths_m
 from mereo.reconstruction.config import IsolationConfig
@@ -43,6 +44,10 @@ class Observation:
         """The object as a reading of ``cloud`` has it: what was dropped as strays is a step of its own."""
         steps = self.steps if reading.step is None else (*self.steps, reading.step)
         return replace(self, cloud=reading.cloud, steps=steps)
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{side:.3g}" for side in self.size_m)
+        return f"Observation({self.frame.source!r}, {counted(len(self.cloud), 'point')}, {size} m)"
 
     @property
     def depth_m(self) -> tuple[float, float, float]:

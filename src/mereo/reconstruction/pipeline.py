@@ -16,6 +16,7 @@ from functools import cached_property, partial
 import numpy as np
 from jaxtyping import Float
 
+from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
@@ -60,6 +61,17 @@ class Reconstruction:
     T_camera_input: Float[np.ndarray, "4 4"]
     reading: Reading
     observed: SegmentedCloud | None = None
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of all stages together."""
+        return sum(self.timings_s.values())
+
+    def __repr__(self) -> str:
+        found = sum(segment.voxels > 0 for segment in self.segments)
+        segments = f"{counted(len(self.segments), 'segment')} found: {listed(s.name for s in self.segments)}"
+        points = counted(len(self.reading.cloud), "point")
+        return f"Reconstruction({found} of {segments}; {points}, {self.seconds:.1f} s)"
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,6 +40,10 @@ class FoundSegment:
     voxels: int
     components: int
 
+    def __repr__(self) -> str:
+        found = f"volume {self.volume:.3g}, confidence {self.confidence:.2f}" if self.voxels else "not found"
+        return f"FoundSegment({self.name!r}, {found})"
+
 
 def segment_points(
     logits: Float[np.ndarray, "n c"],

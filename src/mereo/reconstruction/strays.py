@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.scanner_axes import into_camera
@@ -42,6 +43,9 @@ class Reading:
 
     whole: PointCloud
     keep: Bool[np.ndarray, " n"]
+
+    def __repr__(self) -> str:
+        return f"Reading({len(self.cloud):,} of {counted(len(self.whole), 'point')})"
 
     @classmethod
     def of_all(cls, whole: PointCloud) -> "Reading":

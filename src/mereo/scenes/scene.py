@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.deformation.maps import Deformation
+from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import look_at, rotation_along
 from mereo.scenes.seeds import TEST_SEED_START
@@ -106,6 +107,11 @@ class Scene:
                 f"scene {self.name!r} has the segments {', '.join(self.rest.names)} but its held-out states "
                 f"{', '.join(self.held_out.rest.names)}; they must be one object: give both the same rest mesh"
             )
+
+    def __repr__(self) -> str:
+        unit = "of unknown size" if self.unit_m is None else f"a unit is {1000 * self.unit_m:.3g} mm"
+        segments = f"{counted(len(self.rest.segments), 'segment')}: {listed(self.rest.names)}"
+        return f"Scene({self.name!r}, {segments}; {unit})"
 
     @property
     def source_frame(self) -> SourceFrame:

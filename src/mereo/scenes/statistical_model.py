@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
+from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.pair_distances import PairDistances
@@ -60,6 +61,10 @@ class StatisticalModel:
     residue: float
     pairs: PairDistances
     source_frame: SourceFrame | None = None
+
+    def __repr__(self) -> str:
+        states = f"{counted(self.count, 'mode')} of {counted(len(self.library), 'state')}"
+        return f"StatisticalModel({states}, residue {self.residue:.2g} units; {listed(self.rest.names)})"
 
     @cached_property
     def rest_z(self) -> Float[np.ndarray, " k"]:

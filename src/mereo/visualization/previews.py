@@ -28,7 +28,7 @@ from mereo.visualization.contact_sheets import (
     legend,
     save_png,
 )
-from mereo.visualization.renderer import Viewpoint, shade
+from mereo.visualization.renderer import Viewpoint, shade, shaded_canvas
 
 Vector = tuple[float, float, float]
 
@@ -87,6 +87,35 @@ def render_cloud_and_segments(
     captions = [f"input, {name}" for name in views] + [f"segments, {name}" for name in views]
     sheet = contact_sheet(clouds + shaded, captions, 3, title)
     save_png(path, np.concatenate([sheet, legend(surfaces.names, surfaces.colors, sheet.shape[1])]))
+
+
+SEEN_COLOR = (0.09, 0.1, 0.13)
+
+SEEN_LIFT = 0.012
+"""Share of the picture's height by which observed points are drawn nearer, or noise would hide half of them."""
+
+
+def seen_on_found(
+    points: Float[np.ndarray, "n 3"], surfaces: SegmentedMesh, sides: Sequence[tuple[Vector, Vector]], size: int
+) -> list[Picture]:
+    """Pictures of the segments with the observed points on them as dark dots, one from each side.
+
+    Args:
+        points: observed, camera frame.
+        surfaces: found, in the same frame; segments without faces are left out.
+        sides: viewing direction and up of each, as in ``CAMERA_VIEWS``.
+        size: width and height in pixels; what is shown fills it.
+    """
+    solid = _with_faces(surfaces)
+    meshes = [points, *(segment.vertices for segment in solid.segments if len(segment.faces))]
+    bounds, pictures = _joint_bounds(*meshes), []
+    for direction, up in sides:
+        view = Viewpoint.along(bounds, direction, up)
+        canvas = shaded_canvas(solid, view, (size, size))
+        lifted = points - SEEN_LIFT * 2 * view.half_size * np.asarray(direction)
+        canvas.draw_points(lifted, np.tile(SEEN_COLOR, (len(points), 1)), 0.75)
+        pictures.append(canvas.picture())
+    return pictures
 
 
 def _with_faces(surfaces: SegmentedMesh) -> SegmentedMesh:

@@ -243,6 +243,13 @@ def shade(
 
     Segments that are declared nested shine through those around them.
     """
+    return shaded_canvas(mesh, view, size, colors).picture()
+
+
+def shaded_canvas(
+    mesh: SegmentedMesh, view: Viewpoint, size: tuple[int, int], colors: list[Color] | None = None
+) -> Canvas:
+    """``shade`` before it is finished: more can be drawn on it."""
     colors = list(mesh.colors) if colors is None else colors
     canvas = Canvas.empty(view, size)
     canvas.draw_triangles(Triangles.of(mesh, colors))
@@ -252,4 +259,4 @@ def shade(
         parts = SegmentedMesh(tuple(mesh.segments[index] for index in inner))
         within.draw_triangles(Triangles.of(parts, [colors[index] for index in inner]))
         canvas.let_through(within)
-    return canvas.picture()
+    return canvas

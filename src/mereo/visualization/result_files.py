@@ -23,13 +23,14 @@ from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import CONFIG, DEFAULT_FILES, FilesConfig
 from mereo.io.output_folders import new_directory
-from mereo.io.writers.formats import Results, chosen_formats, write_formats
+from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import files_of, load_scene
+from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
 from mereo.visualization.error_maps import error_picture
@@ -45,12 +46,12 @@ PICTURED_CELLS = 150
 
 
 def evaluate_weights(
-    weights: str | Path,
+    weights: Model | str | Path,
     output: str | Path,
     *,
     examples: int = 128,
     seed: int = TEST_SEED_START,
-    scene: str | None = None,
+    scene: Scene | str | None = None,
     cells: int = CELLS,
     settings: GenerateConfig | None = None,
     inference: InferenceConfig = EXACT,
@@ -62,8 +63,9 @@ def evaluate_weights(
 
     With ``force`` an existing folder that mereo wrote is replaced; ``options`` are written to config.json.
     """
-    with new_directory(output, force, [weights, *([] if scene is None else files_of(scene))]) as directory:
-        model = load_for(weights, inference)
+    read = [*([] if isinstance(weights, Model) else [weights]), *_files_of(scene)]
+    with new_directory(output, force, read) as directory:
+        model = weights if isinstance(weights, Model) else load_for(weights, inference)
         settings = settings or GenerateConfig()
         evaluation = evaluate(
             model,
@@ -76,8 +78,8 @@ def evaluate_weights(
             choice=choice,
         )
         facts = {
-            "weights": str(weights),
-            "scene": scene or trained_scene(model),
+            "weights": model.name if isinstance(weights, Model) else str(weights),
+            "scene": scene.name if isinstance(scene, Scene) else scene or trained_scene(model),
             "seed": seed,
             "image_size": settings.image_size,
             "noise_std": settings.noise_std,
@@ -97,7 +99,7 @@ def evaluate_on_scans(
     output: str | Path,
     *,
     truths: Sequence[str | Path] = (),
-    scene: str | None = None,
+    scene: Scene | str | None = None,
     cells: int = CELLS,
     choice: FitChoice = "auto",
     force: bool = False,
@@ -105,15 +107,20 @@ def evaluate_on_scans(
 ) -> Evaluation:
     """Score a model on real scans, with the same files as ``evaluate_weights``: ``mereo evaluate --scans``.
 
-    Takes the arguments of ``evaluate_scans``; ``scene`` is a name or a file; the others are as there.
+    Takes the arguments of ``evaluate_scans``; ``scene`` may be a name or a file; the others are as there.
     """
-    with new_directory(output, force, [*truths, *([] if scene is None else files_of(scene))]) as directory:
-        loaded = None if scene is None else load_scene(scene)
+    with new_directory(output, force, [*truths, *_files_of(scene)]) as directory:
+        loaded = load_scene(scene) if isinstance(scene, str) else scene
         evaluation = evaluate_scans(model, truths=truths, scene=loaded, cells=cells, choice=choice)
         facts = {"scans": list(evaluation.examples), "truths": [str(path) for path in truths]}
         write_evaluation(directory, evaluation, {**facts, "trained": model.provenance}, options)
     print(markdown_table(evaluation))
     return evaluation
+
+
+def _files_of(scene: Scene | str | None) -> list[Path]:
+    """Files that a named scene is read from."""
+    return files_of(scene) if isinstance(scene, str) else []
 
 
 def write_evaluation(
@@ -201,22 +208,56 @@ def write_files(
     to_viewer = viewer_rotation(frame)
     results = Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, unit_m)
     write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
-    to_camera = camera_axes(frame)
-    seen = PointCloud(transform_points(to_camera, cloud.points))
-    title = str(facts.get("title", "mereo reconstruction"))
     for one in carried:
         write_attachment(directory / "carried" / one.name, one.content, results.factor, to_viewer, unit_m)
     shown = with_carried(result.surfaces, carried)
     if "glb" in formats and len(shown.segments) > len(result.surfaces.segments):
         write_segments_glb(directory / "carried.glb", shown, to_viewer, unit_m)
     pictured = replace(shown, segments=tuple(_pictured(segment) for segment in shown.segments))
-    render_cloud_and_segments(directory / "preview.png", seen, pictured.transformed(to_camera), title)
+    write_preview(directory / "preview.png", pictured, cloud, frame, facts)
     timings_s = {**result.timings_s, "write": time.perf_counter() - started}
     summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
     extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
     told = [*({"name": part.name} for part in extra), *summary["segments"]]
     write_report(directory / "report.html", cloud, pictured, {**summary, "segments": told}, to_viewer)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
+
+
+def write_one(
+    path: Path,
+    suffix: str,
+    result: Reconstruction,
+    cloud: PointCloud,
+    frame: CloudAxes,
+    files: FilesConfig,
+    unit_m: float,
+    facts: dict[str, object],
+) -> None:
+    """Write the one file of a folder of results that has this suffix (".glb", ".html", ...) to a path."""
+    if suffix in (".png", ".html"):
+        pictured = replace(result.surfaces, segments=tuple(_pictured(part) for part in result.surfaces.segments))
+        if suffix == ".png":
+            write_preview(path, pictured, cloud, frame, facts)
+            return
+    summary = summarize(result, **{"frame": frame, "unit_m": unit_m, **facts})
+    if suffix == ".html":
+        write_report(path, cloud, pictured, summary, viewer_rotation(frame))
+        return
+    (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
+    chosen_formats([name])
+    surfaces, labels, turn = result.surfaces, result.labels, viewer_rotation(frame)
+    results = Results.of(surfaces, labels, result.observed, turn, files, unit_m)
+    WRITERS[name].write(path, replace(results, summary=summary))
+
+
+def write_preview(
+    path: Path, surfaces: SegmentedMesh, cloud: PointCloud, frame: CloudAxes, facts: dict[str, object]
+) -> None:
+    """Write the picture of cloud and segments, both turned as a camera sees them."""
+    to_camera = camera_axes(frame)
+    seen = PointCloud(transform_points(to_camera, cloud.points))
+    title = str(facts.get("title", "mereo reconstruction"))
+    render_cloud_and_segments(path, seen, surfaces.transformed(to_camera), title)
 
 
 def _pictured(segment: Segment) -> Segment:

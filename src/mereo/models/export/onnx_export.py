@@ -220,7 +220,7 @@ def describe(model: Model, graphs: Graphs) -> dict[str, Any]:
 
 
 def export_weights(
-    weights: str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", force: bool = False
+    weights: Model | str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", force: bool = False
 ) -> None:
     """Write a new directory with both graphs, ``model.json`` and, for ONNX, the runner (``mereo export``).
 
@@ -229,8 +229,9 @@ def export_weights(
     """
     if format == "onnx":
         _require_onnx()
-    with new_directory(output, force, [weights]) as directory:
-        model = load_model(weights)
+    read = [] if isinstance(weights, Model) else [weights]
+    with new_directory(output, force, read) as directory:
+        model = weights if isinstance(weights, Model) else load_model(weights)
         graphs = export_graphs(model)
         (write_onnx if format == "onnx" else write_torch)(graphs, directory)
         write_json(directory / "model.json", describe(model, graphs))

@@ -72,6 +72,11 @@ class Inspection:
         """Default answer to a cloud of a unit of ``unit_m`` metres; raises as ``fitting.answer.answer`` does."""
         stated = None if registrar is None or unit_m is None else registrar.stated_unit(unit_m)
         found = answer(cloud, model, registrar, resolution, frame, stated_unit=stated, keep_all=keep_all)
+        return cls.of_answer(found, model, registrar)
+
+    @classmethod
+    def of_answer(cls, found: FrameAnswer, model: Model, registrar: Registrar | None) -> "Inspection":
+        """Answer that is there already, with what it was asked from."""
         result = found.reconstruction
         return cls(
             surfaces=result.surfaces,
@@ -139,15 +144,12 @@ def source_of(found: FrameAnswer, registrar: Registrar | None) -> str:
     """Where an answer comes from, in a phrase for people."""
     if registrar is None:
         return "network alone: the weights carry no statistical model"
-    if found.registration is None:
-        return f"network alone: {found.refusal}"
-    told = explained(found.registration)
-    return told if found.taken else f"network alone: the {told}, too few"
+    return explained(found.registration) if found.registration is not None and found.taken else found.source
 
 
 def explained(registration: Registration) -> str:
     """How well a registration explains its frame, in a phrase for people."""
-    told = f"registered model ({registration.method}) explains {registration.explained:.1%} of the observed points"
+    told = registration.told
     return told if registration.doubt is None or not registration.accepted else f"{told}; {registration.doubt}"
 
 

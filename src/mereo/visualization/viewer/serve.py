@@ -1,8 +1,7 @@
-"""``mereo view``: load what is to be shown, start the page, keep it until Ctrl-C."""
+"""``mereo view``: load what is to be shown, and open its page."""
 
-import gc
-import threading
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from mereo.evaluation.sample_views import load_view, shipped_views
 from mereo.fitting.register import registrar_for, statistical_model_of
 from mereo.fitting.registration_state import played_state, restored
-from mereo.fitting.state_file import RegistrationState, read_state
+from mereo.fitting.state_file import RegistrationState, is_state, read_state
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
@@ -23,19 +22,18 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.visualization.viewer.display import import_viser, start_server, stop_server
+from mereo.visualization.result import Result
+from mereo.visualization.viewer.display import import_viser, start_server
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom, ModeShapes
 from mereo.visualization.viewer.guard import LOOPBACK, Entry
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
+from mereo.visualization.viewer.open_page import OpenPage, is_interactive
 from mereo.visualization.viewer.probe import Inspection
 
 PORT = 8080
 """Port of the page where none is chosen."""
-
-COLLECT_EVERY_S = 5.0
-"""Time between two collections of what closed pages leave behind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +57,68 @@ class Frame:
         return "m" if self.unit_m == 1.0 else ""
 
 
+def view(
+    input: str | Path | Result | None = None,
+    weights: str | Path | None = None,
+    *,
+    scene: str | None = None,
+    state: str | Path | None = None,
+    port: int | None = None,
+    host: str = LOOPBACK,
+    resolution: int = 128,
+    reading: InputConfig | None = None,
+    isolation: IsolationConfig | None = None,
+    inference: InferenceConfig | None = None,
+    block: bool | None = None,
+) -> OpenPage:
+    """Look at a frame and its reconstruction in a browser, or move a scene by hand: ``mereo view``.
+
+    Args:
+        input: a point cloud or depth image; a result of `mereo reconstruct` with a registered model (the folder, or its
+            state.json); a ``Result``; without it (and ``scene``) a shipped frame.
+        weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
+        scene: open the laboratory of this scene: its name, or a scene file.
+        state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
+        port: where the page is; by default ``PORT`` where this waits, else any that is free.
+        host: address of this machine that the page is at; only this machine reaches the default.
+        resolution: grid cells along the longest side.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
+        block: wait until Ctrl-C; by default everywhere but in a notebook or an interactive session.
+
+    Returns what closes the page; a notebook shows it as a frame with the page. Raises ``ImportError`` without the extra
+    `view`, ``ValueError`` for both a frame and a scene, and as what is shown cannot be read.
+    """
+    block = not is_interactive() if block is None else block
+    place = (PORT if block else 0) if port is None else port
+    if isinstance(input, Result):
+        return view_result(input, port=place, host=host).stay(block)
+    path, known = (None if value is None else Path(value) for value in (input, state))
+    if known is None and is_state(path):
+        path, known = None, path
+    named = None if weights is None else str(weights)
+    if scene is not None:
+        if path is not None:
+            raise ValueError(f"both {path} and --scene {scene} are given; one can be shown: drop one")
+        return view_scene(scene, named, state=known, port=place, host=host, inference=inference).stay(block)
+    show = partial(view_frame, resolution=resolution) if known is None else partial(view_state, known)
+    page = show(path, named, port=place, host=host, reading=reading, isolation=isolation, inference=inference)
+    return page.stay(block)
+
+
+def view_result(result: Result, *, port: int = 0, host: str = LOOPBACK) -> OpenPage:
+    """Page of a result that is there already."""
+    import_viser()
+    inspection = Inspection.of_answer(result, result.model, result.registrar)
+    entry = Entry.of(host)
+    server = start_server(port, "mereo", entry)
+    frame = result.seen.frame
+    facts = f"{len(result.seen.cloud):,} points · weights {result.model.name or 'of this program'}"
+    FramePage(server, inspection, frame.source, facts, "m" if result.unit_stated and frame.unit_m == 1.0 else "")
+    return OpenPage(server, entry)
+
+
 def view_frame(
     input: Path | None,
     weights: str | None,
@@ -69,7 +129,7 @@ def view_frame(
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
     inference: InferenceConfig | None = None,
-) -> None:
+) -> OpenPage:
     """Show a frame and the default answer to it; without ``input`` the shipped frame of the weights."""
     import_viser()
     if input is None:
@@ -94,7 +154,7 @@ def view_frame(
     entry = Entry.of(host)
     server = start_server(port, "mereo", entry)
     FramePage(server, inspection, frame.title, f"{len(frame.cloud):,} points · weights {weights}", frame.unit)
-    _serve(server, entry)
+    return OpenPage(server, entry)
 
 
 def view_state(
@@ -107,7 +167,7 @@ def view_state(
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
     inference: InferenceConfig | None = None,
-) -> None:
+) -> OpenPage:
     """Show a registration by its state (a file, or a folder of results), with its frame where ``input`` names it."""
     import_viser()
     state = read_state(path)
@@ -126,7 +186,7 @@ def view_state(
     server = start_server(port, "mereo", entry)
     title = str(path) if frame is None else frame.title
     FramePage(server, inspection, title, f"{state.scene} · weights {weights}", "m" if state.unit_m == 1.0 else "")
-    _serve(server, entry)
+    return OpenPage(server, entry)
 
 
 def view_scene(
@@ -137,7 +197,7 @@ def view_scene(
     port: int = PORT,
     host: str = LOOPBACK,
     inference: InferenceConfig | None = None,
-) -> None:
+) -> OpenPage:
     """Show the laboratory of a scene, in a state where one is given.
 
     Without ``weights`` it takes those of the state, or the shipped ones where there are any.
@@ -153,7 +213,7 @@ def view_scene(
     entry = Entry.of(host)
     server = start_server(port, "mereo", entry)
     page = LabPage(server, laboratory, f"Laboratory: {scene.name}", facts)
-    _serve(server, entry, page)
+    return OpenPage(server, entry, page)
 
 
 def shapes_of(state: RegistrationState, scene: Scene, model: Model | None) -> Freedom[Any]:
@@ -183,32 +243,3 @@ def weights_of(state: RegistrationState, weights: str | None) -> str:
             f"the state was made with the weights {known!r}, which are not here: name them with --weights"
         ) from None
     return known
-
-
-def keep_open(end: threading.Event) -> None:
-    """Wait for the end, and collect meanwhile what pages leave behind that were closed.
-
-    viser keeps the exception that says so beside the task that raised it (``ws_handler``), and with that cycle the
-    page's buffers, about 0.4 MB. CPython collects cycles that have grown old only after a quarter of all objects known
-    at the last full collection have come new: of the 400,000 of the libraries and the model. Those are put aside
-    (``gc.freeze``), which makes a full collection of the others a matter of a millisecond.
-    """
-    gc.collect()
-    gc.freeze()
-    try:
-        while not end.wait(COLLECT_EVERY_S):
-            gc.collect()
-    finally:
-        gc.unfreeze()
-
-
-def _serve(server: Any, entry: Entry, page: LabPage | None = None) -> None:
-    print(f"open {entry.address(server.get_port())} in a browser; Ctrl-C ends", flush=True)
-    try:
-        keep_open(threading.Event())
-    except KeyboardInterrupt:
-        print("closed")
-    finally:
-        if page is not None:
-            page.close()
-        stop_server(server)

@@ -1,0 +1,235 @@
+"""Steps from an object to weights as functions: what the commands of the same names do, with what they leave returned.
+
+    scene -generate-> dataset -train-> weights -evaluate-> Evaluation
+                                          '-----export---> graphs for other runtimes
+    scene or meshes -learn-> all of it, in so many minutes
+
+They print their progress as the commands do, and raise the sentences that those print.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from mereo.evaluation import scoring
+from mereo.evaluation.metrics import format_score
+from mereo.evaluation.results import Evaluation
+from mereo.evaluation.scan_scoring import evaluate_scans
+from mereo.fitting.config import FitChoice
+from mereo.learning import learn as learning
+from mereo.learning.example_frame import FRAME
+from mereo.learning.object_files import scene_for
+from mereo.models.config import EXACT, InferenceConfig
+from mereo.models.export.onnx_export import export_weights
+from mereo.models.model import Model
+from mereo.models.weights import load_for
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis import shards
+from mereo.synthesis.config import GenerateConfig
+from mereo.training import trainer
+from mereo.training.config import PRESETS, PresetName, TrainConfig
+from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
+
+
+def generate(
+    scene: str | Path | Scene,
+    output: str | Path,
+    settings: GenerateConfig | None = None,
+    *,
+    examples: int,
+    seed: int = 0,
+    workers: int = 1,
+    shard: tuple[int, int] = (0, 1),
+    resume: bool = False,
+    test: bool = False,
+) -> Path:
+    """Labelled examples of a scene in a folder, which is returned: `mereo generate`.
+
+    Args:
+        scene: a built-in scene's name, a scene file, or a scene.
+        output: folder to create.
+        settings: how one example is made; ``SENSORS`` of ``mereo.synthesis.config`` has those of depth cameras.
+        examples: how many.
+        seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
+        workers: processes, on which the examples do not depend; 0 means one per core. More than one needs a main module
+            that can be imported (``if __name__ == "__main__":``).
+        shard: part i of n, as (i, n), to share the work between machines.
+        resume: go on with what is there.
+        test: allow a test seed.
+
+    Raises as ``synthesis.shards.generate`` does.
+    """
+    made = str(scene) if isinstance(scene, Path) else scene
+    processes = workers or os.cpu_count() or 1
+    shards.generate(
+        made,
+        Path(output),
+        settings or GenerateConfig(),
+        examples=examples,
+        seed=seed,
+        workers=processes,
+        shard=shard,
+        resume=resume,
+        test=test,
+    )
+    return Path(output)
+
+
+def train(dataset: str | Path, output: str | Path, config: TrainConfig | PresetName = "base", **changes: Any) -> Path:
+    """File of weights, trained on generated examples; the same call again continues a stopped run: `mereo train`.
+
+    Args:
+        dataset: folder written by ``generate``.
+        output: folder of the run: config.json, metrics.csv, curves.png, checkpoint.safetensors, weights.safetensors.
+        config: the recipe, or the name of a preset.
+        changes: fields of ``TrainConfig`` to be changed in it, such as ``init="bunny"`` or ``epochs=20.0``.
+
+    Raises ``TypeError`` for a field that there is none of, ``ValueError`` for a preset that is unknown and values that
+    are refused, and as ``training.trainer.train`` does.
+    """
+    if isinstance(config, str):
+        if config not in PRESETS:
+            raise ValueError(f"the preset is {config!r}; it must be one of {', '.join(PRESETS)}: correct the spelling")
+        config = PRESETS[config]
+    return trainer.train(Path(dataset), Path(output), replace(config, **changes))
+
+
+def evaluate(
+    model: Model | str | Path,
+    scene: Scene | str | Path | None = None,
+    *,
+    output: str | Path | None = None,
+    examples: int = 128,
+    seed: int = TEST_SEED_START,
+    scans: Sequence[str | Path] | None = None,
+    settings: GenerateConfig | None = None,
+    fit: FitChoice = "auto",
+    inference: InferenceConfig = EXACT,
+    cells: int = scoring.CELLS,
+    progress: bool = True,
+) -> Evaluation:
+    """Scores of weights on test examples of their scene, or on real scans: `mereo evaluate`.
+
+    Args:
+        model: the weights, or their shipped name or file.
+        scene: a scene, its name or its file, where it is not the built-in one that the weights were trained on.
+        output: folder to create with metrics.json, table.md, errors.png and report.html; None writes nothing.
+        examples: how many.
+        seed: test seeds start at 1,000,000.
+        scans: truth files, or their folders, of `mereo align`; none of them means the four range scans of the bunny.
+        settings: the camera of rendered views (image size, noise, sensor); by default the paper's.
+        fit: whose answer is scored: "auto" what a user gets by default, with all others beside it.
+        inference: where and how exactly the network computes, for weights that are loaded here.
+        cells: of the grid along each axis, on which answers are compared with the truth; 100 is the paper's.
+        progress: show the time left, where nothing is written.
+
+    Raises ``ValueError`` for a training seed, no examples, another object than the model's, and settings with scans,
+    which are real; ``FileExistsError`` for an output with content.
+    """
+    loaded = model if isinstance(model, Model) else load_for(model, inference)
+    place = str(scene) if isinstance(scene, Path) else scene
+    if scans is not None:
+        if settings is not None:
+            raise ValueError("scans are real and take no simulated camera: leave out the settings")
+        if output is not None:
+            return evaluate_on_scans(loaded, output, truths=scans, scene=place, cells=cells, choice=fit)
+        posed = load_scene(place) if isinstance(place, str) else place
+        return evaluate_scans(loaded, truths=scans, scene=posed, cells=cells, choice=fit)
+    if output is not None:
+        return evaluate_weights(
+            loaded, output, examples=examples, seed=seed, scene=place, cells=cells, settings=settings, choice=fit
+        )
+    return scoring.evaluate(
+        loaded, place, examples=examples, seed=seed, cells=cells, progress=progress, settings=settings, choice=fit
+    )
+
+
+def export(
+    model: Model | str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", force: bool = False
+) -> Path:
+    """Folder with a network as two graphs, encoder and query, for other runtimes: `mereo export`.
+
+    Args:
+        model: the weights, or their shipped name or file.
+        output: folder to create; for ONNX with mereo_onnx.py, which runs the graphs with numpy and onnxruntime alone.
+        format: "onnx", or "torch" for .pt2 files.
+        force: replace an existing folder that mereo wrote, and nothing else is in.
+
+    Raises ``ValueError`` for an autodecoder, ``ImportError`` without the extra `onnx`, ``FileExistsError`` for a folder
+    with content unless ``force``.
+    """
+    export_weights(model, output, format, force)
+    return Path(output)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What ``learn`` leaves.
+
+    Attributes:
+        weights: file of the weights, for ``load_model``.
+        scene: name or file of the object's scene.
+        frame: point cloud to try the weights on.
+        report: page of the scores.
+        metrics: scores as test/metrics.json has them.
+    """
+
+    weights: Path
+    scene: str
+    frame: Path
+    report: Path
+    metrics: dict[str, Any]
+
+    @property
+    def iou(self) -> float:
+        """IoU of the answers that a user gets, on views that training has not seen."""
+        return float(self.metrics["iou"])
+
+    @property
+    def miou(self) -> float | None:
+        """Mean IoU of the segments; None where the weights tell no segments apart."""
+        value = self.metrics["miou"]
+        return None if value is None else float(value)
+
+    def __repr__(self) -> str:
+        miou = "" if self.miou is None else f", mIoU {format_score(self.miou)}"
+        return f"Learned({str(self.weights)!r}: IoU {format_score(self.iou)}{miou})"
+
+
+def learn(
+    object: str | Path | Sequence[str | Path],
+    output: str | Path,
+    *,
+    minutes: float = 10.0,
+    init: str = "",
+    units: Literal["mm", "cm", "m", "in"] | None = None,
+    workers: int = 1,
+) -> Learned:
+    """Weights of an object of your own, in one call and so many minutes: `mereo learn`.
+
+    Args:
+        object: a scene's name or file, or the object's meshes: one for each segment, one file of named parts, or a
+            label volume.
+        output: folder to create; the same call continues one that was stopped.
+        minutes: what all stages may take together.
+        init: weights to start from, a shipped name or a file; by default the shipped ones that adapt fastest.
+        units: of the meshes; guessed where not given.
+        workers: processes that make examples, as in ``generate``; 0 means one per core.
+
+    Raises ``ValueError`` for other arguments than the folder was begun with, and as the stages do.
+    """
+    given = [object] if isinstance(object, str | Path) else object
+    files, folder = [Path(file) for file in given], Path(output)
+    processes = workers or os.cpu_count() or 1
+    metrics = learning.learn(files, folder, minutes=minutes, init=init, units=units, workers=processes)
+    return Learned(
+        weights=folder / trainer.WEIGHTS,
+        scene=scene_for(files, folder, units),
+        frame=folder / FRAME,
+        report=folder / learning.TEST / "report.html",
+        metrics=metrics,
+    )

@@ -1,0 +1,345 @@
+"""mereo in Python: frames, results that are saved, shown and told, and the commands as functions."""
+
+import base64
+import inspect
+import io
+import json
+import re
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from analytic import AnalyticModel, ball, logits_of, untrained
+from PIL import Image
+from toy_scene import toy_scene
+
+import mereo
+from mereo.cli.reconstruct import reconstruct_file
+from mereo.evaluation.results import Evaluation
+from mereo.fitting.registration import Located
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.io.output_folders import MARKER
+from mereo.learning import steps
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import SizeWarning
+from mereo.scenes.registry import load_scene
+from mereo.synthesis.config import GenerateConfig
+from mereo.training.config import PRESETS, TrainConfig
+from mereo.visualization.result import SINGLE, Result
+from mereo.visualization.units import Unit
+from mereo.visualization.viewer import serve
+from mereo.visualization.viewer.open_page import OpenPage
+
+NAMES = ("big", "<small>", "absent")
+CENTERS = ((0.02, -0.03, 0.6), (0.02, 0.0605, 0.6))
+RADII = (0.06, 0.03)
+MODEL = AnalyticModel.of(
+    lambda p: 200.0 * logits_of(ball(CENTERS[0], 0.06), ball(CENTERS[1], 0.03), lambda q: np.full(len(q), 1.0))(p),
+    NAMES,
+)
+
+
+def unchecked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function as users have it: without the check of types that tests put before it."""
+    return inspect.unwrap(function)
+
+
+def seen() -> np.ndarray:
+    """Front halves of two balls, in metres."""
+    turned = np.random.default_rng(0).normal(size=(600, 3))
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    turned[:, 2] = -np.abs(turned[:, 2])
+    return np.concatenate([np.add(c, r * turned) for c, r in zip(CENTERS, RADII, strict=True)])
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return mereo.answer(seen(), MODEL, resolution=24, unit_m=1.0, label_points=True)
+
+
+# --- saving -----------------------------------------------------------------------------------------------------------
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """Files of a folder by name; of figures what does not differ from run to run."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.name == "summary.json":
+            facts = json.loads(path.read_text())
+            found[path.name] = {name: value for name, value in facts.items() if name not in ("timings_s", "weights")}
+        elif path.name == "report.html":
+            found[path.name] = re.sub(r'"timings_s": \{.*?\}|"weights": ".*?"', "", path.read_text())
+        elif path.name != MARKER:
+            found[path.name] = path.read_bytes()
+    return found
+
+
+def test_a_result_is_saved_as_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    np.save(tmp_path / "cloud.npy", seen())
+    monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: MODEL)
+    reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "command", resolution=24)
+    found = mereo.answer(tmp_path / "cloud.npy", MODEL, resolution=24)
+    assert found.save(tmp_path / "python") == tmp_path / "python"
+    ours, theirs = contents(tmp_path / "python"), contents(tmp_path / "command")
+    assert ours == theirs and len(ours) == 5 and (tmp_path / "python" / MARKER).is_file()
+
+
+def test_one_file_is_that_of_the_folder(result: Result, tmp_path: Path) -> None:
+    result.save(tmp_path / "all", formats=("glb", "ply", "npz", "vti", "seg.nrrd", "json"))
+    folder = contents(tmp_path / "all")
+    for suffix in SINGLE:
+        if suffix == ".nii.gz":  # needs an extra, and compresses the time with it
+            continue
+        path = result.save(tmp_path / f"one{suffix}")
+        name = next(name for name in folder if name.endswith(suffix))
+        (tmp_path / suffix).mkdir()
+        path.rename(tmp_path / suffix / name)
+        assert contents(tmp_path / suffix) == {name: folder[name]}, suffix
+
+
+def test_nobodys_files_are_replaced(result: Result, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine.txt").write_text("keep")
+    for place in ("out", "one.glb"):
+        (tmp_path / "one.glb").write_text("keep")
+        with pytest.raises(FileExistsError, match="not overwritten"):
+            result.save(tmp_path / place)
+    with pytest.raises(FileExistsError, match="its content is not mereo's"):
+        result.save(tmp_path / "out", force=True)
+    assert (tmp_path / "out/mine.txt").read_text() == (tmp_path / "one.glb").read_text() == "keep"
+    result.save(tmp_path / "one.glb", force=True)
+    assert (tmp_path / "one.glb").read_bytes()[:4] == b"glTF"
+    np.savez(tmp_path / "frame.npz", points=seen())
+    with pytest.raises(FileExistsError, match="frame.npz"):
+        mereo.answer(tmp_path / "frame.npz", MODEL, resolution=8).save(tmp_path / "frame.npz", force=True)
+
+
+def test_other_names_are_refused(result: Result, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"x.stl has the suffix '.stl'; one file is .glb, .ply, .*: choose one"):
+        result.save(tmp_path / "x.stl")
+    with pytest.raises(ValueError, match="one file, whose suffix says its format"):
+        result.save(tmp_path / "x.glb", formats=("ply",))
+    with pytest.raises(ValueError, match="there is no format 'plx'"):
+        unchecked(Result.save)(result, tmp_path / "x", formats=("plx",))
+    assert list(tmp_path.iterdir()) == []
+    assert result.save(tmp_path / "take-1.2", formats=("npz",)).is_dir()
+
+
+# --- told -------------------------------------------------------------------------------------------------------------
+
+
+def test_values_tell_themselves_in_one_line(result: Result) -> None:
+    view = load_scene("rope")
+    camera = Camera.from_fov(4, 3, 0.5)
+    values: Sequence[object] = (
+        result,
+        result.reconstruction,
+        result.reconstruction.surfaces,
+        result.reconstruction.surfaces.segments[0],
+        result.reconstruction.labels,
+        result.reconstruction.segments,
+        result.reconstruction.code,
+        result.reconstruction.reading,
+        result.reconstruction.observed,
+        result.seen,
+        result.seen.frame,
+        result.seen.cloud,
+        untrained(("a",)),
+        view,
+        toy_scene(),
+        DepthImage(np.zeros((3, 4)), camera),
+        DepthImage(np.full((3, 4), 2.0), camera),
+        PointCloud(np.zeros((0, 3))),
+        MODEL.query(result.reconstruction.code, seen()[:5]),
+        Located(np.ones(1, np.uint8), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3))),
+        Evaluation(("a",), np.array([[5, 1], [1, 3]]), {}),
+    )
+    for value in values:
+        assert "\n" not in repr(value) and "array(" not in repr(value) and len(repr(value)) < 250, repr(value)
+    assert repr(result.seen.cloud) == "PointCloud(1,200 points, 0.12 x 0.18 x 0.06)"
+    assert repr(values[16]) == "DepthImage(4 x 3 pixels, 12 measured, depth 2 to 2)"
+    assert repr(result).startswith("Result('cloud': 2 of 3 segments; network alone; ")
+    assert repr(values[-1]) == "Evaluation(0 examples: IoU 0.600, mIoU 0.600; a)"
+    assert "9 segments: base, segment_1, segment_2, segment_3, segment_4, ... (9)" in repr(view)
+
+
+def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
+    page = result._repr_html_()
+    pictures = [np.asarray(Image.open(io.BytesIO(base64.b64decode(code))).convert("RGB")) for code in images(page)]
+    assert [picture.shape[1] for picture in pictures] == [300, 300] and len(page) < 60_000
+    dots = [int((picture.max(axis=2) < 60).sum()) for picture in pictures]
+    assert dots[0] > 1.5 * dots[1] > 0, "the camera sees all that it has measured, its right half of it"
+    rows = re.findall(r"<tr>(.*?)</tr>", page)[1:]
+    assert ["&lt;small&gt;" in row for row in rows] == [False, True, False] and "<small>" not in page
+    assert "not found" in rows[2] and "volume, cm³" in page and "centre, mm" in page
+    volume, _, place = re.findall(r"<td>(.*?)</td>", rows[0])
+    assert float(volume) == pytest.approx(4 / 3 * np.pi * 6**3, rel=0.02)
+    np.testing.assert_allclose([float(value) for value in place.split()], [20, -30, 600], atol=2)
+
+
+def images(page: str) -> list[str]:
+    return re.findall(r'base64,([^"]+)"', page)
+
+
+def test_lengths_are_in_units_where_no_unit_is_known() -> None:
+    result = mereo.answer(
+        PointCloud(1000 * seen()), replace(MODEL, field=lambda p: MODEL.field(p / 1000)), resolution=16
+    )
+    assert result.unit == Unit(None) and "volume, units³" in result._repr_html_()
+    assert Unit(None).volume(12345.6) == "12,346" and Unit(0.01).volume(2.0) == "2"
+    assert Unit(0.01).place(np.array([1.0, -0.5, 0.0])) == "10 -5 0"
+
+
+# --- frames -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_frame_may_be_many_things(result: Result, tmp_path: Path) -> None:
+    np.save(tmp_path / "cloud.npy", seen())
+    frame = mereo.load_frame(tmp_path / "cloud.npy", unit_m=0.5)
+    assert frame.unit_m == 0.5 and result.seen.frame.unit_m == 1.0
+    grid = result.reconstruction.labels.labels
+    for one in (tmp_path / "cloud.npy", frame, result.seen, PointCloud(seen()), seen().tolist()):
+        found = mereo.answer(np.array(one) if isinstance(one, list) else one, MODEL, "off", 24)
+        np.testing.assert_array_equal(found.reconstruction.labels.labels, grid)
+    known = replace(MODEL, provenance={"visible_m": [2, 3]})
+    with pytest.warns(SizeWarning, match="the visible part is 0.18 m long, but 2 to 3 m in training"):
+        mereo.answer(tmp_path / "cloud.npy", known, resolution=8)
+    mereo.answer(seen(), known, resolution=8)  # of no stated unit, so that there is nothing to warn of
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    frame = mereo.load_frame("rope")
+    with pytest.raises(ValueError, match="for a frame that states its own; give them where it is read"):
+        mereo.answer(frame, MODEL, axes="scanner")
+    with pytest.raises(ValueError, match="fit is 'fulll'; it must be one of .*: correct the spelling"):
+        unchecked(mereo.answer)(seen(), MODEL, "fulll")
+    with pytest.raises(ValueError, match="the unit of the points is not known: give unit_m"):
+        mereo.answer(seen(), MODEL, isolation=IsolationConfig(largest_cluster=True))
+    with pytest.raises(ValueError, match="the unit is -1 m; it must be positive"):
+        mereo.answer(seen(), MODEL, unit_m=-1)
+    with pytest.raises(
+        FileNotFoundError, match="there is no frame 'bunnny'; give a file or one of the shipped: bunny,"
+    ):
+        mereo.load_frame("bunnny")
+    with pytest.raises(ValueError, match="the shipped frame 'rope' is in metres and needs no options"):
+        mereo.load_frame("rope", unit_m=0.001)
+    with pytest.raises(ValueError, match="both a reading and mask are given"):
+        mereo.load_frame("rope", mereo.InputConfig(), mask=tmp_path / "mask.png")
+    with pytest.raises(TypeError, match="unit"):
+        mereo.load_frame(tmp_path / "x.ply", unit=1.0)
+
+
+def test_shipped_frames_are_in_metres() -> None:
+    sizes = {name: float(np.ptp(mereo.load_frame(name).cloud.points, axis=0).max()) for name in ("bunny", "liver")}
+    assert 0.1 < sizes["bunny"] < 0.2 and 0.16 < sizes["liver"] < 0.3, sizes
+
+
+# --- the viewer -------------------------------------------------------------------------------------------------------
+
+
+class Server:
+    """As much of viser's as a page needs."""
+
+    stopped = 0
+
+    def get_port(self) -> int:
+        return 1234
+
+    def stop(self) -> None:
+        self.stopped += 1
+
+
+def test_a_page_stays_open_where_somebody_goes_on(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = Server()
+    page = OpenPage(server, serve.Entry())
+    monkeypatch.setattr(OpenPage, "wait", lambda page: page.close())
+    monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
+    assert page.stay() is page and server.stopped == 0
+    assert capsys.readouterr().out == "open http://127.0.0.1:1234 in a browser; close() ends\n"
+    assert (
+        'iframe src="http://127.0.0.1:1234"' in page._repr_html_() and repr(page) == "OpenPage('http://127.0.0.1:1234')"
+    )
+    monkeypatch.delattr(sys, "ps1")
+    page.stay()
+    page.close()
+    assert server.stopped == 1 and "Ctrl-C ends" in capsys.readouterr().out
+    assert "iframe" not in page._repr_html_()
+
+
+def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is computed again: the page's surfaces are the result's."""
+    shown: list[Any] = []
+    monkeypatch.setattr(serve, "import_viser", lambda: None)
+    monkeypatch.setattr(serve, "start_server", lambda port, *_: shown.append(port) or Server())
+    monkeypatch.setattr(serve, "FramePage", lambda *given: shown.append(given))
+    with result.show(block=False) as page, mereo.view(result, block=False, port=8081):
+        assert page.address == "http://127.0.0.1:1234"
+    assert shown[0] == 0 and shown[2] == 8081
+    _, inspection, title, facts, unit = shown[1]
+    assert inspection.surfaces is result.reconstruction.surfaces and inspection.code is result.reconstruction.code
+    assert (title, unit) == ("cloud", "m") and facts.startswith("1,200 points")
+    with pytest.raises(ValueError, match="both .* and --scene rope are given; one can be shown: drop one"):
+        mereo.view("frame.ply", scene="rope", block=False)
+
+
+# --- the commands as functions ----------------------------------------------------------------------------------------
+
+
+def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(steps.shards, "generate", lambda *given, **named: calls.append((*given, named)))
+    assert mereo.generate(tmp_path / "mine.yaml", str(tmp_path / "data"), examples=3, workers=2) == tmp_path / "data"
+    ((scene, output, settings, named),) = calls
+    assert (scene, output, settings) == (str(tmp_path / "mine.yaml"), tmp_path / "data", GenerateConfig())
+    assert named["examples"] == 3 and named["seed"] == 0 and named["workers"] == 2 and named["shard"] == (0, 1)
+    trained: list[TrainConfig] = []
+    monkeypatch.setattr(steps.trainer, "train", lambda data, run, recipe: trained.append(recipe) or run / "w")
+    assert mereo.train("data", tmp_path, "tiny", init="rope") == tmp_path / "w"
+    assert trained == [replace(PRESETS["tiny"], init="rope")]
+    with pytest.raises(ValueError, match="the preset is 'tinny'; it must be one of paper, .*: correct the spelling"):
+        unchecked(mereo.train)("data", tmp_path, "tinny")
+    with pytest.raises(TypeError, match="epoch"):
+        mereo.train("data", tmp_path, epoch=3)
+
+
+def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
+    model = untrained(load_scene("rope").rest.names)
+    alone = mereo.evaluate(model, examples=1, cells=8, fit="off", progress=False)
+    written = mereo.evaluate(model, load_scene("rope"), output=tmp_path / "out", examples=1, cells=8, fit="off")
+    np.testing.assert_array_equal(alone.confusion, written.confusion)
+    assert json.loads((tmp_path / "out/metrics.json").read_text())["scene"] == "rope"
+    with pytest.raises(ValueError, match="scans are real and take no simulated camera"):
+        mereo.evaluate(model, scans=(), settings=GenerateConfig())
+
+
+def test_learn_and_export_return_what_they_leave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Any] = []
+    scores = {"iou": 0.9, "miou": 0.8}
+    monkeypatch.setattr(steps.learning, "learn", lambda files, output, **named: calls.append((files, named)) or scores)
+    learned = mereo.learn("rope", tmp_path, minutes=3)
+    assert calls == [([Path("rope")], {"minutes": 3, "init": "", "units": None, "workers": 1})]
+    assert learned.weights == tmp_path / "weights.safetensors" and learned.scene == "rope" and learned.miou == 0.8
+    assert repr(learned).endswith("weights.safetensors': IoU 0.900, mIoU 0.800)")
+    monkeypatch.setattr(steps, "export_weights", lambda *given: calls.append(given))
+    assert mereo.export("rope", tmp_path / "graphs", "torch") == tmp_path / "graphs"
+    assert calls[-1] == ("rope", tmp_path / "graphs", "torch", False)
+
+
+@pytest.mark.slow
+def test_the_lines_of_the_readme_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert names["result"].taken and names["here"].shape == (1, 3)
+    np.testing.assert_allclose(names["result"].registration.to_rest(names["here"]), [[0, 1, 2]], atol=0.01)
+    assert sorted(path.name for path in (tmp_path / "result").glob("[!.]*")) == [
+        *("labels.npz", "preview.png", "report.html", "segments.glb", "state.json", "summary.json")
+    ]
