@@ -11,7 +11,7 @@ import trimesh
 from analytic import AnalyticModel, ball, logits_of
 
 from mereo.__main__ import main, parse
-from mereo.cli.commands import Reconstruct
+from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE
 from mereo.io.config import FilesConfig
@@ -130,7 +130,7 @@ def test_the_command_line_takes_formats() -> None:
         parse([*start, "--formats", "ply", "seg.nrrd", "--millimetres", "--unit-m", "0.001"]),
         parse(start),
     )
-    assert isinstance(chosen, Reconstruct) and isinstance(default, Reconstruct)
+    assert isinstance(chosen, ReconstructCommand) and isinstance(default, ReconstructCommand)
     assert chosen.files == FilesConfig(("ply", "seg.nrrd"), True)
     assert chosen.reading.unit_m == 0.001
     assert chosen_formats(default.files.formats) == ("glb", "npz", "json")
