@@ -18,7 +18,7 @@ from PIL import Image
 from toy_scene import toy_scene
 
 import mereo
-from mereo.cli.reconstruct import reconstruct_file
+from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.evaluation.results import Evaluation
 from mereo.fitting.registration import Located
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
@@ -78,7 +78,7 @@ def contents(folder: Path) -> dict[str, Any]:
 def test_a_result_is_saved_as_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
     monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: MODEL)
-    reconstruct_file(tmp_path / "cloud.npy", "any", tmp_path / "command", resolution=24)
+    reconstruct_file(tmp_path / "cloud.npy", tmp_path / "command", FrameJob("any", 24))
     found = mereo.answer(tmp_path / "cloud.npy", MODEL, resolution=24)
     assert found.save(tmp_path / "python") == tmp_path / "python"
     ours, theirs = contents(tmp_path / "python"), contents(tmp_path / "command")
