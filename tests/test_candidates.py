@@ -37,6 +37,7 @@ def view() -> View:
     return sample_view(load_scene("engine").for_seed(SEED), GenerateConfig(), example_rng(SEED, 0))
 
 
+@pytest.mark.slow
 def test_a_user_gets_what_is_scored(model: Model, view: View) -> None:
     cloud, grid = view.depth.to_points(), truth_grid(view.mesh, 24).grid
     alone = find_candidates(model, cloud, grid, None, 1.0)

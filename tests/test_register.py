@@ -43,7 +43,7 @@ def network(model: Model, view: SampleView) -> Reconstruction:
 
 @pytest.fixture(scope="module")
 def found(model: Model, view: SampleView) -> Answer:
-    return answer(view.depth.to_points(), model, Registrar.of(model), 48, label_points=True)
+    return answer(view.depth.to_points(), model, Registrar.of(model, "modes"), 48, label_points=True)
 
 
 def iou(view: SampleView, result: Reconstruction) -> float:

@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, arg
+from mereo.cli.positionals import RepositoryName, WeightsName
 
 
 @dataclass(frozen=True)
@@ -19,8 +18,8 @@ class WeightsPush:
         private: where the repository is new, only its owner sees it.
     """
 
-    weights: Annotated[Positional[str], arg(metavar="WEIGHTS")]
-    repository: Annotated[Positional[str], arg(metavar="REPOSITORY")]
+    weights: WeightsName
+    repository: RepositoryName
     private: bool = False
 
     def run(self) -> None:
@@ -42,7 +41,7 @@ class WeightsPull:
         force: replace existing files.
     """
 
-    repository: Annotated[Positional[str], arg(metavar="REPOSITORY")]
+    repository: RepositoryName
     output: Path = Path()
     force: bool = False
 
