@@ -29,6 +29,9 @@ ASSETS = {
 OPTIONS = {"loop.py": ("--fps", "1"), "shipped_weights.py": ("--weights", "rope", "--cells", "24")}
 """What keeps an example short."""
 
+LONG = ("loop.py",)
+"""Those that take half a minute."""
+
 EXTRAS = {"simulate_liver.py": "mujoco"}
 """Modules that come with an extra of the package."""
 
@@ -37,7 +40,7 @@ def test_every_example_is_run() -> None:
     assert {path.name for path in EXAMPLES.glob("*.py")} == set(EXPECTED)
 
 
-@pytest.mark.parametrize("name", EXPECTED)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in EXPECTED])
 def test_example_runs(name: str, tmp_path: Path, require_asset: Callable[[str], Path]) -> None:
     for asset in ASSETS.get(name, ()):
         require_asset(asset)
