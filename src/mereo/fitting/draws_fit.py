@@ -43,7 +43,17 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
         camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
         found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
     best = min(found, key=lambda fit: fit.misfit, default=None)
-    return None if best is None else jump(problem, best)
+    return None if best is None else by_sight(problem, jump(problem, best))
+
+
+def by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
+    """The state brought to what the lines of sight meet.
+
+    Nearest places lead there from afar, and noise takes them a little beside it.
+    """
+    sighted = replace(problem, by_sight=True)
+    start = played(sighted, fit.drawn, fit.z, fit.posed)
+    return fit if start is None else descend(sighted, start, problem.config.last_rounds)
 
 
 def like_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:

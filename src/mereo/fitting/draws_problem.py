@@ -33,6 +33,8 @@ class DrawsProblem:
         states: random states of the scene.
         found: correspondences, scene units.
         weights: how their rest positions follow the material points.
+        config: constants.
+        by_sight: whether observed points are compared with what their lines of sight meet, or with the nearest places.
     """
 
     base: Problem
@@ -40,6 +42,7 @@ class DrawsProblem:
     found: Correspondences
     weights: PointWeights
     config: DrawsConfig
+    by_sight: bool = False
 
     @property
     def model(self) -> StatisticalModel:
@@ -93,7 +96,7 @@ class DrawsFit:
         posed: rigid pose; its ``z`` is empty.
         material: material points, unposed.
         surface: the posed surface.
-        distance, face, place: of what each observed partner's line of sight meets (``Surface.along_sight``).
+        distance, face, place: of what each observed partner is compared with.
         misfit: with the prior of the draws, the cloud by its last sigma.
         motion: of the played points for a standard deviation of each draw, where it is known.
     """
@@ -124,7 +127,8 @@ def played(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], pose
     surface = Surface.through(problem.model, rigid.place(material))
     if len(surface.facing) == 0:
         return None
-    met = problem.base.met(surface)
+    partners = problem.base.evidence.partners
+    met = problem.base.met(surface) if problem.by_sight else surface.nearest(partners)
     fit = DrawsFit(drawn, z, rigid, material, surface, *met, np.inf)
     return replace(fit, misfit=misfit(problem, fit, problem.base.config.cloud_sigma))
 
