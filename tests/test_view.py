@@ -22,7 +22,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.training.config import PRESETS
-from mereo.visualization.viewer import display, html
+from mereo.visualization.viewer import display, html, open_page
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory

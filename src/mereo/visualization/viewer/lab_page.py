@@ -4,49 +4,25 @@ Hands only leave wishes; one thread (``LatestWins``) fulfils them, so that the p
 """
 
 import threading
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import transform_points
 from mereo.scenes.parameters import Parameter, Refused
-from mereo.synthesis.examples import View
-from mereo.visualization.vertex_colors import (
-    CONFIDENCE,
-    ColorScale,
-    confidence,
-    distance_scale,
-    error_scale,
-    observed_distance,
-    surface_error,
-)
 from mereo.visualization.viewer import html
-from mereo.visualization.viewer.display import CLOUD_COLOR, CLOUD_SIZE, Display, SegmentControls, SegmentLayer
+from mereo.visualization.viewer.display import SegmentControls
+from mereo.visualization.viewer.lab_stage import COLORINGS, SHOWN, LabStage, Moment
 from mereo.visualization.viewer.laboratory import Laboratory, Trial, depth_picture
 from mereo.visualization.viewer.latest_request import LatestWins
 from mereo.visualization.viewer.sliders import CameraSliders, ParameterSliders
 
-SHOWN = ("reconstruction", "truth", "side by side")
-COLORINGS = ("segment", "error", "confidence", "distance")
 QUICK, FINE = (32, 24), (96, 64)
 """Resolution of surfaces and cells of the score, while a slider moves and when it rests."""
 
 HISTORY = 60
 """Scores that the curve remembers."""
-
-
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """Moment that the page shows: a state as it is seen, and what has been made of that so far."""
-
-    view: View
-    trial: Trial | None = None
 
 
 class LabPage:
@@ -63,8 +39,7 @@ class LabPage:
         self.shape: Any = None
         self.moment: Moment | None = None
         rest = laboratory.scene.rest
-        self.stage = Display(server, rest.bounds, np.asarray(laboratory.scene.workspace.axis, dtype=float))
-        self.found, self.true = SegmentLayer(self.stage, "/found"), SegmentLayer(self.stage, "/true")
+        self.stage = LabStage(server, laboratory)
         self._build_results(title, facts)
         self._build_controls(rest)
         self._look()
@@ -114,6 +89,8 @@ class LabPage:
         view.on_click(lambda _: self._look(view.value))
         for handle in (self._shown, self._coloring, self._points):
             handle.on_update(lambda _: self._draw())
+        # white points would hide the colours that are looked at
+        self._coloring.on_update(lambda _: setattr(self._points, "value", self._coloring.value == "segment"))
         self._shown.on_update(lambda _: self._look())
         gui.add_button("Random state").on_click(lambda _: self._wish_anew())
         with gui.add_folder("Camera"):
@@ -132,7 +109,7 @@ class LabPage:
         direction = {"camera": toward + 0.2 * right, "side": right, "behind": -toward}[name]
         room = 1.35 if self._shown.value != "side by side" else 2.4
         # up is where the depth image has it, so that a rolled camera's view looks like its image
-        self.stage.look_from(direction, bounds, room, -T_world_camera[:3, 1])
+        self.stage.stage.look_from(direction, bounds, room, -T_world_camera[:3, 1])
 
     # --- wishes -------------------------------------------------------------------------------------------------------
 
@@ -217,61 +194,9 @@ class LabPage:
         if moment is None:
             return
         with self._drawing, self.server.atomic():
-            mode, T_world_camera = self._shown.value, moment.view.T_world_camera
-            # side by side: both give way, along the camera's horizon
-            aside = (1.2 if mode == "side by side" else 0.0) * T_world_camera[:3, 0]
-            self._draw_camera(moment.view, -aside)
-            if mode == "reconstruction":
-                self.true.clear_from()
-            else:
-                self.true.show(moment.view.mesh.transformed(T_world_camera), self.controls, shift=aside)
-            self._legend.visible = False
-            if moment.trial is None or mode == "truth":
-                self.found.clear_from()
-                return
-            colors = self._colors(moment.view, moment.trial)
-            surfaces = moment.trial.result.surfaces.transformed(T_world_camera)
-            self.found.show(surfaces, self.controls, colors, -aside)
-
-    def _draw_camera(self, view: View, shift: Float[np.ndarray, "3"]) -> None:
-        """The observed points, and the camera with its image at its place."""
-        scene, T_world_camera = self.server.scene, view.T_world_camera
-        points = self.stage.place(transform_points(T_world_camera, view.depth.to_points().points))
-        scene.add_point_cloud(
-            "/points",
-            points + shift,
-            CLOUD_COLOR,
-            point_size=CLOUD_SIZE,
-            point_shape="circle",
-            precision="float32",
-            visible=bool(self._points.value),
-        )
-        x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
-        scene.add_camera_frustum(
-            "/camera",
-            self.laboratory.scene.workspace.fov_rad,
-            1.0,
-            scale=0.35,
-            color=(150, 160, 176),
-            image=depth_picture(view.depth),
-            format="png",
-            wxyz=(w, x, y, z),
-            position=tuple(self.stage.place(T_world_camera[:3, 3])),
-        )
-
-    def _colors(self, view: View, trial: Trial) -> list[np.ndarray] | None:
-        """Colours of the reconstruction's vertices, with their legend; None for the segments' own."""
-        mode, surfaces = self._coloring.value, trial.result.surfaces
-        if mode == "segment":
-            return None
-        scale: ColorScale
-        if mode == "error":
-            values, scale = surface_error(surfaces, Solids(view.mesh)), error_scale(view.mesh, "")
-        elif mode == "confidence":
-            assert self.laboratory.model is not None
-            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.result.code)), CONFIDENCE
-        else:
-            values = observed_distance(surfaces, view.depth.to_points().points)
-            scale = distance_scale(values, "")
-        self._legend.content, self._legend.visible = html.color_bar(scale), True
-        return [scale.colors(value) for value in values]
+            mode, coloring, points = self._shown.value, self._coloring.value, bool(self._points.value)
+            scale = self.stage.draw(moment, mode, coloring, self.controls, points)
+            self._legend.content, self._legend.visible = (
+                "" if scale is None else html.color_bar(scale),
+                scale is not None,
+            )
