@@ -1,19 +1,22 @@
 """What lies on the stage of the viewer's pages: points as large as their spacing allows, names, colours in sight."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from browser import until
 from test_view import toy_inspection
+from toy_scene import toy_scene
 
 from mereo.models.weights import load_model
-from mereo.scenes.parameters import random_state
+from mereo.scenes.parameters import Parameter, random_state
 from mereo.scenes.registry import load_scene
 from mereo.visualization.viewer import display
 from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, SegmentControls, point_size
 from mereo.visualization.viewer.frame_page import FramePage
+from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.lab_stage import ASIDE, LabStage, Moment
 from mereo.visualization.viewer.laboratory import Laboratory
 
@@ -75,3 +78,38 @@ def test_side_by_side_both_are_named_under_themselves(server: object) -> None:
     assert lowest < true @ down < lowest + 0.5
     assert stage.draw(moment, "truth", "segment", controls, points=True) is None
     assert nodes(server)["/points"].visible and not any(name.startswith("/names/") for name in nodes(server))
+
+
+@needs_viser
+def test_undo_takes_back_what_one_hand_did(server: object) -> None:
+    page = LabPage(server, Laboratory(toy_scene(), None), "toy", "no weights")
+    try:
+        until(lambda: page.moment is not None)
+        first = page.shape
+        freedom = page.laboratory.freedom
+        assert page._undo.disabled
+        one, other = freedom.parameters(first)[:2]
+
+        def change(act: Callable[[], None]) -> None:
+            before = page.moment
+            act()
+            until(lambda: page.moment is not before)
+
+        def value(of: Parameter) -> float:
+            return next(p.value for p in freedom.parameters(page.shape) if p.key == of.key and p.index == of.index)
+
+        middle, end = (one.low + one.high) / 2, 0.9 * one.high + 0.1 * one.low
+        change(lambda: page._wish(one, middle))
+        change(lambda: page._wish(one, end))  # the same slider, still being dragged
+        change(lambda: page._wish(other, (other.low + other.high) / 2))
+        change(page._wish_anew)
+        assert not page._undo.disabled
+        change(page._wish_back)
+        assert value(one) == pytest.approx(end)
+        change(page._wish_back)
+        assert value(one) == pytest.approx(end) and value(other) == pytest.approx(other.value)
+        change(page._wish_back)
+        assert page.shape is first
+        until(lambda: page._undo.disabled)
+    finally:
+        page.close()

@@ -123,7 +123,7 @@ def _scene_parts(path: Path) -> list[Part]:
     nodes.sort(key=lambda node: (order[scene.graph[node][1]], node))
     parts = [_part(scene, node, path.stem if len(nodes) == 1 else "") for node in nodes]
     own = stl_segment_name(path) if path.suffix.lower() == ".stl" else None
-    return parts if own is None else [(own, *rest) for _, *rest in parts]
+    return parts if own is None else [(own, color, vertices, faces) for _, color, vertices, faces in parts]
 
 
 def _has_faces(scene: Any, node: str) -> bool:

@@ -22,7 +22,7 @@ QUICK, FINE = (32, 24), (96, 64)
 """Resolution of surfaces and cells of the score, while a slider moves and when it rests."""
 
 HISTORY = 60
-"""Scores that the curve remembers."""
+"""Scores that the curve, and changes that "Undo" remembers."""
 
 
 class LabPage:
@@ -35,6 +35,9 @@ class LabPage:
         self._wishes: dict[tuple[Any, int | None], tuple[Parameter, float]] = {}
         self._first_seed = seed
         self._new_seed: int | None = None
+        self._back = False
+        self._past: list[Any] = []
+        self._hand: frozenset[Any] = frozenset()
         self._scores: list[tuple[float, float]] = []
         self.shape: Any = None
         self.moment: Moment | None = None
@@ -93,6 +96,8 @@ class LabPage:
         self._coloring.on_update(lambda _: setattr(self._points, "value", self._coloring.value == "segment"))
         self._shown.on_update(lambda _: self._look())
         gui.add_button("Random state").on_click(lambda _: self._wish_anew())
+        self._undo = gui.add_button("Undo", disabled=True)
+        self._undo.on_click(lambda _: self._wish_back())
         with gui.add_folder("Camera"):
             self._camera = CameraSliders(gui, self.laboratory, lambda: self.worker.submit(None))
         self._sliders = ParameterSliders(gui, gui.add_folder("Deformation"), self._wish)
@@ -123,13 +128,29 @@ class LabPage:
             self._new_seed = int(self._seeds.integers(2**31))
         self.worker.submit(None)
 
+    def _wish_back(self) -> None:
+        with self._wishing:
+            self._wishes, self._new_seed, self._back = {}, None, True
+        self.worker.submit(None)
+
+    def _remember(self, hand: frozenset[Any]) -> None:
+        """Keep the shape that is about to change; what one slider does until another hand moves is one change."""
+        if self.shape is not None and (hand != self._hand or not hand):
+            self._past = [*self._past, self.shape][-HISTORY:]
+        self._hand = hand
+
     def _fulfil(self) -> tuple[Any, Refused | None]:
         """The shape that is wished for. Values that are refused are left out, and the last of them is told."""
         with self._wishing:
-            wishes, seed = list(self._wishes.values()), self._new_seed
-            self._wishes, self._new_seed = {}, None
+            wishes, hand, seed, back = list(self._wishes.values()), frozenset(self._wishes), self._new_seed, self._back
+            self._wishes, self._new_seed, self._back = {}, None, False
         freedom, refusal = self.laboratory.freedom, None
+        if back and self._past:
+            *self._past, shape = self._past
+            self._hand = frozenset()
+            return shape, None
         if seed is not None:
+            self._remember(frozenset())
             return freedom.random(seed), None
         shape = freedom.first(self._first_seed) if self.shape is None else self.shape
         for parameter, value in wishes:
@@ -137,12 +158,15 @@ class LabPage:
                 shape = freedom.moved(shape, parameter, value)
             except Refused as error:
                 refusal = error
+        if shape is not self.shape and wishes:
+            self._remember(hand)
         return shape, refusal
 
     # --- the worker's thread ------------------------------------------------------------------------------------------
 
     def _quick(self, _: None) -> None:
         self.shape, refusal = self._fulfil()
+        self._undo.disabled = not self._past
         self._sliders.show(self.laboratory.freedom.parameters(self.shape))
         view, is_first = self.laboratory.look(self.shape, self._camera.place()), self.moment is None
         self.moment = Moment(view)
