@@ -269,7 +269,9 @@ def test_draws_keep_their_values_with_their_names() -> None:
 
 def test_built_in_scenes_name_their_sliders() -> None:
     robot = [(f.name, f.unit, f.low, f.high) for f in parameters(random_state(load_scene("robot"), 0))]
-    assert [name for name, *_ in robot] == ["turn", "lean", "fold", "roll", "pitch", "spin", "opening"]
+    moved = [name.rsplit(" ", 1)[0].replace(" ", "_") for name, *_ in robot]
+    assert (*moved[:6], "finger_left") == load_scene("robot").rest.names[1:8] and robot[6][0] == "fingers apart"
+    assert {f.group for f in parameters(random_state(load_scene("skull"), 3))} == {"mandible"}
     assert robot[0][1:] == ("°", -170.0, 170.0)
     (cycle,) = parameters(random_state(load_scene("engine"), 0))
     assert (cycle.name, cycle.unit) == ("crank angle", "°")

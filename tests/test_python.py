@@ -178,6 +178,18 @@ def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
     np.testing.assert_allclose([float(value) for value in place.split()], [20, -30, 600], atol=2)
 
 
+def test_a_cloud_has_metres_only_where_somebody_says_so(tmp_path: Path) -> None:
+    np.save(tmp_path / "cloud.npy", seen())
+    assumed = mereo.answer(mereo.load_frame(tmp_path / "cloud.npy"), MODEL, resolution=16)
+    assert assumed.seen.frame.unit_m == 1.0 and assumed.unit == Unit(None)
+    told = mereo.answer(mereo.load_frame(tmp_path / "cloud.npy", unit_m=1.0), MODEL, resolution=16)
+    assert told.unit == Unit(1.0)
+    assumed.save(tmp_path / "assumed.html")
+    told.save(tmp_path / "told.html")
+    assert "volume (units³)" in (tmp_path / "assumed.html").read_text(encoding="utf-8")
+    assert "volume (cm³)" in (tmp_path / "told.html").read_text(encoding="utf-8")
+
+
 def images(page: str) -> list[str]:
     return re.findall(r'base64,([^"]+)"', page)
 

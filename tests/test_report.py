@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.visualization.reconstruction_report import BUDGET_BYTES, cluster, write_report
+from mereo.visualization.units import Unit
 
 
 def ball(name: str, shift: float, color: tuple[int, int, int], level: int = 3) -> Segment:
@@ -28,7 +29,11 @@ def example() -> tuple[PointCloud, SegmentedMesh, dict[str, object]]:
     mesh = SegmentedMesh((ball("head", -0.1, PALETTE[0]), ball("tail </script><b>", 0.1, PALETTE[1]), lost))
     summary = {
         "title": "A <b>bold</b> </script> title",
-        "unit": "m",
+        "points": 104,
+        "frame": "camera",
+        "precision": "float32",
+        "clipped": True,
+        "spacing": 0.00201,
         "input": Path("scan.ply"),
         "segments": [
             {"name": s.name, "centroid": np.array([0.1, 0.2, 0.3]), "volume": np.float64(s.volume), "confidence": 0.5}
@@ -64,7 +69,7 @@ def test_the_page_holds_the_shapes_to_16_bits_of_the_box(tmp_path: Path) -> None
         np.testing.assert_array_equal(indices, segment.faces)
         assert (shown["name"], tuple(shown["color"])) == (segment.name, segment.color)
     assert not data["coarsened"]
-    assert data["summary"]["segments"][2]["confidence"] is None
+    assert data["words"]["rows"][2] == ["\N{EN DASH}", "0", None]
 
 
 def test_the_page_needs_nothing_from_outside_and_cannot_be_broken_by_names(tmp_path: Path) -> None:
@@ -73,6 +78,45 @@ def test_the_page_needs_nothing_from_outside_and_cannot_be_broken_by_names(tmp_p
     assert not re.search(r"https?://|src=|@import|url\(|fetch\(|XMLHttpRequest", page)
     assert page.count("</script>") == 1
     assert "<title>A &lt;b&gt;bold&lt;/b&gt; &lt;/script&gt; title</title>" in page
+
+
+@pytest.mark.parametrize(
+    ("unit", "heads", "row", "voxels"),
+    [
+        (Unit(1.0), ["centre x, y, z (mm)", "volume (cm³)"], [[100, 200, 300], 4189], "voxels of 2.01 mm"),
+        (
+            Unit(None),
+            ["centre x, y, z (units)", "volume (units³)"],
+            [[0.1, 0.2, 0.3], 4.19e-3],
+            "voxels of 0.00201 units",
+        ),
+    ],
+)
+def test_figures_are_in_millimetres_where_the_unit_is_known(
+    tmp_path: Path, unit: Unit, heads: list[str], row: list, voxels: str
+) -> None:
+    cloud, mesh, summary = example()
+    write_report(tmp_path / "r.html", cloud, mesh, summary, unit=unit)
+    words = page_data(tmp_path / "r.html")["words"]
+    assert words["heads"][1:3] == heads and voxels in words["facts"]
+    place, volume, confidence = words["rows"][0]
+    assert [float(value) for value in place.split()] == row[0] and confidence == 0.5
+    assert float(volume.replace(",", "")) == pytest.approx(row[1], rel=0.02)
+
+
+def test_the_page_counts_the_points_once_and_has_no_words_of_programs(tmp_path: Path) -> None:
+    cloud, mesh, summary = example()
+    told = {"answer": "registration", "explained": 0.973, "doubt": "doubtful: look at it"}
+    write_report(tmp_path / "r.html", cloud, mesh, {**summary, "registration": told, "patient_pose": "supine"})
+    data = page_data(tmp_path / "r.html")
+    words = data["words"]
+    assert words["facts"][0] == "your model, registered: it explains 97.3% of the points"
+    assert "patient pose: supine" in words["facts"]
+    text = " ".join(words["facts"])
+    assert not re.search(r"float32|camera|clipped|points:|104|_", text), text
+    assert data["cloud"]["count"] == len(cloud)
+    assert words["warnings"][0] == "Doubtful: look at it." and "may be cut off there." in words["warnings"][1]
+    assert words["timings_s"] == {"reading the points": 0.1, "field": 1.5}
 
 
 def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Path) -> None:
@@ -123,10 +167,12 @@ def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
     table = re.search(r'<table id="table">(.*?)</table>', text, re.DOTALL)
     assert table
     assert "tail &lt;/script&gt;&lt;b&gt;" in table[1]
-    assert "0.1,  0.2,  0.3" in table[1]
+    assert "0.1&nbsp;&nbsp;&nbsp;0.2&nbsp;&nbsp;&nbsp;0.3" in table[1]
     browse(address, tmp_path, f"--screenshot={tmp_path / 's.png'}")
     stage = np.asarray(Image.open(tmp_path / "s.png").convert("RGB"))[150:500, 40:680].astype(float)
     for segment in mesh.segments[:2]:
         wanted = np.asarray(segment.color, dtype=float)
         cosine = stage @ wanted / (np.linalg.norm(stage, axis=-1) * np.linalg.norm(wanted))
         assert (cosine > 0.99).sum() > 1000, f"{segment.name} is not to be seen"
+    drawn = np.flatnonzero((np.ptp(stage, axis=-1) > 60).any(axis=0))
+    assert np.ptp(drawn) > 0.8 * stage.shape[1], "the object does not fill the canvas"

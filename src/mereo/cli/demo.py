@@ -37,6 +37,7 @@ from mereo.reconstruction.pipeline import Reconstruction, extract, segment_names
 from mereo.scenes.assets import AssetUnavailable
 from mereo.visualization.result import registration_facts
 from mereo.visualization.result_files import write_files
+from mereo.visualization.units import Unit
 
 REAL_SCAN = "bun000"
 FRAMES = ("liver", "rope")
@@ -177,7 +178,9 @@ def _write(case: Case, found: Answer, registrar: Registrar | None, folder: Path)
         print_source(found)
         facts["registration"] = registration_facts(found)
     with new_directory(folder, force=True) as directory:
-        write_files(directory, found.reconstruction, case.cloud, case.frame, DEFAULT_FILES, 1.0, facts)
+        write_files(
+            directory, found.reconstruction, case.cloud, case.frame, DEFAULT_FILES, 1.0, facts, unit=Unit(case.unit_m)
+        )
         write_state(directory, found, registrar, case.weights, case.frame, 1.0)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.io.errors import readable
-from mereo.io.mesh_headers import check_mesh
+from mereo.io.mesh_headers import check_mesh, stl_segment_name
 
 VIEWER_ROOT = "camera_frame"
 """Name of the root node of our own GLB files; below it, vertices are in the input's camera frame."""
@@ -23,8 +23,8 @@ def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
     """Segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order.
 
     A file with several named parts (GLB nodes, OBJ objects or groups, 3MF objects) gives one segment each; a file with
-    one part gives one segment called after its GLB node, or else after the file. A directory stands for the mesh files
-    in it, by name.
+    one part gives one segment called after its GLB node, or as our own STL files say, or else after the file. A
+    directory stands for the mesh files in it, by name.
     Node transforms are applied, except the root of GLB files written by mereo: those come back in the camera frame.
     Vertices at the same position are merged, because exporters split them at normals and texture seams, which would
     open a closed mesh. ``SegmentedMesh.check`` is left to the caller.
@@ -121,7 +121,9 @@ def _scene_parts(path: Path) -> list[Part]:
     order = {key: index for index, key in enumerate(scene.geometry)}
     nodes = [node for node in scene.graph.nodes_geometry if _has_faces(scene, node)]
     nodes.sort(key=lambda node: (order[scene.graph[node][1]], node))
-    return [_part(scene, node, path.stem if len(nodes) == 1 else "") for node in nodes]
+    parts = [_part(scene, node, path.stem if len(nodes) == 1 else "") for node in nodes]
+    own = stl_segment_name(path) if path.suffix.lower() == ".stl" else None
+    return parts if own is None else [(own, color, vertices, faces) for _, color, vertices, faces in parts]
 
 
 def _has_faces(scene: Any, node: str) -> bool:

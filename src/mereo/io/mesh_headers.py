@@ -21,6 +21,19 @@ COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9
 """Components of each of glTF's element types."""
 
 
+STL_NAME = b"written by mereo: "
+"""What the header of our own STL files says before the name of the segment."""
+
+
+def stl_segment_name(path: Path) -> str | None:
+    """Name of the segment in an STL file that mereo wrote; None for another one."""
+    with path.open("rb") as file:
+        header = file.read(80)
+    if not header.startswith(STL_NAME):
+        return None
+    return header.removeprefix(STL_NAME).decode("utf-8", errors="replace").strip() or None
+
+
 def check_mesh(path: Path) -> None:
     """Check the header of a mesh file in one of the formats that have counts."""
     check = CHECKS.get(path.suffix.lower())

@@ -41,6 +41,7 @@ class SensorFrame:
         axes: the cloud's.
         depth: the depth image in metres that the points come from, without what a mask leaves out; None for clouds.
         message: the recording's message, by topic and time; empty for other files.
+        unit_stated: whether the file or an option says the unit; metres are assumed where neither does.
     """
 
     path: Path
@@ -49,6 +50,7 @@ class SensorFrame:
     axes: CloudAxes
     depth: DepthImage | None = None
     message: str = ""
+    unit_stated: bool = True
 
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in np.ptp(self.cloud.points, axis=0) * self.unit_m)
@@ -81,8 +83,9 @@ def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> Sensor
         return _recorded(recorded_frame(path, index, *_recording_options(reading)), path, reading)
     if kind == "depth image":
         return _depth_image(path, reading)
-    unit_m = FORMAT_UNITS_M.get(path.suffix.lower(), 1.0) if reading.unit_m is None else reading.unit_m
-    return SensorFrame(path, read_point_cloud(path, reading.drop_invalid), unit_m, reading.frame)
+    stated = FORMAT_UNITS_M.get(path.suffix.lower()) if reading.unit_m is None else reading.unit_m
+    cloud, unit_m = read_point_cloud(path, reading.drop_invalid), 1.0 if stated is None else stated
+    return SensorFrame(path, cloud, unit_m, reading.frame, unit_stated=stated is not None)
 
 
 def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFrame, Callable[[], SensorFrame]]]:

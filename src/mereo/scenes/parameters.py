@@ -285,6 +285,6 @@ def _share(call: Call, parameter: Parameter, value: float) -> float:
 
 def _refusal(parameter: Parameter) -> str:
     return (
-        f"the scene refuses this value of {parameter.name!r}: with the other values as they are, its parts would "
-        "touch, or fold over; the last state that it allows is shown: move another slider first"
+        f"the scene refuses this value of {parameter.name!r} ({parameter.group}): with the other values as they are, "
+        "its parts would touch, or fold over; the last state that it allows is shown: move another slider first"
     )

@@ -18,8 +18,10 @@ from jaxtyping import Float, Int, UInt16
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.io.atomic_files import atomic_file, to_json
+from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, OUTER_OPACITY
+from mereo.visualization.report_words import page_words
+from mereo.visualization.units import UNKNOWN, Unit
 
 BUDGET_BYTES = 5_000_000
 """Most bytes of a page."""
@@ -38,6 +40,7 @@ def write_report(
     surfaces: SegmentedMesh,
     summary: dict[str, Any],
     frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
+    unit: Unit = UNKNOWN,
 ) -> None:
     """Write the page of a reconstruction.
 
@@ -46,18 +49,19 @@ def write_report(
         cloud: the input, in its frame and units; at most ``CLOUD_POINTS`` of it are shown.
         surfaces: the segments in the same frame; those without faces are listed but not drawn, those
             around a nested one are drawn see-through.
-        summary: what the page says in words; every key may be missing. ``title`` and ``unit`` are text; ``segments`` is
-            a list of ``{"name", "centroid" [3], "volume", "confidence" in 0..1}`` in the order of ``surfaces``;
-            ``timings_s`` maps stages to seconds; other texts and numbers are listed as facts.
+        summary: what the page says in words; every key may be missing. ``title`` is text; ``segments`` is a list of
+            ``{"name", "centroid" [3], "volume", "confidence" in 0..1}`` in the order of ``surfaces``; ``timings_s``
+            maps stages to seconds; of the other texts and numbers those for people are listed (``report_words``).
         frame_rotation: rotation from the input's frame to the viewer's (x right, y up, z toward the viewer).
+        unit: of the cloud's lengths; the page has millimetres and cubic centimetres where it is known.
 
     Raises ``ValueError`` when the page cannot be brought under the budget.
     """
-    title = str(summary.get("title", "mereo reconstruction"))
     page = files("mereo.visualization").joinpath("report.html").read_text(encoding="utf-8")
-    data = _page_data(cloud, surfaces, summary, np.asarray(frame_rotation))
+    data = _page_data(cloud, surfaces, page_words(summary, unit), np.asarray(frame_rotation))
     # "</script>" inside a name must not end the script; \u003c is the same character to JSON
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False, default=str).replace("<", "\\u003c")
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    title = data["words"]["title"]
     page = page.replace(TITLE_MARKER, escape(title)).replace(DATA_MARKER, text)
     encoded = page.encode("utf-8", errors="replace")
     if len(encoded) > BUDGET_BYTES:
@@ -67,12 +71,12 @@ def write_report(
 
 
 def _page_data(
-    cloud: PointCloud, surfaces: SegmentedMesh, summary: dict[str, Any], rotation: Float[np.ndarray, "3 3"]
+    cloud: PointCloud, surfaces: SegmentedMesh, words: dict[str, Any], rotation: Float[np.ndarray, "3 3"]
 ) -> dict[str, Any]:
     points = _thin(cloud.points)
     low, high = _joint_bounds(points, surfaces)
-    # binary room: a page's text and the summary take the rest; base64 grows data by a third
-    room = int((BUDGET_BYTES - 300_000 - len(json.dumps(to_json(summary), default=str))) * 3 / 4) - 6 * len(points)
+    # binary room: the page's text takes the rest; base64 grows data by a third
+    room = int((BUDGET_BYTES - 300_000 - len(json.dumps(words))) * 3 / 4) - 6 * len(points)
     shown = _fit(surfaces, float((high - low).max()), room)
     return {
         "low": low.tolist(),
@@ -91,7 +95,7 @@ def _page_data(
             for full, part, opaque in zip(surfaces.segments, shown, surfaces.opaque, strict=True)
         ],
         "coarsened": any(len(a.faces) != len(b.faces) for a, b in zip(surfaces.segments, shown, strict=True)),
-        "summary": to_json(summary),
+        "words": words,
     }
 
 

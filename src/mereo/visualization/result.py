@@ -26,7 +26,7 @@ from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.visualization.result_files import write_files, write_one
 from mereo.visualization.result_html import result_html
-from mereo.visualization.units import Unit
+from mereo.visualization.units import UNKNOWN, Unit
 
 if TYPE_CHECKING:
     from mereo.visualization.viewer.open_page import OpenPage
@@ -76,12 +76,14 @@ class Result(Answer):
 
     @property
     def unit(self) -> Unit:
-        """Unit of all lengths, for people: by the true size of the registered model, or as it was stated."""
+        """Unit of all lengths, for people: as it was stated, or by the true size of the registered model."""
+        if self.unit_stated and self.seen.frame.unit_stated:
+            return Unit(self.seen.frame.unit_m)
         if self.taken and self.registration is not None:
             source = self.registration.model.source_frame
             if source is not None and source.unit_m is not None:
                 return Unit(source.unit_m / self.registration.scene_unit)
-        return Unit(self.seen.frame.unit_m if self.unit_stated else None)
+        return UNKNOWN
 
     def facts(self, carried: Sequence[Carried] = ()) -> dict[str, object]:
         """What the summary of a folder of results says first."""
@@ -102,7 +104,9 @@ class Result(Answer):
         """Write what `mereo reconstruct` does into a directory that is there."""
         frame = self.seen.frame
         facts = self.facts(carried)
-        write_files(directory, self.reconstruction, self.seen.cloud, frame.axes, files, frame.unit_m, facts, carried)
+        write_files(
+            directory, self.reconstruction, self.seen.cloud, frame.axes, files, frame.unit_m, facts, carried, self.unit
+        )
         write_state(directory, self, self.registrar, self.model.name, frame.axes, frame.unit_m)
 
     def save(
@@ -140,7 +144,9 @@ class Result(Answer):
             with atomic_file(path, force=force, inputs=self._read()) as partial:
                 files, facts = FilesConfig((), millimetres), self.facts()
                 cloud = self.seen.cloud
-                write_one(partial, suffix, self.reconstruction, cloud, frame.axes, files, frame.unit_m, facts)
+                write_one(
+                    partial, suffix, self.reconstruction, cloud, frame.axes, files, frame.unit_m, facts, self.unit
+                )
         return path
 
     def show(self, *, port: int | None = None, host: str = "127.0.0.1", block: bool | None = None) -> "OpenPage":

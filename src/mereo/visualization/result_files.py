@@ -37,6 +37,7 @@ from mereo.visualization.error_maps import error_picture
 from mereo.visualization.evaluation_report import write_evaluation_report
 from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.reconstruction_report import cluster, write_report
+from mereo.visualization.units import UNKNOWN, Unit
 
 PICTURED_FACES = 100_000
 """A mesh of more faces is coarsened for pictures: shading takes seconds for each hundred thousand."""
@@ -173,19 +174,21 @@ def write_reconstruction(
     *,
     frame: CloudAxes = "camera",
     files: FilesConfig = DEFAULT_FILES,
-    unit_m: float = 1.0,
+    unit_m: float | None = None,
     force: bool = False,
     **facts: object,
 ) -> None:
     """Write preview.png, report.html and ``files`` into a new directory, all or nothing.
 
     By default these are segments.glb, labels.npz and summary.json; ``mereo.io.writers.formats.WRITERS`` names all. The
-    format "points" needs ``reconstruct(..., label_points=True)``. ``facts`` (``title``, ``unit``, ...) are added to the
+    format "points" needs ``reconstruct(..., label_points=True)``. ``unit_m`` is metres per unit of the cloud; without
+    it files that need one take metres, and the report has plain units. ``facts`` (``title``, ...) are added to the
     summary and shown in the report. Raises ``FileExistsError`` for a directory with content unless ``force``, and
     ``ImportError`` where a format's extra is missing.
     """
     with new_directory(output_dir, force) as directory:
-        write_files(directory, result, cloud, frame, files, unit_m, facts)
+        metres = 1.0 if unit_m is None else unit_m
+        write_files(directory, result, cloud, frame, files, metres, facts, unit=Unit(unit_m))
 
 
 def write_files(
@@ -197,8 +200,11 @@ def write_files(
     unit_m: float,
     facts: dict[str, object],
     carried: Sequence[Carried] = (),
+    unit: Unit = UNKNOWN,
 ) -> None:
     """Write what ``write_reconstruction`` does into a directory that is there; ``facts`` go into the summary.
+
+    ``unit`` is that of the report, which tells no metres where they were only assumed.
 
     What is carried goes into ``carried/`` under its files' own names; its surfaces also into pictures and report, and
     together with the segments into ``carried.glb``, where GLB is asked for.
@@ -219,7 +225,7 @@ def write_files(
     summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
     extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
     told = [*({"name": part.name} for part in extra), *summary["segments"]]
-    write_report(directory / "report.html", cloud, pictured, {**summary, "segments": told}, to_viewer)
+    write_report(directory / "report.html", cloud, pictured, {**summary, "segments": told}, to_viewer, unit)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
 
 
@@ -232,6 +238,7 @@ def write_one(
     files: FilesConfig,
     unit_m: float,
     facts: dict[str, object],
+    unit: Unit = UNKNOWN,
 ) -> None:
     """Write the one file of a folder of results that has this suffix (".glb", ".html", ...) to a path."""
     if suffix in (".png", ".html"):
@@ -241,7 +248,7 @@ def write_one(
             return
     summary = summarize(result, **{"frame": frame, "unit_m": unit_m, **facts})
     if suffix == ".html":
-        write_report(path, cloud, pictured, summary, viewer_rotation(frame))
+        write_report(path, cloud, pictured, summary, viewer_rotation(frame), unit)
         return
     (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
     chosen_formats([name])

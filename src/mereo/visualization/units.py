@@ -45,6 +45,10 @@ class Unit:
         return rounded(volume * self.volume_factor)
 
 
+UNKNOWN = Unit(None)
+"""Unit of a cloud that does not say which it is."""
+
+
 def rounded(value: float) -> str:
     """Number with three digits, or all before the point: 0.0123, 4.56, 78.9, 12,345."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

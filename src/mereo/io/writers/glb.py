@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.io.atomic_files import atomic_file
 from mereo.io.mesh_formats import VIEWER_ROOT
 from mereo.io.writers.segment_table import with_faces
@@ -35,8 +35,8 @@ def write_segments_glb(
 ) -> None:
     """Write a GLB file: one named, coloured node per segment, below a root node that turns the frame for viewers.
 
-    Vertices stay as they are (rounded to float32, all that glTF holds). Segments without faces are left out; those
-    around a nested segment that was found are translucent.
+    Vertices stay as they are (rounded to float32, all that glTF holds), each with its normal. Segments without faces
+    are left out; those around a nested segment that was found are translucent.
 
     Args:
         path: the .glb file.
@@ -77,6 +77,7 @@ def _gltf_document(
     document = _gltf_skeleton(solid, surfaces.opaque, np.asarray(frame_rotation) * unit_m)
     for _, segment in solid:
         _add_array(document, chunks, segment.vertices.astype("<f4"), "VEC3", 34962)
+        _add_array(document, chunks, _unit_normals(segment).astype("<f4"), "VEC3", 34962)
         _add_array(document, chunks, segment.faces.astype("<u4").reshape(-1, 1), "SCALAR", 34963)
     binary = b"".join(chunks)
     document["buffers"] = [{"byteLength": len(binary)}]
@@ -105,7 +106,11 @@ def _gltf_skeleton(
 
 def _gltf_mesh(index: int, label: int, segment: Segment) -> dict[str, Any]:
     """Mesh of a segment; ``extras`` keep the label and the exact colour, which a material's factors approximate."""
-    primitive = {"attributes": {"POSITION": 2 * index}, "indices": 2 * index + 1, "material": index}
+    primitive = {
+        "attributes": {"POSITION": 3 * index, "NORMAL": 3 * index + 1},
+        "indices": 3 * index + 2,
+        "material": index,
+    }
     return {"name": segment.name, "primitives": [primitive], "extras": {"label": label, "color": list(segment.color)}}
 
 
@@ -117,6 +122,13 @@ def _gltf_material(segment: Segment, opaque: bool) -> dict[str, Any]:
     surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
     return material if opaque else {**material, "alphaMode": "BLEND"}
+
+
+def _unit_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
+    """Normals of the vertices; glTF wants unit length, so those of vertices without a face's area point up."""
+    normals = vertex_normals(segment)
+    normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 0.0, 1.0)
+    return normals
 
 
 def _add_array(document: dict[str, Any], chunks: list[bytes], array: np.ndarray, kind: str, target: int) -> None:

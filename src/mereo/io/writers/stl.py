@@ -1,4 +1,7 @@
-"""STL, binary: one file for each segment, because a file holds one nameless surface. It has neither unit nor colour."""
+"""STL, binary: one file for each segment, because a file holds one surface. It has neither unit nor colour.
+
+The name is in the 80 bytes that STL leaves to the writer, as ``STL_NAME`` and UTF-8, and comes back from there.
+"""
 
 import re
 from pathlib import Path
@@ -7,6 +10,7 @@ import numpy as np
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
+from mereo.io.mesh_headers import STL_NAME
 from mereo.io.output_folders import new_directory
 from mereo.io.writers.segment_table import with_faces
 
@@ -30,13 +34,19 @@ def write_surface_stl(path: str | Path, surfaces: SegmentedMesh) -> None:
     """Write all segments as one nameless surface; positions are float32, in the mesh's frame and unit."""
     vertices, faces, _ = surfaces.merged()
     with atomic_file(path) as partial:
-        partial.write_bytes(_binary(Segment("all", surfaces.colors[0], vertices, faces)))
+        partial.write_bytes(_binary(Segment("", surfaces.colors[0], vertices, faces)))
 
 
 def stl_name(label: int, name: str) -> str:
     """File name of a segment that every system takes: letters and digits of its name; the label keeps it unique."""
     words = re.sub(r"[^\w]+", "-", name).strip("-")
     return f"{label}-{words}.stl" if words else f"{label}.stl"
+
+
+def _header(name: str) -> bytes:
+    """80 bytes with a segment's name; one that is too long for them is left out, not cut short."""
+    text = STL_NAME + name.encode("utf-8")
+    return (text if len(text) <= 80 and name.isprintable() else b"written by mereo").ljust(80)
 
 
 def _binary(segment: Segment) -> bytes:
@@ -47,4 +57,4 @@ def _binary(segment: Segment) -> bytes:
     triangles["normal"] = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
     triangles["corners"] = corners
     # the header must not begin with "solid", which is how text files begin
-    return b"written by mereo".ljust(80) + np.uint32(len(corners)).astype("<u4").tobytes() + triangles.tobytes()
+    return _header(segment.name) + np.uint32(len(corners)).astype("<u4").tobytes() + triangles.tobytes()

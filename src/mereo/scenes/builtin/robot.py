@@ -41,7 +41,10 @@ from mereo.scenes.scene import Scene, Workspace
 
 
 class ArmJoint(NamedTuple):
-    """Revolute joint of the rest pose: a point of its axis, the axis, and limits in degrees."""
+    """Revolute joint of the rest pose: a point of its axis, the axis, and limits in degrees.
+
+    It is called after the segment that it moves.
+    """
 
     name: str
     center: Vector
@@ -51,12 +54,12 @@ class ArmJoint(NamedTuple):
 
 
 JOINTS = (
-    ArmJoint("turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
-    ArmJoint("lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
-    ArmJoint("fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
-    ArmJoint("roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
-    ArmJoint("pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
-    ArmJoint("spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+    ArmJoint("column turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
+    ArmJoint("upper arm lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
+    ArmJoint("elbow fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
+    ArmJoint("forearm roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+    ArmJoint("wrist pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
+    ArmJoint("hand spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
 )
 OPENING = (0.15, 2.0)
 """Least and largest distance of a finger from the middle."""
@@ -157,7 +160,7 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     while not is_clear(turns):
         turns = chain(sample_angles(rng))
     links = [Compose(turns[:count][::-1]) for count in range(1, len(turns) + 1)]
-    opening = named(rng, "opening").uniform(*OPENING)
+    opening = named(rng, "fingers apart").uniform(*OPENING)
     slide = np.array([0.0, opening - parts.JAW_OPENING, 0.0])
     fingers = [Compose((Rigid(np.zeros(3), side * slide, np.zeros(3)), *turns[::-1])) for side in (1, -1)]
     return (Identity(), *links, *fingers)

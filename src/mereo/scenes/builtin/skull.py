@@ -26,7 +26,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
-from mereo.deformation.draw_names import named
+from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.geometry.manifold import solid_of
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -136,8 +136,9 @@ def jaw_state(opening: float, forward: float, side: float) -> tuple[float, float
 
 def sample_jaw(rng: np.random.Generator) -> tuple[float, float, float]:
     """Random ``jaw_state``; one mouth in seven is closed."""
-    opening = 0.0 if named(rng, "closed below 1/7").uniform() < 1 / 7 else named(rng, "opening").uniform()
-    return jaw_state(opening, named(rng, "forward").uniform(), named(rng, "to its left").uniform(-1.0, 1.0))
+    with part(rng, "mandible"):
+        opening = 0.0 if named(rng, "closed below 1/7").uniform() < 1 / 7 else named(rng, "opening").uniform()
+        return jaw_state(opening, named(rng, "forward").uniform(), named(rng, "to its left").uniform(-1.0, 1.0))
 
 
 # --- the model --------------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
 
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.visualization.viewer.guard import Entry, guarded_servers
@@ -26,7 +27,15 @@ ENVIRONMENT = 0.45
 """Share of viser's surrounding light; with all of it the palette's colours fade to white."""
 
 CLOUD_COLOR = (244, 246, 250)
-CLOUD_SIZE = 0.008
+CLOUD_SIZES = (0.001, 0.012)
+"""Smallest and largest size at which points start: what still shows, and what would be blobs in a sparse cloud."""
+
+POINT_SHARE = 0.2
+"""Share of the spacing of points that one takes, so that the surface is seen between them."""
+
+SAMPLED = 1000
+"""Points whose neighbours are measured."""
+
 FOV_RAD = float(np.deg2rad(40.0))
 """Of the page's own camera."""
 
@@ -96,6 +105,15 @@ def stop_server(server: Any) -> None:
     """Close all pages; without the line that viser prints."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
+
+
+def point_size(points: Float[np.ndarray, "n 3"]) -> float:
+    """Size of points on the stage, from their median distance to the nearest neighbour, within ``CLOUD_SIZES``."""
+    some = points[:: max(1, len(points) // SAMPLED)]
+    apart = cKDTree(points).query(some, k=2)[0][:, 1] if len(points) > 1 else np.zeros(0)
+    apart = apart[np.isfinite(apart) & (apart > 0)]  # repeated points have no spacing
+    smallest, largest = CLOUD_SIZES
+    return float(np.clip(POINT_SHARE * np.median(apart), smallest, largest)) if len(apart) else largest
 
 
 @runtime_checkable

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from mereo.geometry.camera import PointCloud
 from mereo.visualization.vertex_colors import CONFIDENCE, confidence, distance_scale, observed_distance
 from mereo.visualization.viewer import html
-from mereo.visualization.viewer.display import CLOUD_COLOR, CLOUD_SIZE, Display, SegmentControls, SegmentLayer
+from mereo.visualization.viewer.display import CLOUD_COLOR, Display, SegmentControls, SegmentLayer, point_size
 from mereo.visualization.viewer.probe import Inspection, first_hit
 
 EMPTY_COLOR = (150, 156, 168)
@@ -59,15 +59,17 @@ class FramePage:
 
     def _build_cloud(self, seen: PointCloud) -> None:
         gui = self.server.gui
+        points = self.stage.place(seen.points)
         with gui.add_folder("Observed points"):
             cloud_on = gui.add_checkbox("show", True)
-            size = gui.add_slider("size", 0.002, 0.04, 0.001, CLOUD_SIZE)
-        points = self.stage.place(seen.points)
+            size = gui.add_slider("size (%)", 0.05, 4.0, 0.05, round(100 * point_size(points), 2))
         cloud = self.server.scene.add_point_cloud(
-            "/cloud", points, CLOUD_COLOR, point_size=size.value, point_shape="circle", precision="float32"
+            "/cloud", points, CLOUD_COLOR, point_size=size.value / 100, point_shape="circle", precision="float32"
         )
         cloud_on.on_update(lambda _: setattr(cloud, "visible", cloud_on.value))
-        size.on_update(lambda _: setattr(cloud, "point_size", size.value))
+        # white points would hide the colours that are looked at
+        self.coloring.on_update(lambda _: setattr(cloud_on, "value", self.coloring.value == "segment"))
+        size.on_update(lambda _: setattr(cloud, "point_size", size.value / 100))
 
     def _build_probe(self) -> None:
         gui = self.server.gui

@@ -4,49 +4,25 @@ Hands only leave wishes; one thread (``LatestWins``) fulfils them, so that the p
 """
 
 import threading
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import transform_points
 from mereo.scenes.parameters import Parameter, Refused
-from mereo.synthesis.examples import View
-from mereo.visualization.vertex_colors import (
-    CONFIDENCE,
-    ColorScale,
-    confidence,
-    distance_scale,
-    error_scale,
-    observed_distance,
-    surface_error,
-)
 from mereo.visualization.viewer import html
-from mereo.visualization.viewer.display import CLOUD_COLOR, CLOUD_SIZE, Display, SegmentControls, SegmentLayer
+from mereo.visualization.viewer.display import SegmentControls
+from mereo.visualization.viewer.lab_stage import COLORINGS, SHOWN, LabStage, Moment
 from mereo.visualization.viewer.laboratory import Laboratory, Trial, depth_picture
 from mereo.visualization.viewer.latest_request import LatestWins
 from mereo.visualization.viewer.sliders import CameraSliders, ParameterSliders
 
-SHOWN = ("reconstruction", "truth", "side by side")
-COLORINGS = ("segment", "error", "confidence", "distance")
 QUICK, FINE = (32, 24), (96, 64)
 """Resolution of surfaces and cells of the score, while a slider moves and when it rests."""
 
 HISTORY = 60
-"""Scores that the curve remembers."""
-
-
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """Moment that the page shows: a state as it is seen, and what has been made of that so far."""
-
-    view: View
-    trial: Trial | None = None
+"""Scores that the curve, and changes that "Undo" remembers."""
 
 
 class LabPage:
@@ -59,12 +35,14 @@ class LabPage:
         self._wishes: dict[tuple[Any, int | None], tuple[Parameter, float]] = {}
         self._first_seed = seed
         self._new_seed: int | None = None
+        self._back = False
+        self._past: list[Any] = []
+        self._hand: frozenset[Any] = frozenset()
         self._scores: list[tuple[float, float]] = []
         self.shape: Any = None
         self.moment: Moment | None = None
         rest = laboratory.scene.rest
-        self.stage = Display(server, rest.bounds, np.asarray(laboratory.scene.workspace.axis, dtype=float))
-        self.found, self.true = SegmentLayer(self.stage, "/found"), SegmentLayer(self.stage, "/true")
+        self.stage = LabStage(server, laboratory)
         self._build_results(title, facts)
         self._build_controls(rest)
         self._look()
@@ -114,8 +92,12 @@ class LabPage:
         view.on_click(lambda _: self._look(view.value))
         for handle in (self._shown, self._coloring, self._points):
             handle.on_update(lambda _: self._draw())
+        # white points would hide the colours that are looked at
+        self._coloring.on_update(lambda _: setattr(self._points, "value", self._coloring.value == "segment"))
         self._shown.on_update(lambda _: self._look())
         gui.add_button("Random state").on_click(lambda _: self._wish_anew())
+        self._undo = gui.add_button("Undo", disabled=True)
+        self._undo.on_click(lambda _: self._wish_back())
         with gui.add_folder("Camera"):
             self._camera = CameraSliders(gui, self.laboratory, lambda: self.worker.submit(None))
         self._sliders = ParameterSliders(gui, gui.add_folder("Deformation"), self._wish)
@@ -132,7 +114,7 @@ class LabPage:
         direction = {"camera": toward + 0.2 * right, "side": right, "behind": -toward}[name]
         room = 1.35 if self._shown.value != "side by side" else 2.4
         # up is where the depth image has it, so that a rolled camera's view looks like its image
-        self.stage.look_from(direction, bounds, room, -T_world_camera[:3, 1])
+        self.stage.stage.look_from(direction, bounds, room, -T_world_camera[:3, 1])
 
     # --- wishes -------------------------------------------------------------------------------------------------------
 
@@ -146,13 +128,29 @@ class LabPage:
             self._new_seed = int(self._seeds.integers(2**31))
         self.worker.submit(None)
 
+    def _wish_back(self) -> None:
+        with self._wishing:
+            self._wishes, self._new_seed, self._back = {}, None, True
+        self.worker.submit(None)
+
+    def _remember(self, hand: frozenset[Any]) -> None:
+        """Keep the shape that is about to change; what one slider does until another hand moves is one change."""
+        if self.shape is not None and (hand != self._hand or not hand):
+            self._past = [*self._past, self.shape][-HISTORY:]
+        self._hand = hand
+
     def _fulfil(self) -> tuple[Any, Refused | None]:
         """The shape that is wished for. Values that are refused are left out, and the last of them is told."""
         with self._wishing:
-            wishes, seed = list(self._wishes.values()), self._new_seed
-            self._wishes, self._new_seed = {}, None
+            wishes, hand, seed, back = list(self._wishes.values()), frozenset(self._wishes), self._new_seed, self._back
+            self._wishes, self._new_seed, self._back = {}, None, False
         freedom, refusal = self.laboratory.freedom, None
+        if back and self._past:
+            *self._past, shape = self._past
+            self._hand = frozenset()
+            return shape, None
         if seed is not None:
+            self._remember(frozenset())
             return freedom.random(seed), None
         shape = freedom.first(self._first_seed) if self.shape is None else self.shape
         for parameter, value in wishes:
@@ -160,12 +158,15 @@ class LabPage:
                 shape = freedom.moved(shape, parameter, value)
             except Refused as error:
                 refusal = error
+        if shape is not self.shape and wishes:
+            self._remember(hand)
         return shape, refusal
 
     # --- the worker's thread ------------------------------------------------------------------------------------------
 
     def _quick(self, _: None) -> None:
         self.shape, refusal = self._fulfil()
+        self._undo.disabled = not self._past
         self._sliders.show(self.laboratory.freedom.parameters(self.shape))
         view, is_first = self.laboratory.look(self.shape, self._camera.place()), self.moment is None
         self.moment = Moment(view)
@@ -217,61 +218,9 @@ class LabPage:
         if moment is None:
             return
         with self._drawing, self.server.atomic():
-            mode, T_world_camera = self._shown.value, moment.view.T_world_camera
-            # side by side: both give way, along the camera's horizon
-            aside = (1.2 if mode == "side by side" else 0.0) * T_world_camera[:3, 0]
-            self._draw_camera(moment.view, -aside)
-            if mode == "reconstruction":
-                self.true.clear_from()
-            else:
-                self.true.show(moment.view.mesh.transformed(T_world_camera), self.controls, shift=aside)
-            self._legend.visible = False
-            if moment.trial is None or mode == "truth":
-                self.found.clear_from()
-                return
-            colors = self._colors(moment.view, moment.trial)
-            surfaces = moment.trial.result.surfaces.transformed(T_world_camera)
-            self.found.show(surfaces, self.controls, colors, -aside)
-
-    def _draw_camera(self, view: View, shift: Float[np.ndarray, "3"]) -> None:
-        """The observed points, and the camera with its image at its place."""
-        scene, T_world_camera = self.server.scene, view.T_world_camera
-        points = self.stage.place(transform_points(T_world_camera, view.depth.to_points().points))
-        scene.add_point_cloud(
-            "/points",
-            points + shift,
-            CLOUD_COLOR,
-            point_size=CLOUD_SIZE,
-            point_shape="circle",
-            precision="float32",
-            visible=bool(self._points.value),
-        )
-        x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
-        scene.add_camera_frustum(
-            "/camera",
-            self.laboratory.scene.workspace.fov_rad,
-            1.0,
-            scale=0.35,
-            color=(150, 160, 176),
-            image=depth_picture(view.depth),
-            format="png",
-            wxyz=(w, x, y, z),
-            position=tuple(self.stage.place(T_world_camera[:3, 3])),
-        )
-
-    def _colors(self, view: View, trial: Trial) -> list[np.ndarray] | None:
-        """Colours of the reconstruction's vertices, with their legend; None for the segments' own."""
-        mode, surfaces = self._coloring.value, trial.result.surfaces
-        if mode == "segment":
-            return None
-        scale: ColorScale
-        if mode == "error":
-            values, scale = surface_error(surfaces, Solids(view.mesh)), error_scale(view.mesh, "")
-        elif mode == "confidence":
-            assert self.laboratory.model is not None
-            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.result.code)), CONFIDENCE
-        else:
-            values = observed_distance(surfaces, view.depth.to_points().points)
-            scale = distance_scale(values, "")
-        self._legend.content, self._legend.visible = html.color_bar(scale), True
-        return [scale.colors(value) for value in values]
+            mode, coloring, points = self._shown.value, self._coloring.value, bool(self._points.value)
+            scale = self.stage.draw(moment, mode, coloring, self.controls, points)
+            self._legend.content, self._legend.visible = (
+                "" if scale is None else html.color_bar(scale),
+                scale is not None,
+            )

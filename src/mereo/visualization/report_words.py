@@ -1,0 +1,111 @@
+"""What the page of a reconstruction says: facts, the table of its segments and its times, in words and known units.
+
+``reconstruction_report`` is about the page's shapes and bytes; here is all of its text that depends on a result.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mereo.visualization.units import Unit, rounded
+
+STAGES = {
+    "encode": "reading the points",
+    "fit": "registration",
+    "locate": "finding the object",
+    "extract": "surfaces",
+    "label": "labels of the volume",
+    "points": "labels of the points",
+    "measure": "measuring",
+    "write": "writing files",
+}
+"""What each stage of ``timings_s`` does; another one keeps its name."""
+
+SAID_ELSEWHERE = frozenset(
+    {"title", "unit", "unit_m", "source", "frame", "points", "segments", "nested", "timings_s", "registration"}
+)
+"""Keys of a summary that the page shows in another place, or that its units say."""
+
+FOR_PROGRAMS = frozenset({"precision", "evaluated_points", "depth_m", "visible_size_m", "isolation", "carried"})
+"""Keys that only summary.json has."""
+
+DEVICES = {"cpu": "the processor", "cuda": "the GPU"}
+DASH, GAP = "\N{EN DASH}", 3 * "\N{NO-BREAK SPACE}"
+"""For what there is no number of; between coordinates, which have commas at their thousands."""
+
+
+def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
+    """Texts of the page.
+
+    Args:
+        summary: as ``write_report`` takes it.
+        unit: of the lengths in it.
+
+    Returns ``title``, ``facts`` (phrases), ``warnings`` (sentences), ``heads`` (of the table), ``rows`` (centre,
+    volume and confidence of each segment; confidence is None where there is none), ``weights`` (their name) and
+    ``timings_s``, seconds of each stage in words.
+    """
+    times = {name: _number(seconds) for name, seconds in dict(summary.get("timings_s") or {}).items()}
+    return {
+        "title": str(summary.get("title", "mereo reconstruction")),
+        "facts": _facts(summary, unit),
+        "warnings": _warnings(summary),
+        "heads": ["segment", f"centre x, y, z ({unit.length_name})", f"volume ({unit.volume_name})", "confidence"],
+        "rows": [_row(told, unit) for told in summary.get("segments") or ()],
+        "weights": str(summary.get("weights") or ""),
+        "timings_s": {STAGES.get(name, _plain(name)): value for name, value in times.items() if value is not None},
+    }
+
+
+def _facts(summary: Mapping[str, Any], unit: Unit) -> list[str]:
+    """Where the answer comes from, what it was made with, then whatever else a caller has to say."""
+    facts = [_answer(summary["registration"])] if isinstance(summary.get("registration"), Mapping) else []
+    source, spacing = summary.get("source"), _number(summary.get("spacing"))
+    if source is not None and str(source) != str(summary.get("title")):
+        facts.append(f"from {source}")
+    if spacing is not None:
+        facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
+    if summary.get("device"):
+        facts.append(f"computed on {DEVICES.get(str(summary['device']), str(summary['device']))}")
+    said = SAID_ELSEWHERE | FOR_PROGRAMS | {"weights", "spacing", "device", "resolution", "clipped"}
+    for key, value in summary.items():
+        number = None if isinstance(value, bool) else _number(value)
+        if key not in said and (number is not None or isinstance(value, str)):
+            facts.append(f"{_plain(key)}: {value if number is None else rounded(number)}")
+    return facts
+
+
+def _answer(registration: Mapping[str, Any]) -> str:
+    explained = _number(registration.get("explained"))
+    if registration.get("answer") == "registration" and explained is not None:
+        return f"your model, registered: it explains {explained:.1%} of the points"
+    return "the network's own answer"
+
+
+def _warnings(summary: Mapping[str, Any]) -> list[str]:
+    """Sentences on why the result may not be what it seems."""
+    registration = summary.get("registration")
+    told = registration if isinstance(registration, Mapping) else {}
+    warnings = [str(told[key]) for key in ("refusal", "doubt") if told.get(key)]
+    if summary.get("clipped"):
+        warnings.append("the object reaches the border of the volume that was searched and may be cut off there")
+    return [text[0].upper() + text[1:] + ("" if text.endswith(".") else ".") for text in warnings]
+
+
+def _row(told: Mapping[str, Any], unit: Unit) -> list[Any]:
+    centre, volume = told.get("centroid"), _number(told.get("volume"))
+    place: Sequence[str] = [] if centre is None else unit.place(np.asarray(centre, dtype=float)).split()
+    words = [GAP.join(place) or DASH, DASH if volume is None else unit.volume(volume)]
+    return [*words, _number(told.get("confidence"))]
+
+
+def _number(value: object) -> float | None:
+    """The value as a finite number; None for everything else."""
+    if not isinstance(value, int | float | np.integer | np.floating) or not np.isfinite(value):
+        return None
+    return float(value)
+
+
+def _plain(key: str) -> str:
+    return key.replace("_", " ")

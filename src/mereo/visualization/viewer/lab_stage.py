@@ -1,0 +1,140 @@
+"""Stage of the laboratory: what is found and what is true, the points seen, and the camera at its place."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
+
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import transform_points
+from mereo.synthesis.examples import View
+from mereo.visualization.vertex_colors import (
+    CONFIDENCE,
+    ColorScale,
+    confidence,
+    distance_scale,
+    error_scale,
+    observed_distance,
+    surface_error,
+)
+from mereo.visualization.viewer.display import CLOUD_COLOR, Display, SegmentLayer, Shown, point_size
+from mereo.visualization.viewer.laboratory import Laboratory, Trial, depth_picture
+
+SHOWN = ("reconstruction", "truth", "side by side")
+COLORINGS = ("segment", "error", "confidence", "distance")
+ASIDE = 1.2
+"""Shift of each of two objects side by side, in stage units, along the camera's horizon."""
+
+UNDER = 0.12
+"""Distance of a name below what it names, in stage units."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """Moment that the page shows: a state as it is seen, and what has been made of that so far."""
+
+    view: View
+    trial: Trial | None = None
+
+
+class LabStage:
+    """Stage that shows a ``Moment`` in the scene's frame."""
+
+    def __init__(self, server: Any, laboratory: Laboratory) -> None:
+        self.server, self.laboratory = server, laboratory
+        rest = laboratory.scene.rest
+        self.stage = Display(server, rest.bounds, np.asarray(laboratory.scene.workspace.axis, dtype=float))
+        self.found, self.true = SegmentLayer(self.stage, "/found"), SegmentLayer(self.stage, "/true")
+        self._names: list[Any] = []
+
+    def draw(self, moment: Moment, mode: str, coloring: str, shown: Shown, points: bool) -> ColorScale | None:
+        """Show a moment; returns the scale that the surfaces are coloured by, None for the segments' own colours.
+
+        Args:
+            moment: what is shown.
+            mode: one of ``SHOWN``.
+            coloring: one of ``COLORINGS``, of what is found.
+            shown: choice of the segments.
+            points: whether those that the camera sees are shown.
+        """
+        T_world_camera, truth = moment.view.T_world_camera, moment.view.mesh
+        both = mode == "side by side"
+        aside = (ASIDE if both else 0.0) * T_world_camera[:3, 0]
+        self._draw_camera(moment.view, -aside, points)
+        self._clear_names()
+        if mode == "reconstruction":
+            self.true.clear_from()
+        else:
+            self.true.show(truth.transformed(T_world_camera), shown, shift=aside)
+        if moment.trial is None or mode == "truth":
+            self.found.clear_from()
+            return None
+        surfaces = moment.trial.result.surfaces
+        if both:
+            self._name("reconstruction", surfaces, moment.view, -aside)
+            self._name("truth", truth, moment.view, aside)
+        painted = self._colors(coloring, moment.view, moment.trial)
+        colors, scale = (None, None) if painted is None else painted
+        self.found.show(surfaces.transformed(T_world_camera), shown, colors, -aside)
+        return scale
+
+    def _clear_names(self) -> None:
+        for name in self._names:
+            name.remove()
+        self._names = []
+
+    def _name(self, text: str, mesh: SegmentedMesh, view: View, shift: Float[np.ndarray, "3"]) -> None:
+        """A word under a mesh of the camera's frame, as the camera has it: y is down."""
+        low, high = mesh.bounds
+        foot = np.array([(low[0] + high[0]) / 2, high[1], (low[2] + high[2]) / 2])
+        place = self.stage.place(transform_points(view.T_world_camera, foot[None]))[0] + shift
+        place += UNDER * view.T_world_camera[:3, 1]
+        self._names.append(
+            self.server.scene.add_label(f"/names/{text}", text, position=tuple(place), anchor="top-center")
+        )
+
+    def _draw_camera(self, view: View, shift: Float[np.ndarray, "3"], points_on: bool) -> None:
+        """The observed points, and the camera with its image at its place."""
+        scene, T_world_camera = self.server.scene, view.T_world_camera
+        points = self.stage.place(transform_points(T_world_camera, view.depth.to_points().points))
+        scene.add_point_cloud(
+            "/points",
+            points + shift,
+            CLOUD_COLOR,
+            point_size=point_size(points),
+            point_shape="circle",
+            precision="float32",
+            visible=points_on,
+        )
+        x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
+        scene.add_camera_frustum(
+            "/camera",
+            self.laboratory.scene.workspace.fov_rad,
+            1.0,
+            scale=0.35,
+            color=(150, 160, 176),
+            image=depth_picture(view.depth),
+            format="png",
+            wxyz=(w, x, y, z),
+            position=tuple(self.stage.place(T_world_camera[:3, 3])),
+        )
+
+    def _colors(self, mode: str, view: View, trial: Trial) -> tuple[list[UInt8[np.ndarray, "_ 3"]], ColorScale] | None:
+        """Colours of the reconstruction's vertices, and their scale; None for the segments' own."""
+        surfaces = trial.result.surfaces
+        if mode == "segment":
+            return None
+        scale: ColorScale
+        if mode == "error":
+            values, scale = surface_error(surfaces, Solids(view.mesh)), error_scale(view.mesh, "")
+        elif mode == "confidence":
+            assert self.laboratory.model is not None
+            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.result.code)), CONFIDENCE
+        else:
+            values = observed_distance(surfaces, view.depth.to_points().points)
+            scale = distance_scale(values, "")
+        return [scale.colors(value) for value in values], scale
