@@ -1,7 +1,7 @@
 """Weights to hand on: what is in the file, and what the card says of it."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -11,7 +11,9 @@ import torch
 from safetensors.torch import load_file
 
 from mereo import __main__ as command_line
+from mereo.evaluation.tables import read_metrics
 from mereo.models.weights import PACKED, _pack, _unpack, find_weights, load_model, save_model, shipped_names
+from mereo.synthesis.config import SENSORS, SensorConfig
 from mereo.training.model_card import card, release
 
 TEST = {
@@ -60,6 +62,25 @@ def test_the_file_answers_as_the_weights_and_the_card_knows_it(tmp_path: Path) -
     assert "| 0.923 | 0.798 | 0.930 | 0.878 | 0.685 | 0.719 | - |" in text
     assert "2 real scans (bun000, chin)" in text and "Not tested on a real sensor" not in text
     assert "Weakest segment on synthetic views: ear_left, IoU 0.685" in text
+
+
+@pytest.mark.parametrize(
+    ("sensor", "size", "words"),
+    [
+        (SENSORS["paper"], 96, "noise 0.1 units"),
+        (SENSORS["time-of-flight"], 192, "time of flight, 192 x 192 pixels, noise 0.1 units"),
+        (
+            replace(SENSORS["structured-light"], tool=0.5),
+            96,
+            "structured light, a tool in 50% of them, noise 0.1 units",
+        ),
+        (replace(SENSORS["paper"], axial=2.0), 96, "a camera of its own terms, noise 0.1 units"),
+    ],
+)
+def test_a_test_by_another_camera_says_by_which(sensor: SensorConfig, size: int, words: str, tmp_path: Path) -> None:
+    folder = evaluation(tmp_path / "test", sensor=asdict(sensor), image_size=size)
+    text = card("rope", load_model("rope"), [read_metrics(folder / "metrics.json")], b"")
+    assert f"\n128 synthetic views, test seed 1000000, {words}:\n" in text
 
 
 def test_packed_distances_are_fine_at_the_surface_and_stay_what_they_are() -> None:

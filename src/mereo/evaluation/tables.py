@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from mereo.evaluation.metrics import Scores, format_score, intersection_over_union
 from mereo.evaluation.results import AnswerScores, Evaluation
 from mereo.evaluation.scoring import CELLS
 from mereo.io.errors import readable
+from mereo.synthesis.config import SensorConfig
 
 CLEARLY = 0.01
 """Least difference in mIoU (in IoU where there is no mIoU) by which another answer counts as clearly better."""
@@ -110,6 +111,16 @@ class _Timed(_Mean):
     seconds: FiniteFloat
 
 
+def _sensor(value: object) -> object:
+    """Sensor of the terms that a file states."""
+    if not isinstance(value, dict):
+        return value
+    try:
+        return SensorConfig(**value)
+    except TypeError:
+        raise ValueError(f"{', '.join(map(str, value))} are no terms of a camera") from None
+
+
 class _Written(_Mean):
     """What is read of a file, as any version has written it."""
 
@@ -117,6 +128,8 @@ class _Written(_Mean):
     examples: int = 0
     seed: int = 0
     noise_std: FiniteFloat = 0.0
+    image_size: int = 0
+    sensor: Annotated[SensorConfig | None, BeforeValidator(_sensor)] = None
     scans: list[str] = []
     example_mean: _Mean | None = None
     network: _Timed | None = None

@@ -21,6 +21,7 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model, weights_bytes
 from mereo.scenes.random_states import built_in_model, with_frame
 from mereo.scenes.statistical_model_file import modes_within, with_fewer_modes
+from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS
 
 MOST_BYTES = 8_000_000
@@ -142,14 +143,23 @@ def nearest_preset(recipe: dict[str, Any]) -> str:
     return max(PRESETS, key=agreement)
 
 
+def _camera(test: dict[str, Any]) -> str:
+    """Words for a camera that is not the paper's, with a comma behind; nothing for the paper's."""
+    sensor, size = SensorConfig(**(test.get("sensor") or {})), test.get("image_size", GenerateConfig.image_size)
+    named = [name.replace("-", " ") for name, known in SENSORS.items() if known == replace(sensor, tool=known.tool)]
+    words = [named[0] if named else "a camera of its own terms"] if sensor.on else []
+    words += [f"a tool in {sensor.tool:.0%} of them"] if sensor.tool else []
+    words += [f"{size} x {size} pixels"] if size != GenerateConfig.image_size else []
+    return "".join(f"{word}, " for word in words)
+
+
 def _result(test: dict[str, Any]) -> str:
     segments = test["per_segment"]
     if "scans" in test:
         title = f"{len(test['scans'])} real scans ({', '.join(test['scans'])})"
     else:
-        title = (
-            f"{test['examples']} synthetic views, test seed {test['seed']}, noise {test.get('noise_std', 0.1)} units"
-        )
+        noise = f"noise {test.get('noise_std', 0.1)} units"
+        title = f"{test['examples']} synthetic views, test seed {test['seed']}, {_camera(test)}{noise}"
     names = ["IoU", "mIoU", *segments]
     values = [test["iou"], test["miou"], *segments.values()]
     rows = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}", f"| {' | '.join(format_score(v) for v in values)} |"]
