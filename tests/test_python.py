@@ -28,7 +28,7 @@ from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
 from mereo.visualization.result import SINGLE, Result
 from mereo.visualization.units import Unit
-from mereo.visualization.viewer import serve
+from mereo.visualization.viewer import result_page
 from mereo.visualization.viewer.open_page import OpenPage
 
 NAMES = ("big", "<small>", "absent")
@@ -284,9 +284,9 @@ def test_a_page_stays_open_where_somebody_goes_on(
 def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is computed again: the page's surfaces are the result's."""
     shown: list[Any] = []
-    monkeypatch.setattr(serve, "import_viser", lambda: None)
-    monkeypatch.setattr(serve, "start_server", lambda port, *_: shown.append(port) or Server())
-    monkeypatch.setattr(serve, "FramePage", lambda *given: shown.append(given))
+    monkeypatch.setattr(result_page, "import_viser", lambda: None)
+    monkeypatch.setattr(result_page, "start_server", lambda port, *_: shown.append(port) or Server())
+    monkeypatch.setattr(result_page, "FramePage", lambda *given: shown.append(given))
     with result.show(block=False) as page, mereo.view(result, block=False, port=8081):
         assert page.address == "http://127.0.0.1:1234"
     assert shown[0] == 0 and shown[2] == 8081

@@ -160,9 +160,11 @@ class Result(Answer):
 
         Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
         """
-        from mereo.visualization.viewer.serve import view_result
+        from mereo.visualization.viewer.result_page import open_answer
 
-        return view_result(self, port=port or 0, host=host).stay(block)
+        unit = "m" if self.unit_stated and self.seen.frame.unit_m == 1.0 else ""
+        page = open_answer(self, self.seen, self.model, self.registrar, unit, port=port or 0, host=host)
+        return page.stay(block)
 
     def _read(self) -> list[Path]:
         """Files that this was made from."""

@@ -93,7 +93,7 @@ def view(
     block = not is_interactive() if block is None else block
     place = (PORT if block else 0) if port is None else port
     if isinstance(input, Result):
-        return view_result(input, port=place, host=host).stay(block)
+        return input.show(port=place, host=host, block=block)
     path, known = (None if value is None else Path(value) for value in (input, state))
     if known is None and is_state(path):
         path, known = None, path
@@ -105,18 +105,6 @@ def view(
     show = partial(view_frame, resolution=resolution) if known is None else partial(view_state, known)
     page = show(path, named, port=place, host=host, reading=reading, isolation=isolation, inference=inference)
     return page.stay(block)
-
-
-def view_result(result: Result, *, port: int = 0, host: str = LOOPBACK) -> OpenPage:
-    """Page of a result that is there already."""
-    import_viser()
-    inspection = Inspection.of_answer(result, result.model, result.registrar)
-    entry = Entry.of(host)
-    server = start_server(port, "mereo", entry)
-    frame = result.seen.frame
-    facts = f"{len(result.seen.cloud):,} points · weights {result.model.name or 'of this program'}"
-    FramePage(server, inspection, frame.source, facts, "m" if result.unit_stated and frame.unit_m == 1.0 else "")
-    return OpenPage(server, entry)
 
 
 def view_frame(

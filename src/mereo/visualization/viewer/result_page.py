@@ -1,0 +1,27 @@
+"""Page of an answer that is there already: what ``Result.show`` opens."""
+
+from mereo.fitting.answer import Answer
+from mereo.fitting.register import Registrar
+from mereo.models.model import Model
+from mereo.reconstruction.observation import Observation
+from mereo.visualization.viewer.display import import_viser, start_server
+from mereo.visualization.viewer.frame_page import FramePage
+from mereo.visualization.viewer.guard import Entry
+from mereo.visualization.viewer.open_page import OpenPage
+from mereo.visualization.viewer.probe import Inspection
+
+
+def open_answer(
+    found: Answer, seen: Observation, model: Model, registrar: Registrar | None, unit: str, *, port: int, host: str
+) -> OpenPage:
+    """Page of an answer, on the frame that it was given to; ``unit`` is what its lengths are called.
+
+    Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
+    """
+    import_viser()
+    inspection = Inspection.of_answer(found, model, registrar)
+    entry = Entry.of(host)
+    server = start_server(port, "mereo", entry)
+    facts = f"{len(seen.cloud):,} points · weights {model.name or 'of this program'}"
+    FramePage(server, inspection, seen.frame.source, facts, unit)
+    return OpenPage(server, entry)
