@@ -28,7 +28,7 @@ from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
 from mereo.visualization.result import SINGLE, Result
 from mereo.visualization.units import Unit
-from mereo.visualization.viewer import result_page
+from mereo.visualization.viewer import result_page, serve
 from mereo.visualization.viewer.open_page import OpenPage
 
 NAMES = ("big", "<small>", "absent")
