@@ -87,7 +87,6 @@ class Surface:
         has a noisy cloud a little in front, and noise across an edge pulls that edge along. Where nothing is met, or
         only a plane farther than ``far`` from the point, it is the nearest place all the same.
         """
-        distance, face, place = self.nearest(points)
         rows, met = first_faces(self._rays, self._center, points)
         toward, normal = points[rows], self.normals[met]
         corner = self.material[self.model.faces[self.facing[met], 0]]
@@ -95,8 +94,12 @@ class Surface:
         there = toward * shares[:, None]
         off = np.abs(np.einsum("pi,pi->p", normal, toward - there))
         near = off <= far
-        rows = rows[near]
-        distance[rows], face[rows], place[rows] = off[near], met[near], there[near]
+        other = np.ones(len(points), dtype=bool)
+        other[rows[near]] = False
+        distance, face, place = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
+        distance[~other], face[~other], place[~other] = off[near], met[near], there[near]  # rows are in order
+        if other.any():
+            distance[other], face[other], place[other] = self.nearest(points[other])
         return distance, face, place
 
     @cached_property
