@@ -14,6 +14,7 @@ import torch
 from fuzz_rule import fault_of
 from fuzz_targets import TARGETS
 from PIL import Image
+from safetensors import numpy as arrays
 from safetensors.torch import load_file, save_file
 
 from mereo import __main__ as command_line
@@ -76,6 +77,12 @@ def pair_at_infinity(content: bytes) -> bytes:
     return json.dumps(facts).encode()
 
 
+def complex_centres(content: bytes) -> bytes:
+    """A shard without its checksum, whose numbers torch would make real with a warning."""
+    tensors = arrays.load(content)
+    return arrays.save({**tensors, "center": tensors["center"].astype(np.complex64)})
+
+
 def labels_of_infinity(content: bytes) -> bytes:
     nibabel = pytest.importorskip("nibabel")
     return bytes(nibabel.Nifti1Image(np.full((4, 4, 4), np.inf, "f4"), np.eye(4)).to_bytes())
@@ -107,6 +114,7 @@ CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "a point at infinity": ("start.json", pair_at_infinity, "scan of the start of the object must be rows of 3 finite"),
     "a cloud as wide as numbers": ("cloud.npy", lambda c: npy_of(np.full((40, 3), 1e300)), "or beyond 1e.12"),
     "a camera of no size": ("frames.mcap", without_focal_length, "is no camera .focal"),
+    "complex places": ("shard-00000.safetensors", complex_centres, "its tensor 'center' has complex numbers"),
     "labels beyond all numbers": ("labels.nii", labels_of_infinity, "holds values that are no labels"),
     "arrays as of Python 2": ("view.npz", of_python_2, "view.npz is not a sample view of mereo"),
     "a run whose recipe is a number": ("config.json", json_with(train=3), "holds no settings of a training"),

@@ -78,7 +78,7 @@ def test_the_file_answers_as_the_weights_and_the_card_knows_it(tmp_path: Path) -
     ],
 )
 def test_a_test_by_another_camera_says_by_which(sensor: SensorConfig, size: int, words: str, tmp_path: Path) -> None:
-    folder = evaluation(tmp_path / "test", sensor=asdict(sensor), image_size=size)
+    folder = evaluation(tmp_path / "test", sensor=asdict(sensor), image_size=size, network=None)
     text = card("rope", load_model("rope"), [read_metrics(folder / "metrics.json")], b"")
     assert f"\n128 synthetic views, test seed 1000000, {words}:\n" in text
 

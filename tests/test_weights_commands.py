@@ -52,15 +52,17 @@ def test_show_tells_object_unit_network_and_scores(capsys: pytest.CaptureFixture
     ):
         assert part in text
     assert sha256((SHIPPED / "tumor.safetensors").read_bytes()).hexdigest() in text
-    (result,) = card_results((SHIPPED / "tumor.md").read_text("utf-8"))
-    assert all(score in text for score in result.scores.values()) and result.answers in text
+    results = card_results((SHIPPED / "tumor.md").read_text("utf-8"))
+    assert len(results) == 2 and "structured light" in results[1].title
+    for result in results:
+        assert all(score in text for score in result.scores.values()) and result.answers in text
     assert "- Not tested on a real sensor." in text
 
 
 def test_json_has_everything(capsys: pytest.CaptureFixture[str]) -> None:
     found = json.loads(said(capsys, "show", "bunny", "--json"))
     assert [segment["name"] for segment in found["segments"]] == list(load_model("bunny").names)
-    assert [result["mIoU"] for result in found["results"]] == ["0.894", "0.986"]
+    assert [result["mIoU"] for result in found["results"]] == ["0.894", "0.986", "0.808", "0.756"]
     assert found["provenance"]["recipe"]["batch"] == 40 and found["network"]["encoder"] == "pointnet2"
 
 

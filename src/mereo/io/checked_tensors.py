@@ -50,7 +50,7 @@ def read_tensors(path: Path, dataset: str | None = None) -> tuple[dict[str, np.n
 
 
 def check_tensors(tensors: Tensors, shapes: Mapping[str, str], sizes: Mapping[str, int]) -> None:
-    """Raise ``ValueError`` (its reason only) where a tensor is missing or of another shape.
+    """Raise ``ValueError`` (its reason only) where a tensor is missing, of another shape or of complex numbers.
 
     Args:
         tensors: what a file holds.
@@ -61,6 +61,8 @@ def check_tensors(tensors: Tensors, shapes: Mapping[str, str], sizes: Mapping[st
     for name, axes in shapes.items():
         if name not in tensors:
             raise ValueError(f"it has no tensor {name!r}")
+        if np.iscomplexobj(tensors[name]):
+            raise ValueError(f"its tensor {name!r} has complex numbers")
         found, wanted = tensors[name].shape, axes.split()
         if len(found) != len(wanted) or any(
             length != (int(axis) if axis.isdecimal() else known.setdefault(axis, length))

@@ -204,7 +204,7 @@ def _answers(test: dict[str, Any]) -> list[str]:
     titles = {"network": "the network alone", "modes": "registered modes", "full": "with the draws of the scene"}
     each = []
     for name, title in titles.items():
-        if name in test:
+        if test.get(name) is not None:
             iou, miou = (format_score(test[name][key]) for key in ("iou", "miou"))
             each.append(f"{title} {iou} / {miou} in {test[name]['seconds']:.2f} s")
     return [f"By who answers (IoU / mIoU, seconds of a frame): {', '.join(each)}.", ""] if len(each) > 1 else []
