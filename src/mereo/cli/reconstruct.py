@@ -1,6 +1,5 @@
 """``mereo reconstruct``: one frame of a sensor to a folder of results."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mereo.fitting.answer import Answer, answer
+from mereo.fitting.answer import Answer
 from mereo.fitting.carry import Carried, Placed, place
 from mereo.fitting.carry import carry as carry_one
 from mereo.fitting.config import FitChoice
@@ -26,9 +25,10 @@ from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import SizeWarning, find_object, size_warning
+from mereo.reconstruction.observation import find_object
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import files_of
+from mereo.visualization.answering import answer
 from mereo.visualization.result import Result
 
 
@@ -104,7 +104,7 @@ class FrameJob:
         return () if self.registrar is None else tuple(place(self.attachments, self.registrar, self.carry_frame))
 
 
-def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Answer:
+def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Result:
     """Read one frame of a sensor, reconstruct it, write a new directory, print what was found.
 
     Args:
@@ -122,28 +122,21 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> An
         print(seen)
         placed = job.placed  # what is carried is refused before the work
         found = answer(
-            seen.cloud,
+            seen,
             job.model,
             job.registrar,
             job.resolution,
-            frame.axes,
+            isolation=job.isolation,
             label_points="points" in chosen_formats(job.files.formats),
-            stated_unit=None if job.registrar is None else job.registrar.stated_unit(frame.unit_m),
-            keep_all=job.isolation.keep_all,
         )
-        whole = Result.of(found, seen, job.model, job.registrar, job.resolution)
         if found.reconstruction.reading.dropped:
             print(found.reconstruction.reading)
-        warning = size_warning(whole.seen, job.model.provenance)
-        if warning is not None:
-            warnings.warn(warning, SizeWarning, stacklevel=2)
         if job.registrar is not None:
             print_source(found)
-        whole.write(directory, job.files, carried_along(placed, found))
+        found.write(directory, job.files, carried_along(placed, found))
         if job.options is not None:
             write_json(directory / CONFIG, {**job.options, "inputs": [str(Path(input).absolute())]})
-    result, seen = found.reconstruction, whole.seen
-    print_segments(result, f"{frame.source}, {len(seen.cloud)} points")
+    print_segments(found.reconstruction, f"{frame.source}, {len(found.seen.cloud)} points")
     print(f"wrote {output} in {seconds_of(found):.1f} s; open {Path(output) / 'report.html'} in a browser")
     return found
 

@@ -219,7 +219,7 @@ def write_files(
     shown = with_carried(result.surfaces, carried)
     if "glb" in formats and len(shown.segments) > len(result.surfaces.segments):
         write_segments_glb(directory / "carried.glb", shown, to_viewer, unit_m)
-    pictured = replace(shown, segments=tuple(_pictured(segment) for segment in shown.segments))
+    pictured = _pictured(shown)
     write_preview(directory / "preview.png", pictured, cloud, frame, facts)
     timings_s = {**result.timings_s, "write": time.perf_counter() - started}
     summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
@@ -242,7 +242,7 @@ def write_one(
 ) -> None:
     """Write the one file of a folder of results that has this suffix (".glb", ".html", ...) to a path."""
     if suffix in (".png", ".html"):
-        pictured = replace(result.surfaces, segments=tuple(_pictured(part) for part in result.surfaces.segments))
+        pictured = _pictured(result.surfaces)
         if suffix == ".png":
             write_preview(path, pictured, cloud, frame, facts)
             return
@@ -267,8 +267,12 @@ def write_preview(
     render_cloud_and_segments(path, seen, surfaces.transformed(to_camera), title)
 
 
-def _pictured(segment: Segment) -> Segment:
-    """A segment as pictures need it."""
+def _pictured(mesh: SegmentedMesh) -> SegmentedMesh:
+    """A mesh as pictures need it."""
+    return replace(mesh, segments=tuple(_coarsened(segment) for segment in mesh.segments))
+
+
+def _coarsened(segment: Segment) -> Segment:
     if len(segment.faces) <= PICTURED_FACES:
         return segment
     return cluster(segment, float(np.ptp(segment.vertices, axis=0).max()) / PICTURED_CELLS)
