@@ -10,7 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from mereo.evaluation.metrics import Scores, format_score, intersection_over_union
 from mereo.evaluation.results import AnswerScores, Evaluation
 from mereo.evaluation.scoring import CELLS
-from mereo.io.errors import readable
+from mereo.io.errors import first_problem, readable
 from mereo.synthesis.config import SensorConfig
 
 CLEARLY = 0.01
@@ -147,11 +147,7 @@ def read_metrics(path: Path) -> dict[str, Any]:
     try:
         given = _Written.model_validate(found).model_fields_set
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "content"
-        raise ValueError(
-            f"{path} is not what mereo evaluate writes (its {place!r}: {first['msg']}): evaluate again"
-        ) from None
+        raise ValueError(f"{path} is not what mereo evaluate writes ({first_problem(error)}): evaluate again") from None
     if not {"scans"} <= given and not {"examples", "seed"} <= given:
         raise ValueError(f"{path} says neither its scans nor its examples and their seed: evaluate again")
     return found

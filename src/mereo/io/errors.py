@@ -9,10 +9,14 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mereo.io.size_limits import SizeError, check_bytes
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 MOST_CHARACTERS = 300
 """Length of a library's text in a sentence, which may quote all that it has read."""
@@ -45,6 +49,12 @@ def readable(path: Path, kind: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise ValueError(f"{path} cannot be read as a {kind} ({reason(error)}): export or download it again") from error
+
+
+def first_problem(error: "ValidationError") -> str:
+    """What pydantic found wrong first, and where: "its 'iou': Input should be a valid number"."""
+    first = error.errors()[0]
+    return f"its {'.'.join(map(str, first['loc'])) or 'content'!r}: {first['msg']}"
 
 
 @contextmanager

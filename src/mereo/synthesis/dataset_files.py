@@ -17,7 +17,7 @@ from jaxtyping import Float16
 from pydantic import BaseModel, Field, ValidationError
 
 from mereo.io.checked_tensors import check_tensors, read_tensors
-from mereo.io.errors import reason
+from mereo.io.errors import first_problem, reason
 from mereo.scenes.rest_pose import TEMPLATE_NODES
 
 DECISIVE = ("scene", "segments", "nested", "any_roll", "workspace", "settings", "seed", "rest_sha256")
@@ -84,10 +84,8 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         manifest: dict[str, Any] = json.loads(path.read_text("utf-8"))
         _Manifest.model_validate(manifest)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "content"
         raise ValueError(
-            f"{path} is not the manifest of a dataset (its {place!r}: {first['msg']}); generate the dataset again"
+            f"{path} is not the manifest of a dataset ({first_problem(error)}); generate the dataset again"
         ) from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON ({reason(error)}); generate the dataset again") from None
