@@ -73,10 +73,13 @@ def second_pass(problem: DrawsProblem, best: DrawsFit | None) -> list[DrawsFit]:
 
 
 def explained(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool:
-    """Whether the cloud's misfit under one of the states is below ``most``."""
+    """Whether one of the states explains the cloud: ``Problem.explained``."""
     sigma = problem.base.config.cloud_sigma
-    least = min((float(robust_square(fit.distance, sigma).mean()) for fit in found), default=np.inf)
-    return least < most
+    misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in found]
+    if not misfits:
+        return False
+    best = found[int(np.argmin(misfits))]
+    return problem.base.explained(min(misfits), best.surface, most)
 
 
 def shape_of_modes(problem: DrawsProblem, modes: Posed) -> Shape:

@@ -70,7 +70,7 @@ class DrawsProblem:
         """The problem in the linear neighbourhood of a state."""
         model = self.model.around(mean, modes)
         network = NetworkTerm(self.found.points, self.weights(mean), self.weights(modes), self.found.confidence)
-        return Problem(model, network, self.base.evidence, self.base.scale_std, self.base.config)
+        return replace(self.base, model=model, network=network)
 
     def network(self, fit: "DrawsFit", modes: Float32[np.ndarray, "n 3 d"] | None = None) -> NetworkTerm:
         """Correspondences in the neighbourhood of a state."""

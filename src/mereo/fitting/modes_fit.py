@@ -16,6 +16,7 @@ from mereo.fitting.hypotheses import ALIKE, by_likeness, by_network
 from mereo.fitting.joints import positions
 from mereo.fitting.priors import Prior
 from mereo.fitting.problem import Misfit, Problem
+from mereo.fitting.residuals import Surface
 from mereo.geometry.procrustes import robust_rigid
 
 
@@ -25,7 +26,7 @@ def fit_modes(problem: Problem) -> "Judged":
     first = fit_whole(problem)
     best = Judged.of(problem, first).better(problem, refine(problem, first))
     for number in range(config.rounds if len(problem.model.pairs) >= config.curved else 0):
-        if best.misfit.cloud < config.explained:
+        if problem.explained(best.misfit.cloud, Surface.of(problem.model, best.posed), config.explained):
             break
         before = best
         for other in likely(problem, best.posed, number):

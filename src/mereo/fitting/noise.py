@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo.fitting.config import FitConfig
+from mereo.fitting.residuals import robust_square
 
 TO_STD = 1.4826
 """Standard deviation of normal numbers over the median of their absolute values."""
@@ -22,11 +23,19 @@ CLEAN = 0.1
 COHERENT = 1.3
 """What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1, whatever the camera."""
 
-SIGMAS = 3.0
-"""Standard deviation that the cloud gets, in noises: as on clean frames."""
+SIGMAS = 1.5
+"""Standard deviation that the cloud gets, in noises: mixed pixels are far beyond ``residuals.ROBUST`` of these."""
+
+NOISES = 3.0
+"""Distance, in noises, that counts as a standard deviation of a clean frame does where a fit is to be believed."""
 
 LARGEST = 1.0
 """Largest standard deviation of the cloud, in scene units."""
+
+SHARED = 1.05
+"""Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained.
+
+Fits to noisy training views that other states do not improve have 1.02 to 1.15, those that they do mostly more."""
 
 ACCEPTED = 0.75
 """Share of a noisy frame's points that a fit must explain to be believed: what remains are strays that nothing tells.
@@ -51,10 +60,17 @@ def is_noise(offset: Float[np.ndarray, " n"], noise: float) -> bool:
     return TO_STD * float(np.median(np.abs(offset))) <= COHERENT * noise
 
 
+def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float) -> float:
+    """Misfit of a cloud, in misfits of what its points' offsets do not share with those around them."""
+    own = offset - np.median(offset[around], axis=1)
+    own /= np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
+    return float(robust_square(offset, sigma).mean() / max(robust_square(own, sigma).mean(), 1e-12))
+
+
 def constants_for(noise: float, config: FitConfig) -> FitConfig:
     """Constants for a frame of this noise in scene units; the same where it is as on clean frames."""
     if noise <= CLEAN:
         return config
     sigma = min(max(SIGMAS * noise, config.cloud_sigma), LARGEST)
-    tolerance = config.tolerance * sigma / config.cloud_sigma
+    tolerance = config.tolerance * min(max(NOISES * noise, config.cloud_sigma), LARGEST) / config.cloud_sigma
     return replace(config, cloud_sigma=sigma, tolerance=tolerance, accepted=min(config.accepted, ACCEPTED))

@@ -11,7 +11,7 @@ from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import PARTNERS, Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed
 from mereo.fitting.joints import Joints
-from mereo.fitting.noise import constants_for, is_noise, noise_of
+from mereo.fitting.noise import SHARED, constants_for, is_noise, noise_of, shared
 from mereo.fitting.priors import PairTerm, Prior
 from mereo.fitting.residuals import (
     ROBUST,
@@ -71,6 +71,7 @@ class Problem:
         evidence: the frame.
         scale_std: how far the scale is unsure.
         config: constants.
+        noisy: whether they are those of a noisy frame.
     """
 
     model: StatisticalModel
@@ -78,6 +79,7 @@ class Problem:
     evidence: Evidence
     scale_std: float
     config: FitConfig
+    noisy: bool = False
 
     @classmethod
     def of(
@@ -115,7 +117,7 @@ class Problem:
         config = constants_for(noise_of(self.offsets(posed), self.evidence.around), self.config)
         if config is self.config:
             return None
-        return replace(self, config=config, evidence=self.evidence.with_more_partners)
+        return replace(self, config=config, evidence=self.evidence.with_more_partners, noisy=True)
 
     def with_network(self, found: Correspondences) -> "Problem":
         """The problem with other correspondences."""
@@ -125,6 +127,15 @@ class Problem:
         """Whether what a fit leaves over is noise, and not its own error."""
         offset = self.offsets(posed)
         return is_noise(offset, noise_of(offset, self.evidence.around))
+
+    def explained(self, cloud: float, surface: Surface, most: float) -> bool:
+        """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise."""
+        if cloud < most or not self.noisy:
+            return cloud < most
+        points = self.evidence.points
+        distance, face, place = surface.along_sight(points, self.far)
+        offset = np.copysign(distance, np.einsum("pi,pi->p", points - place, surface.normals[face]))
+        return shared(offset, self.evidence.around, self.config.cloud_sigma) < SHARED
 
     @property
     def far(self) -> float:
@@ -149,11 +160,13 @@ class Problem:
     def coarse(self) -> "Problem":
         """Problem with fewer points, for the choice among many states."""
         config = replace(self.config, samples=self.config.coarse_samples, witnesses=self.config.witnesses // COARSE)
-        few = slice(None, None, COARSE)
-        network = NetworkTerm(*(part[few] for part in vars(self.network).values()))
+        if self.noisy:  # its sigma would ask the faces in all steps
+            config = replace(config, exact_steps=0)
+        some = slice(None, None, COARSE)
+        network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
         evidence = replace(self.evidence, partners=self.evidence.partners[: PARTNERS // COARSE])
-        coarse = Problem(self.model, network, evidence, self.scale_std, config)
-        vars(coarse)["pairs"] = PairTerm(*(part[few] for part in vars(self.pairs).values()))
+        coarse = Problem(self.model, network, evidence, self.scale_std, config, self.noisy)
+        vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))
         return coarse
 
     def screen(self, posed: Posed, sigma: float) -> float:
