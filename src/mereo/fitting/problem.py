@@ -32,7 +32,7 @@ BESIDE = 1.0
 """Share of the samples' spacing: a partner so far beside one is still on its plane."""
 
 FAR = 1.0
-"""Scene units beyond its slack by which a vertex is ruled out for good."""
+"""Scene units beyond the tolerance by which a vertex is ruled out for good."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class Problem:
 
     def ruled_out(self, surface: Surface) -> float:
         """Share of a surface's vertices that the frame rules out by more than ``FAR``."""
-        amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * self.config.cloud_sigma)[1]
+        amount = self.evidence.violations(surface.material[self.witnesses], self.config.tolerance)[1]
         return float((amount > FAR).mean())
 
     def total(self, cloud: float, network: float, witnesses: float, z: Float[np.ndarray, " k"]) -> Misfit:
