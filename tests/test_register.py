@@ -7,14 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import untrained
+from trimesh.remesh import subdivide
 
 from mereo import __main__ as command_line
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.evaluation.sample_views import SampleView, load_view
+from mereo.evaluation.scoring import evaluate
 from mereo.fitting import register
 from mereo.fitting.answer import Answer, answer
-from mereo.fitting.register import Registrar, registrar_for, statistical_model_of
+from mereo.fitting.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.solids import Solids
 from mereo.models.model import Model
@@ -105,6 +108,33 @@ def test_full_needs_a_scene(model: Model) -> None:
     assert Registrar.of(other, "full", "rope").scene is not None
     with pytest.raises(ValueError, match="the scene 'engine' has other segments or meshes than the weights' own model"):
         Registrar.of(other, "full", "engine")
+
+
+def test_a_scene_that_has_changed_since_is_said_and_not_played(
+    model: Model, view: SampleView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = load_scene("rope")
+    base, *pieces = scene.rest.segments
+    finer = Segment(base.name, base.color, *subdivide(base.vertices, base.faces))
+    changed = replace(scene, rest=SegmentedMesh((finer, *pieces)))
+    said = (
+        rf"'rope' has other .* \(its segment 'base' has {len(finer.vertices)} vertices, theirs {len(base.vertices)}\)"
+    )
+    fitted = Registrar.of(model, "modes").fit_modes(view.depth.to_points())
+    monkeypatch.setattr(register, "load_scene", lambda name: changed)
+    for registrar in (Registrar.of(model), Registrar.of(model, scene=changed)):
+        with pytest.warns(ChangedSceneWarning, match=f"{said}: it has changed since .* only the modes .* train them"):
+            assert registrar.finish(fitted).method == "modes"
+        assert registrar.at_hand is None  # said once
+    for given in (None, changed):
+        with pytest.raises(ValueError, match=f"{said}, so its draws .* or use --fit modes"):
+            Registrar.of(model, "full", given)
+    with pytest.raises(ValueError, match=f"{said}, so its draws"):  # named as that of other weights
+        assert Registrar.of(replace(model, provenance={"scene": "mine"}), scene=changed).at_hand
+    for choice in ("auto", "modes", "full"):
+        with pytest.raises(ValueError, match=f"{said}, so places cannot be compared: .* with --fit off"):
+            evaluate(model, changed, examples=1, choice=choice)
+    assert evaluate(model, changed, examples=1, cells=12, choice="off").sources == ("network",)
 
 
 def test_auto_plays_the_scene_where_it_is_at_hand(model: Model, view: SampleView) -> None:

@@ -7,11 +7,15 @@ import pytest
 from solid_pairs import gap, overlapping_pairs
 
 from mereo.deformation.maps import jacobian
+from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid
 from mereo.scenes.builtin import _robot_parts as parts
 from mereo.scenes.builtin import robot
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import State
+from mereo.synthesis.depth_rendering import render_depth
 
 LINKS = ("base", "column", "upper_arm", "elbow", "forearm", "wrist", "hand")
 
@@ -109,6 +113,38 @@ def test_states_vary(states: list[State]) -> None:
 def test_poses_in_which_parts_meet_are_refused(angles_deg: tuple[float, ...], pair: tuple[str, str]) -> None:
     assert pair in overlapping_pairs(pose(*angles_deg))
     assert not robot.is_clear(robot.chain(np.deg2rad(np.array(angles_deg))))
+
+
+def test_spheres_enclose_the_hand_and_its_camera() -> None:
+    rows = [row for row in robot.REACHING if row.link == 6]
+    vertices = np.concatenate([part.vertices for part in robot.rest_mesh().segments[6:]])
+    outside = [np.linalg.norm(vertices[:, None] - row.centers(), axis=-1).min(axis=1) - row.radius for row in rows]
+    assert np.min(outside, axis=0).max() < 0.0
+
+
+@pytest.mark.parametrize("pitch_deg", [-100.0, 100.0])
+def test_the_hand_passes_the_forearm_at_any_spin(pitch_deg: float) -> None:
+    arm = Solids(SegmentedMesh(robot.rest_mesh().segments[3:5]))
+    for spin_deg in range(0, 360, 30):
+        hand = pose(0, 0, 0, 0, pitch_deg, spin_deg).segments[6]
+        assert arm.nearest(hand.vertices).distance.min() > 1.0
+        assert not arm.label(hand.vertices).any()
+
+
+def test_views_tell_a_hand_from_one_turned_by_half(states: list[State]) -> None:
+    scene, rng = load_scene("robot"), np.random.default_rng(3)
+    camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
+    half_turn = robot.Rigid(np.array([np.pi, 0.0, 0.0]), np.zeros(3), np.array(parts.WRIST))
+    telling = []
+    for state in states:
+        hand, left, right = state.deformations[6:]
+        # the left finger at rest, turned by half, lies where the right one is, and then moves as that does
+        turned = [robot.Compose((half_turn, after)) for after in (hand, right, left)]
+        other = scene.deform((*state.deformations[:6], *turned))
+        T_camera_world = inverse_rigid(scene.workspace.sample(rng, state.mesh.bounds.mean(axis=0)))
+        seen, confused = (render_depth(each.mesh.transformed(T_camera_world), camera).depth for each in (state, other))
+        telling.append(int((np.abs(seen - confused) > 0.5).sum()))  # five times the noise
+    assert np.quantile(telling, 0.1) > 15 and np.median(telling) > 30
 
 
 def test_few_free_poses_are_refused() -> None:

@@ -141,3 +141,39 @@ def test_clearance_test_sees_a_rope_through_itself_or_the_base() -> None:
     assert not rope.is_clear(hairpin)
     back_into_base = np.where((rope.NODES < 10)[:, None], straight, np.array([20.0, 5.0, 0]) - straight)
     assert not rope.is_clear(back_into_base)
+
+
+def test_rope_leaves_its_plane_as_far_as_it_moves_in_it() -> None:
+    rng = np.random.default_rng(4)
+    centers = np.stack([rope.sample_centerline(rng) for _ in range(600)])
+    tangents = np.diff(centers, axis=1)
+    sideways, forwards = (np.abs(tangents[..., axis]).mean() for axis in (1, 2))
+    assert 0.9 < forwards / sideways < 1.1  # half as large where only sideways bends are at full strength
+    reach = np.quantile(np.abs(centers[:, :, 1:]).max(axis=1), [0.5, 0.9], axis=0)
+    assert np.allclose(reach[:, 1] / reach[:, 0], 1.0, atol=0.12)
+
+
+def test_centerline_bends_as_it_is_told() -> None:
+    """A constant bend in any direction is a circle in that direction's plane."""
+    for direction in (0.0, 0.7, np.pi / 2, 3.0):
+        toward = np.array([0.0, np.cos(direction), np.sin(direction)])
+        bends = 0.2 * np.outer(toward[1:], np.ones(len(rope.NODES)))
+        center = rope.centerline(bends)
+        assert np.allclose(np.linalg.norm(center - 5.0 * toward, axis=1), 5.0, atol=0.01)
+        assert np.abs(center @ np.cross([1.0, 0.0, 0.0], toward)).max() < 1e-9
+
+
+def test_coils_keep_their_pitch_in_any_direction() -> None:
+    rng, steepest = np.random.default_rng(5), []
+    for _ in range(30):
+        bends = rope.coil(rng)
+        center = rope.centerline(bends)
+        tangents = np.diff(center[-40:], axis=0) / rope.NODES[1]
+        axis = np.linalg.svd(np.diff(tangents, axis=0))[2][2]  # a helix's normals are across its axis
+        rise = np.abs(tangents @ axis)
+        assert np.ptp(rise) < 1e-3
+        curvature = np.hypot(*bends[:, -1])
+        turn = curvature / np.sqrt(1.0 - rise.mean() ** 2)
+        assert 4.9 < rise.mean() * 2 * np.pi / turn < 9.1
+        steepest.append(np.abs(axis[1:]))
+    assert np.array(steepest).max(axis=0).min() > 0.9  # across both ways

@@ -193,7 +193,7 @@ def test_two_hundred_states_are_sound_invertible_and_in_view(scene: Scene) -> No
         assert smallest_determinant(state, points) > 0.05
         assert_in_view(scene, state.mesh, rng)
         if index % 4 == 0:
-            check_overlap(state.mesh, tolerance=0.02, cells=32)
+            check_overlap(state.mesh, tolerance=0.02)
             assert_seen(scene, state.mesh, rng)
 
 

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from manifold3d import Manifold, OpType
 from solid_pairs import crowded
 
 from mereo.deformation.maps import Deformation, jacobian
+from mereo.geometry.manifold import solid_of
 from mereo.scenes.builtin import sheet
 from mereo.scenes.builtin._sheet_parts import THICKNESS, middle_points
 from mereo.scenes.registry import load_scene
@@ -47,6 +49,14 @@ def test_a_sheet_that_lies_on_itself_is_refused() -> None:
     assert sheet.is_clear(flat)
     folded = np.where(flat[:, :1] > 0, flat * [-1.0, 1.0, 1.0] + [0.0, 0.0, THICKNESS], flat)
     assert not sheet.is_clear(folded)
+
+
+def test_half_a_cell_through_its_thickness_costs_the_flat_mat_a_quarter() -> None:
+    rest = load_scene("sheet").rest
+    mat = Manifold.batch_boolean([solid_of(part.vertices, part.faces) for part in rest.segments], OpType.Add)
+    half_a_cell = float((rest.bounds[1] - rest.bounds[0]).max()) / 100 / 2
+    shared = (mat ^ mat.translate((0.0, 0.0, half_a_cell))).volume()
+    assert shared / (2 * mat.volume() - shared) == pytest.approx(0.72, abs=0.005)
 
 
 def test_the_middle_surface_keeps_its_lengths() -> None:

@@ -12,6 +12,7 @@ from tyro.conf import arg
 from mereo.cli.config_file import ConfigFile, options_of
 from mereo.cli.positionals import AssetNames, DatasetFolder, SceneName, WeightsName
 from mereo.fitting.config import FitChoice
+from mereo.geometry.conventions import WorkspaceName
 from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Threads, Workers
 from mereo.io.config import CONFIG
 from mereo.io.cores import workers_for
@@ -176,6 +177,8 @@ class Evaluate:
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
         image_size: the depth image is square, in pixels; 96 is the paper's, a depth camera gives the object 200 to 400.
         noise_std: Gaussian noise on the depth, standard deviation in scene units.
+        workspace: where the camera may be: own is what the scene states; cone is on one side of the object, sphere all
+            around it, at any roll.
         terms: what else is wrong with the depth image.
         inference: where and how exactly the network computes.
         fit: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the modes'
@@ -194,6 +197,7 @@ class Evaluate:
     sensor: Sensor = "paper"
     image_size: ImageSize = 96
     noise_std: NotNegative = 0.1
+    workspace: WorkspaceName = "own"
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
     fit: FitChoice = "auto"
@@ -205,13 +209,16 @@ class Evaluate:
         """Write scores and pictures of their errors, and print the table."""
         from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
 
-        settings = GenerateConfig(image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms)
+        settings = GenerateConfig(
+            image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms, workspace=self.workspace
+        )
         if self.scans is not None:
             from mereo.models.weights import load_for
 
             if settings != GenerateConfig():
                 raise ValueError(
-                    "--scans are real and take no simulated camera: leave out --sensor, --image-size and --noise-std"
+                    "--scans are real and take no simulated camera: leave out --sensor, --image-size, --noise-std and "
+                    "--workspace"
                 )
             model = load_for(self.weights, self.inference)
             evaluate_on_scans(

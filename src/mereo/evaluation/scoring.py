@@ -17,7 +17,7 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import EvaluatedView, Evaluation, Tally, grid_confusion
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import Registrar, registrar_for
+from mereo.fitting.register import CURE, Registrar, other_mesh, registrar_for
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
@@ -119,7 +119,8 @@ def evaluate(
         settings: the camera (image size, noise, sensor); by default the paper's.
         choice: which answer is scored: by default what a user gets, and beside it all others that can be had.
 
-    Raises ``ValueError`` for a training seed, no examples, or another object than the model's.
+    Raises ``ValueError`` for a training seed, no examples, another object than the model's, and, where a registration
+    is asked for, other meshes than those of the model's own statistical model.
     """
     if seed < TEST_SEED_START:
         raise ValueError(f"the seed is {seed}; training may have seen it: take a test seed, {TEST_SEED_START} or more")
@@ -128,6 +129,10 @@ def evaluate(
     if scene is None or isinstance(scene, str):
         scene = load_scene(scene or trained_scene(model))
     check_names(model, scene.rest.names)
+    if choice != "off" and model.statistical_model is not None:
+        fault = other_mesh(scene, model.statistical_model)
+        if fault is not None:
+            raise ValueError(f"{fault}, so places cannot be compared: {CURE}, or score the network with --fit off")
     case = partial(_scene_case, scene, settings or GenerateConfig(), seed, cells)
     unit_mm = None if scene.unit_m is None else 1000 * scene.unit_m
     return replace(score_cases(model, case, examples, progress, registrar_for(model, choice, scene)), unit_mm=unit_mm)

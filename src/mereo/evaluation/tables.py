@@ -10,6 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from mereo.evaluation.metrics import Scores, format_score, intersection_over_union
 from mereo.evaluation.results import AnswerScores, Evaluation
 from mereo.evaluation.scoring import CELLS
+from mereo.geometry.conventions import WorkspaceName
 from mereo.io.errors import first_problem, readable
 from mereo.synthesis.config import SensorConfig
 
@@ -129,6 +130,7 @@ class _Written(_Mean):
     seed: int = 0
     noise_std: FiniteFloat = 0.0
     image_size: int = 0
+    workspace: WorkspaceName = "own"
     sensor: Annotated[SensorConfig | None, BeforeValidator(_sensor)] = None
     scans: list[str] = []
     example_mean: _Mean | None = None

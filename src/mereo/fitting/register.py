@@ -3,6 +3,7 @@
 EncodedFrame -Registrar-> Registration
 """
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,14 +14,18 @@ from mereo.fitting.config import FitChoice
 from mereo.fitting.fit import ModesFit, fit_frame
 from mereo.fitting.playback import DrawnStates
 from mereo.fitting.registration import Registration
+from mereo.geometry.brief import listed
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.random_states import built_in_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.statistical_model import StatisticalModel
+
+
+class ChangedSceneWarning(UserWarning):
+    """Scene with other meshes than when the weights were trained on it: its draws are not fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,19 +70,24 @@ class Registrar:
     def scene(self) -> Scene | None:
         """Scene whose draws can be played: the given one, or the built-in one of the weights; None where neither is.
 
-        Raises ``ValueError`` for a given scene of another object, and ``AssetUnavailable`` where its mesh cannot be
-        had.
+        Also None, with a ``ChangedSceneWarning``, where ``choice`` is "auto" and the scene that the weights were
+        trained on has other meshes since. Raises ``ValueError`` for such a scene with other choices and for a given
+        scene of another object, and ``AssetUnavailable`` where its mesh cannot be had.
         """
         name = str(self.network.provenance.get("scene"))
         scene = self.given if self.given is not None else load_scene(name) if name in SCENES else None
-        if scene is not None and not same_topology(scene, self.model):
-            if self.given is None:
-                return None
-            raise ValueError(
-                f"the scene {scene.name!r} has other segments or meshes than the weights' own model; its draws move "
-                "other vertices: name the scene that the weights were trained on, or use --fit modes"
+        fault = None if scene is None else other_mesh(scene, self.model)
+        if scene is None or fault is None:
+            return scene
+        if self.choice == "auto" and scene.name == name:
+            warnings.warn(
+                f"{fault}: it has changed since they were trained, so only the modes of that model are fitted; train "
+                "them again for the fit of its draws",
+                ChangedSceneWarning,
+                stacklevel=2,
             )
-        return scene
+            return None
+        raise ValueError(f"{fault}, so its draws move other points: {CURE}, or use --fit modes")
 
     @cached_property
     def states(self) -> DrawnStates | None:
@@ -147,15 +157,26 @@ def registrar_for(model: Model, choice: FitChoice, scene: Scene | str | None = N
     return Registrar.of(model, choice, scene)
 
 
-def same_topology(scene: Scene, model: StatisticalModel) -> bool:
-    """Whether a scene's rest meshes have the names and numbers of vertices and faces of a model's."""
+CURE = "name the scene that the weights were trained on, train them again if it has changed since"
+"""What to do about a scene of other meshes."""
 
-    def sizes(mesh: SegmentedMesh) -> list[tuple[str, int, int]]:
-        return [
-            (name, len(part.vertices), len(part.faces)) for name, part in zip(mesh.names, mesh.segments, strict=True)
-        ]
 
-    return sizes(scene.rest) == sizes(model.rest)
+def other_mesh(scene: Scene, model: StatisticalModel) -> str | None:
+    """How a scene's segments differ from a model's, in names or in numbers of vertices or faces; None where they agree.
+
+    Places of a statistical model mean nothing on another mesh.
+    """
+    said = f"the scene {scene.name!r} has other segments or meshes than the weights' own model"
+    if scene.rest.names != model.rest.names:
+        return f"{said} ({listed(scene.rest.names)}; theirs: {listed(model.rest.names)})"
+    for now, then in zip(scene.rest.segments, model.rest.segments, strict=True):
+        for count, before, what in (
+            (len(now.vertices), len(then.vertices), "vertices"),
+            (len(now.faces), len(then.faces), "faces"),
+        ):
+            if count != before:
+                return f"{said} (its segment {now.name!r} has {count} {what}, theirs {before})"
+    return None
 
 
 def statistical_model_of(model: Model) -> StatisticalModel:

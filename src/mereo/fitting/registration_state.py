@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from mereo.fitting.answer import Answer
 from mereo.fitting.playback import SMOOTH, Drawn, material_moved, shares_of
-from mereo.fitting.register import Registrar, same_topology
+from mereo.fitting.register import CURE, Registrar, other_mesh
 from mereo.fitting.registration import Registration
 from mereo.fitting.state_file import FORMAT, STATE, WITNESSES, RegistrationState, StateDraws, read_state, save_state
 from mereo.geometry.conventions import CloudAxes
@@ -198,11 +198,9 @@ def _unposed(
         return (model.rest_points if state.method == "rest" else model.material(z)), None
     scene = scene_of(state) if scene is None else scene
     played = played_state(state, scene)
-    if not same_topology(scene, model):
-        raise ValueError(
-            f"the scene {scene.name!r} has other segments or meshes than the weights' own model: name the scene that "
-            "they were trained on"
-        )
+    fault = other_mesh(scene, model)
+    if fault is not None:
+        raise ValueError(f"{fault}: {CURE}")
     smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in played.calls])
     return material_moved(scene, model, played.deformations), Drawn(state.draws.seed, z, state.draws.sizes, smooth)
 

@@ -1,4 +1,4 @@
-"""Conventions shared by every room: axes of clouds, units of length, the least number of points."""
+"""Conventions shared by every room: axes of clouds, names of workspaces, units of length, least number of points."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -14,6 +14,10 @@ LARGEST = 1e12
 
 CloudAxes = Literal["camera", "scanner"]
 """Axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner."""
+
+
+WorkspaceName = Literal["own", "cone", "sphere"]
+"""Places where a virtual camera may be: as the scene states them, on one side of the object, or all around it."""
 
 
 UNITS_M: Mapping[str, float] = MappingProxyType({"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254})

@@ -1,13 +1,14 @@
 """Scenes: a segmented model at rest, its random deformations, and where a camera may stand (paper, appendix B)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from mereo.deformation.maps import Deformation
 from mereo.geometry.brief import counted, listed
+from mereo.geometry.conventions import WorkspaceName
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import look_at, rotation_along
 from mereo.scenes.seeds import TEST_SEED_START
@@ -41,6 +42,11 @@ class Workspace:
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     any_roll: bool = False
     fov_rad: float = float(np.deg2rad(35.0))
+
+    @property
+    def all_around(self) -> bool:
+        """Whether it is the whole sphere, which has no middle."""
+        return self.aperture_rad >= WHOLE_SPHERE_RAD
 
     def sample(self, rng: np.random.Generator, target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
         """Pose ``T_world_camera`` of a camera aimed at ``target``, uniform in direction and in distance."""
@@ -82,6 +88,8 @@ class Scene:
         rest: the segments at rest, in scene units (shortest dimension about 20).
         sample_deformations: draws one deformation per segment; segments that move together share one object.
         workspace: where the camera may be.
+        cone: where else it may be, of a scene whose ``workspace`` is the whole sphere; by default the paper's cone
+            about the workspace's axis.
         source: where the mesh comes from, and its licence.
         held_out: the same object in states that are kept for testing; None where states are drawn without end.
         unit_m: metres per scene unit; None where the object's true size is not known.
@@ -100,6 +108,7 @@ class Scene:
     unit_m: float | None = None
     T_scene_source: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     definition: str = ""
+    cone: Workspace | None = None
 
     def __post_init__(self) -> None:
         if self.held_out is not None and self.held_out.rest.names != self.rest.names:
@@ -117,6 +126,19 @@ class Scene:
     def source_frame(self) -> SourceFrame:
         """Frame of the object's own files."""
         return SourceFrame(self.T_scene_source, self.unit_m)
+
+    def workspace_named(self, name: WorkspaceName) -> Workspace:
+        """Workspace of the scene by name, at its own distances and with its own angle of view.
+
+        "own" is ``workspace``. "cone" and "sphere" are that too where it is one, so that scenes can be compared; else
+        the cone of the scene, with a level horizon, and the whole sphere at any roll.
+        """
+        own = self.workspace
+        if name == "cone" and own.all_around:
+            return self.cone or replace(own, aperture_rad=PAPER_APERTURE_RAD, any_roll=False)
+        if name == "sphere" and not own.all_around:
+            return replace(own, aperture_rad=WHOLE_SPHERE_RAD, any_roll=True)
+        return own
 
     def for_seed(self, seed: int) -> "Scene":
         """Scene that a seed draws from: its held-out states for testing (``TEST_SEED_START`` up), or itself."""

@@ -3,11 +3,12 @@
 Light, so that the command line may import them.
 """
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
 from tyro.conf import OmitArgPrefixes
 
+from mereo.geometry.conventions import WorkspaceName
 from mereo.io.bounds import (
     ImageSize,
     Multiple,
@@ -174,6 +175,9 @@ class GenerateConfig:
         sensor: what else is wrong with the depth image; nothing in the paper.
         observations: further clouds of every example's state and camera, each by another sensor, of which training
             sees a random one; all are those that differ from the example's own sensor.
+        workspace: where the camera may be: own is what the scene states; cone is on one side of the object (the paper's
+            140 degrees about its upward direction, where the scene has no cone of its own); sphere is all around it, at
+            any roll.
     """
 
     image_size: ImageSize = 96
@@ -183,6 +187,7 @@ class GenerateConfig:
     sampling: OmitArgPrefixes[SamplingConfig] = field(default_factory=SamplingConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     observations: tuple[ObservationName | Literal["all"], ...] = ()
+    workspace: WorkspaceName = "own"
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -198,3 +203,14 @@ class GenerateConfig:
         if "all" in self.observations:
             return {name: sensor for name, sensor in OBSERVATIONS.items() if sensor != self.sensor}
         return {name: OBSERVATIONS[name] for name in self.observations if name != "all"}
+
+    def stated(self) -> dict[str, Any]:
+        """Settings as a manifest has them: further observations with their sensors, and no word of these without any.
+
+        Nor of the workspace where it is the scene's own.
+        """
+        stated = asdict(self)
+        names, place = stated.pop("observations") and list(self.further), stated.pop("workspace")
+        sensors = {name: asdict(sensor) for name, sensor in self.further.items()}
+        stated |= {"observations": names, "sensors": sensors} if names else {}
+        return stated | ({} if place == "own" else {"workspace": place})

@@ -116,10 +116,11 @@ def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator
 
 def _sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> tuple[View, Solids]:
     """View of a random state, and the search structures on its mesh that rendering has built."""
-    camera = Camera.from_fov(settings.image_size, settings.image_size, scene.workspace.fov_rad)
+    workspace = scene.workspace_named(settings.workspace)
+    camera = Camera.from_fov(settings.image_size, settings.image_size, workspace.fov_rad)
     for _ in range(ATTEMPTS):
         state = scene.sample_state(rng)
-        T_world_camera = scene.workspace.sample(rng, state.mesh.bounds.mean(axis=0))
+        T_world_camera = workspace.sample(rng, state.mesh.bounds.mean(axis=0))
         mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
         solids = Solids(mesh)
         seen = observe(solids, camera, settings.noise_std, settings.sensor, rng)

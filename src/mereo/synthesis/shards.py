@@ -166,7 +166,7 @@ def _check_request(examples: int, seed: int, workers: int, shard: tuple[int, int
 
 def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: int) -> dict[str, Any]:
     """Manifest of a dataset as JSON values: all that decides it, and what training needs to know of the scene."""
-    digest = hashlib.sha256()
+    workspace, digest = scene.workspace_named(settings.workspace), hashlib.sha256()
     for segment in scene.rest.segments:
         for array, dtype in ((segment.vertices, "<f8"), (segment.faces, "<i8")):
             digest.update(np.ascontiguousarray(array, dtype=dtype).tobytes())
@@ -175,9 +175,9 @@ def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: i
         "source": scene.source,
         "segments": [{"name": s.name, "color": s.color} for s in scene.rest.segments],
         "nested": scene.rest.nested,
-        "any_roll": scene.workspace.any_roll,
-        "workspace": asdict(scene.workspace),
-        "settings": _stated(settings),
+        "any_roll": workspace.any_roll,
+        "workspace": asdict(workspace),
+        "settings": settings.stated(),
         "seed": seed,
         "examples": examples,
         "shard_size": SHARD_SIZE,
@@ -197,14 +197,6 @@ def example_bytes(settings: GenerateConfig, segments: int) -> int:
     per_point, per_query, once = 12, 12 + 1 + 4 + 6 + 6, 4 + 24 + 8
     seen = len(settings.further) * (6 * settings.points + 4)
     return per_point * settings.points + per_query * settings.sampling.total(segments) + once + seen
-
-
-def _stated(settings: GenerateConfig) -> dict[str, Any]:
-    """Settings as a manifest has them: with the sensors of further observations, and no word of these without any."""
-    stated = asdict(settings)
-    names = stated.pop("observations") and list(settings.further)
-    sensors = {name: asdict(sensor) for name, sensor in settings.further.items()}
-    return stated | ({"observations": names, "sensors": sensors} if names else {})
 
 
 def _claim(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> dict[str, Any]:

@@ -143,6 +143,10 @@ def nearest_preset(recipe: dict[str, Any]) -> str:
     return max(PRESETS, key=agreement)
 
 
+SEEN_FROM = {"cone": "cameras on one side of the object", "sphere": "cameras all around the object"}
+"""Words for workspaces other than the scene's own."""
+
+
 def _camera(test: dict[str, Any]) -> str:
     """Words for a camera that is not the paper's, with a comma behind; nothing for the paper's."""
     sensor, size = SensorConfig(**(test.get("sensor") or {})), test.get("image_size", GenerateConfig.image_size)
@@ -150,6 +154,7 @@ def _camera(test: dict[str, Any]) -> str:
     words = [named[0] if named else "a camera of its own terms"] if sensor.on else []
     words += [f"a tool in {sensor.tool:.0%} of them"] if sensor.tool else []
     words += [f"{size} x {size} pixels"] if size != GenerateConfig.image_size else []
+    words += [SEEN_FROM[test["workspace"]]] if test.get("workspace", "own") != "own" else []
     return "".join(f"{word}, " for word in words)
 
 

@@ -137,7 +137,7 @@ def preview_scene(scene: Scene, path: str | Path, seed: int = 0, states: int = 9
     settings = GenerateConfig()
     views = [sample_view(scene, settings, example_rng(seed, index)) for index in range(states)]
     # a workspace around the whole object has no meaningful axis; mesh files are mostly y up
-    up = (0.0, 1.0, 0.0) if scene.workspace.aperture_rad >= 2 * np.pi else scene.workspace.axis
+    up = (0.0, 1.0, 0.0) if scene.workspace.all_around else scene.workspace.axis
     preview_states(path, views, f"{scene.name}: {states} random states", up=up)
 
 

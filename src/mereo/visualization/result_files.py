@@ -85,6 +85,7 @@ def evaluate_weights(
             "image_size": settings.image_size,
             "noise_std": settings.noise_std,
             "sensor": asdict(settings.sensor),
+            "workspace": settings.workspace,
             "device": model.device.type,
             "precision": model.working_precision,
             "trained": model.provenance,

@@ -5,11 +5,13 @@ The arm is built in layers, so that neighbours pass each other at any angle. Sho
 that turn upon each other are 0.2 apart.
 """
 
+from itertools import pairwise
+
 import numpy as np
 from manifold3d import Manifold
 
 from mereo.scenes.builtin._machine_parts import bolts, box, plate, ring_of, shaft, turned, without
-from mereo.scenes.builtin._solids import Vector, hull, union
+from mereo.scenes.builtin._solids import Vector, hull, rod, union
 
 SHOULDER: Vector = (3.5, 0.0, 19.0)
 """A point of the second axis, which is along y."""
@@ -156,7 +158,7 @@ def wrist() -> Manifold:
 
 
 def hand() -> Manifold:
-    """Bolted flange, adapter, gripper housing with cooling slots, guide rails and a socket on one side."""
+    """Bolted flange, adapter, gripper housing with cooling slots, guide rails, a socket on top and a camera beside."""
     x, z = WRIST[0] + 3.6 + GAP, FOREARM_HEIGHT
     flange = union(
         shaft("x", (x, 0, z), 0.8, 2.4, sides=24),
@@ -174,7 +176,24 @@ def hand() -> Manifold:
     socket = union(
         box((x + 2.2, -1.0, z + 1.8), (x + 4.6, 1.0, z + 3.3), 0.25), shaft("x", (x + 2.6, 0, z + 2.7), -1.3, 0.45)
     )
-    return union(flange, without(housing, *slots), *rails, socket)
+    return union(flange, without(housing, *slots), *rails, socket, hand_camera())
+
+
+def hand_camera() -> Manifold:
+    """The hand's own camera: it stands off beside the right finger, and its cable makes a bow over to the socket.
+
+    It is what tells the fingers apart, so it stands out far enough for a depth image of 96 x 96 pixels, in which one
+    pixel is about a unit. It is far enough forward to pass the forearm where the wrist is pitched all the way.
+    """
+    x, z = WRIST[0] + 3.6 + GAP, FOREARM_HEIGHT
+    y = -7.9
+    bracket = box((x + 2.8, y + 1.0, z - 1.0), (x + 4.8, -3.5, z + 1.0), 0.2)
+    body = box((x + 3.0, y - 1.6, z - 2.8), (x + 6.2, y + 1.6, z + 2.8), 0.4)
+    lenses = [shaft("x", (x + 6.0, y, z + dz), 0.9, 0.8, sides=16) for dz in (-1.5, 1.5)]
+    bow = [(y, 2.5), (y + 0.2, 4.6), (y + 1.4, 6.0), (y + 3.2, 6.3), (y + 5.0, 5.6), (-1.4, 3.9), (-0.6, 2.7)]
+    course: list[Vector] = [(x + 4.0, across, z + up) for across, up in bow]
+    cable = [rod(start, end, 0.55, 0.55, sides=8) for start, end in pairwise(course)]
+    return union(bracket, body, *lenses, *cable)
 
 
 def finger(side: int) -> Manifold:

@@ -6,6 +6,7 @@ closed segments.
 
 What makes it hard: a nearly round body without landmarks, ears thin against the distance, a tail hidden from most
 sides, and a camera that may look from anywhere (the whole sphere, any roll), because real scans come from all sides.
+The workspace `cone` is that of the other scenes: from above, at most 70 degrees off, with a level horizon.
 """
 
 from dataclasses import dataclass
@@ -29,6 +30,9 @@ from mereo.scenes.scene import WHOLE_SPHERE_RAD, Scene, Workspace
 SHORTEST_SIDE = 20.0
 LONGEST_EDGE = 1.2
 """Longer edges are split, so that the flat faces of the cuts bend with the rest."""
+
+
+FOV_RAD = float(np.deg2rad(26.0))
 
 
 @dataclass(frozen=True)
@@ -204,7 +208,8 @@ def scene() -> Scene:
         name="bunny",
         rest=rest_mesh(),
         sample_deformations=sample_deformations,
-        workspace=Workspace(aperture_rad=WHOLE_SPHERE_RAD, any_roll=True, fov_rad=float(np.deg2rad(26.0))),
+        workspace=Workspace(aperture_rad=WHOLE_SPHERE_RAD, any_roll=True, fov_rad=FOV_RAD),
+        cone=Workspace(axis=(0.0, 1.0, 0.0), fov_rad=FOV_RAD),
         source="Stanford Computer Graphics Laboratory, Stanford 3D Scanning Repository: research use, not commercial",
         unit_m=1 / model_to_scene()[1],
         T_scene_source=Normalizer(*model_to_scene()).matrix,

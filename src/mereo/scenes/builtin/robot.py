@@ -2,10 +2,14 @@
 
 Source: modelled in mereo's own code (`_robot_parts`), MIT licence; no particular product. Proportions are those of an
 arm of 0.7 m reach, with a large gripper: one unit is about 16 mm. At rest, with the upper arm upright and the forearm
-level, it is 48 x 20 x 44 units.
+level, it is 48 x 20 x 46 units.
 
 Segments: one for each link, `base`, `column`, `upper_arm`, `elbow`, `forearm`, `wrist`, `hand`, and the jaws
 `finger_left` and `finger_right`. Motors, covers, ribs and bolts belong to the link that carries them.
+
+Beside the right finger the hand carries a camera, whose cable makes a bow over to a socket. Without it a hand turned by
+half looks the same with its fingers exchanged: in the median of 200 views of 96 x 96 pixels, four pixels told them
+apart, and which finger is the left one was a question that no view answers. With it 40 do, and in 95 % of the views 19.
 
 Degrees of freedom, each uniform within its limits, rigid motions composed down the chain:
 
@@ -21,8 +25,9 @@ Neighbours cannot meet within these limits, by construction; poses in which othe
 the column, the upper arm or the floor) are drawn again, about one in four. The base stays.
 
 What makes it hard: the chain reaches 58 units from a fixed base, so a small error in one angle moves everything after
-it; the forearm and the hand look almost the same after half a turn; the fingers differ by their place alone, are two
-pixels thick and often hidden; the camera may stand behind the arm, where the column hides the hand.
+it; the forearm looks almost the same after half a turn; only the hand's camera tells how far the hand is turned and
+which finger is which; the fingers are two pixels thick and often hidden; the depth camera may stand behind the arm,
+where the column hides the hand.
 """
 
 from functools import cache
@@ -85,6 +90,9 @@ REACHING = (
     Bulk(4, (11.0, 0.0, _Z), (19.5, 0.0, _Z), 3.9, 4),
     Bulk(5, (21.5, 0.0, _Z), (24.0, 0.0, _Z), 3.9, 2),
     Bulk(6, (27.5, 0.0, _Z), (35.8, 0.0, _Z), 4.9, 5),
+    Bulk(6, (30.3, -7.9, _Z - 1.4), (30.3, -7.9, _Z + 1.4), 2.9, 2),  # the hand's camera
+    Bulk(6, (29.1, -5.6, _Z), (29.1, -5.6, _Z), 1.8, 1),  # its bracket
+    Bulk(6, (29.3, -6.4, _Z + 4.3), (29.3, -4.0, _Z + 4.3), 2.8, 2),  # the bow of its cable
 )
 """What may come near the parts it does not hang from; the fingers are in the hand's spheres."""
 

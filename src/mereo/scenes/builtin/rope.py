@@ -6,11 +6,13 @@ it, and the camera looks across, from a cone about z.
 Segments: `base` (a rounded block) and `segment_1` (at the base) to `segment_8` (the free end), each a piece of one
 round rope, 8 units long and 3.6 thick.
 
-Degrees of freedom: the base stays. Two ropes in three swing: heading and elevation of the centreline are smooth random
-functions of arc length (four harmonics each), up to full loops. One in three coils: from somewhere in its upper part on
-it winds about an axis across it, 0.13 to 0.2 radians per unit, which is up to 1.8 turns, each 5 to 9 units beside the
-last. Nothing bends more than 0.22 per unit (radius of curvature 4.5). Curves in which the rope would touch itself or
-the base are drawn again.
+Degrees of freedom: the base stays. The centreline is drawn by how much it bends, at each place, sideways (at rest along
+y) and forwards (along z, towards the cameras): both by the same law, so that a rope leaves its plane as far as it moves
+in it. Two ropes in three swing: both bends are random functions of arc length (four harmonics each), up to full loops.
+One in three coils: from somewhere in its upper part on it winds as a helix of either hand, about an axis across it in
+any direction, 0.13 to 0.2 radians per unit, which is up to 1.8 turns, each 5 to 9 units beside the last. Nothing bends
+more than 0.22 per unit (radius of curvature 4.5). Curves in which the rope would touch itself or the base are drawn
+again.
 
 What makes it hard: the segments are identical, so a segment's name follows only from its place along the rope, which
 may be hidden where the rope crosses itself in the image. The paper's own Rope reaches mIoU 0.375 (or 0.422).
@@ -22,6 +24,7 @@ from itertools import pairwise
 import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation, Identity
@@ -114,52 +117,65 @@ COIL_PITCH = (5.0, 9.0)
 """Between neighbouring turns; the rope is 3.6 thick."""
 
 COIL_BEGINS = 10.0
-"""Over this length straight becomes coiled: the turn out of the plane, at most 0.03 per unit, bends little more."""
+"""Over this length straight becomes coiled."""
 
-
-SWINGS = tuple(f"phase {k + 1} of the {angle}" for angle in ("heading", "elevation") for k in range(HARMONICS))
+SWINGS = tuple(f"phase {k + 1} {way}" for way in ("sideways", "forwards") for k in range(HARMONICS))
 """Names of the harmonics of a rope that swings."""
+
+Bends = Float[np.ndarray, "2 m"]
+"""Curvature sideways and forwards at ``NODES``, along two normals that never turn about the rope (Bishop, "There is
+more than one way to frame a curve", 1975)."""
 
 
 def sample_centerline(rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
     """Places at ``NODES`` along a random rope that starts along x."""
     coils = named(rng, "coils below 1/3").random() < COILS
     with part(rng, "coil" if coils else "swing"):
-        heading, elevation = coil(rng) if coils else swing(rng)
-    tangents = np.stack(
-        [np.cos(elevation) * np.cos(heading), np.cos(elevation) * np.sin(heading), np.sin(elevation)], axis=1
-    )
+        return centerline(coil(rng) if coils else swing(rng))
+
+
+def centerline(bends: Bends) -> Float[np.ndarray, "m 3"]:
+    """Places at ``NODES`` along the curve of these bends, which starts along x; sideways is y there, forwards z.
+
+    With tangent t and normals u, v it obeys t' = a u + b v, u' = -a t, v' = -b t. The frame's columns t, u, v turn by a
+    small rotation from node to node, about (0, -b, a) in the frame's own axes.
+    """
+    step = NODES[1]
+    sideways, forwards = (bends[:, 1:] + bends[:, :-1]) / 2
+    turns = Rotation.from_rotvec(step * np.stack([np.zeros_like(sideways), -forwards, sideways], axis=1)).as_matrix()
+    frames, reach = np.concatenate([np.eye(3)[None], turns]), 1
+    while reach < len(frames):  # products of ever more turns: seven rounds instead of one for each node
+        frames[reach:] = frames[:-reach] @ frames[reach:]
+        reach *= 2
+    tangents = frames[:, :, 0]
     middle = (tangents[1:] + tangents[:-1]) / 2
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(middle * NODES[1], axis=0)])
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(middle * step, axis=0)])
 
 
-Angles = tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]
-"""Heading and elevation of the tangent at ``NODES``."""
-
-
-def swing(rng: np.random.Generator) -> Angles:
-    """Tangent angles of a rope that swings: random harmonics, scaled to a random share of the largest bend."""
+def swing(rng: np.random.Generator) -> Bends:
+    """Bends of a rope that swings: random harmonics, scaled to a random share of the largest bend."""
     k = np.arange(1, HARMONICS + 1)
     phases = named(rng, SWINGS, "rad").uniform(0, 2 * np.pi, size=(2, HARMONICS, 1))
     amplitudes = named(rng, "amplitudes").normal(size=(2, HARMONICS, 1)) / np.sqrt(k)[:, None]
-    rates = (amplitudes * np.cos(np.pi * k[:, None] * NODES / LENGTH + phases)).sum(axis=1)
-    rates[1] *= 0.5  # the camera sees sweeps sideways better
-    rates *= named(rng, "bend").uniform(0.15, 1.0) * MAX_BEND / np.linalg.norm(rates, axis=0).max()
-    rates *= np.clip(NODES / 6.0, 0.0, 1.0)  # leaves the base straight
-    heading, elevation = (np.cumsum(rates, axis=1) - rates / 2) * NODES[1]
-    return heading, 1.2 * np.tanh(elevation / 1.2)
+    bends = (amplitudes * np.cos(np.pi * k[:, None] * NODES / LENGTH + phases)).sum(axis=1)
+    bends *= named(rng, "bend").uniform(0.15, 1.0) * MAX_BEND / np.linalg.norm(bends, axis=0).max()
+    return bends * np.clip(NODES / 6.0, 0.0, 1.0)  # leaves the base straight
 
 
-def coil(rng: np.random.Generator) -> Angles:
-    """Tangent angles of a helix from a random place on; its axis is z and its pitch keeps the turns apart."""
+def coil(rng: np.random.Generator) -> Bends:
+    """Bends of a helix from a random place on, in a random direction; its pitch keeps the turns apart."""
     start = named(rng, "start").uniform(0.05, 0.4) * LENGTH
     rate, pitch = named(rng, "turn per unit", "rad").uniform(0.13, 0.2), named(rng, "pitch").uniform(*COIL_PITCH)
-    begun = np.clip((NODES - start) / COIL_BEGINS, 0.0, 1.0)
-    heading = named(rng, "sense of turning").choice([-1.0, 1.0]) * np.cumsum(rate * begun) * NODES[1]
-    # one turn takes an arc of 2 pi / rate, of which the sine of the elevation is pitch
-    elevation = named(rng, "side").choice([-1.0, 1.0]) * np.arcsin(pitch * rate / (2 * np.pi)) * begun
-    return heading, elevation
+    direction = named(rng, "direction", "rad").uniform(0, 2 * np.pi)
+    hand = named(rng, "hand").choice([-1.0, 1.0])
+    # one turn takes an arc of 2 pi / rate, of which the sine of the slope is pitch; so a helix has its curvature
+    # and torsion, and torsion turns the direction in which it bends
+    slope = np.arcsin(pitch * rate / (2 * np.pi))
+    along = np.maximum(NODES - start, 0.0)
+    toward = direction + hand * rate * np.sin(slope) * along
+    bend = rate * np.cos(slope) * np.minimum(along / COIL_BEGINS, 1.0)
+    return bend * np.stack([np.cos(toward), np.sin(toward)])
 
 
 def is_clear(center: Float[np.ndarray, "m 3"]) -> bool:

@@ -19,7 +19,9 @@ and so is one in which the sweep would press or stretch a corner that is already
 meet. Six of seven states show some of the underside from above.
 
 What makes it hard: layers hide each other and their undersides look the same; turned by half a turn the mat is the
-same but for the tab and for holes that become studs.
+same but for the tab and for holes that become studs. And it is thin: a perfect answer that is moved by half a cell of
+the grid that scores it, along each axis, keeps an IoU of 0.77 and a mIoU of 0.74 (64 test views); the flat mat that is
+moved through its thickness by as much, 0.295 units of its 59, keeps 0.72.
 """
 
 from functools import cache

@@ -55,7 +55,7 @@ def report_states(scene: Scene) -> int:
 
 def _direction(workspace: Workspace) -> str:
     """Which way the camera takes for up."""
-    if workspace.aperture_rad >= 2 * np.pi:
+    if workspace.all_around:
         return "no side: the camera looks from all around"
     axis = np.array(workspace.axis, dtype=float)
     index = int(np.abs(axis).argmax())
