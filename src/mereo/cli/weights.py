@@ -11,6 +11,7 @@ from rich.table import Table
 from mereo.io.atomic_files import to_json
 from mereo.models.weights import SHIPPED, shipped_names
 from mereo.models.weights_facts import WeightsFacts, read_facts
+from mereo.training.examples_seen import told
 from mereo.training.model_card import CardResult, card_results, nearest_preset
 
 LIST_COLUMNS = ("name", "object", "segments", "parameters", "size", "IoU mIoU", "of scans")
@@ -161,6 +162,7 @@ def _training(made: dict[str, Any]) -> str:
         f"on {made['training_examples']:,} of seed {made.get('training_seed')}"
         if made.get("training_examples")
         else "",
+        told(made),
         f"preset {nearest_preset(recipe)}" if recipe.get("network") else "",
         f"started from {recipe['init']}" if recipe.get("init") else "",
         f"mereo {made['mereo']}" if made.get("mereo") else "",
