@@ -210,24 +210,29 @@ class BenchCommand:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Repeat one of the paper's experiments; the same command again continues a stopped one.
+    """Repeat one of the paper's experiments; the same command again continues a stopped one. `list` says which.
 
     Attributes:
-        name: which one.
+        name: which one; list shows what each answers and costs, and which results are here.
         scale: smoke shows in minutes that it runs, cpu takes hours on two cores, paper is the full recipe for a GPU.
         output: folder for datasets, runs, scores and results, shared by all experiments.
         workers: processes that make datasets; 0 means as many as --threads.
         threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
     """
 
-    name: Positional[ExperimentName]
+    name: Positional[Literal["list", ExperimentName]]
     scale: ScaleName = "smoke"
     output: Path = Path("out/experiments")
     workers: Workers = 0
     threads: Threads = 0
 
     def run(self) -> None:
-        """Run the experiment and print its table."""
+        """Run the experiment and print its table, or list all."""
+        if self.name == "list":
+            from mereo.cli.experiment_list import list_experiments
+
+            list_experiments(self.output)
+            return
         from mereo.io.plots import pyplot
 
         pyplot()  # before the hours that it takes

@@ -13,7 +13,7 @@ from mereo.training.config import TrainConfig
 from mereo.training.trial import STEPS, nearest, small_dataset, timed
 
 MADE_AS = GenerateConfig(sampling=SamplingConfig(uniform_fraction=0.15))
-"""How examples are made: with the share of uniform queries that the schedule was measured with (the paper's is more)."""
+"""How examples are made: with the share of uniform queries that the schedule was measured with; the paper's is more."""
 
 EXAMPLES = 48
 """Examples that are measured; they are of the seed of training, and are made again with the others."""

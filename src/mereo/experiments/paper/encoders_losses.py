@@ -7,7 +7,9 @@ from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
 from mereo.models.config import Encoder, Loss
 from mereo.synthesis.config import GenerateConfig
-from mereo.training.config import PRESETS, TrainConfig
+from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
+
+QUESTION = "Which encoder and which loss are best?"
 
 OBJECTS = ("rope", "shapes", "robot", "lizard", "human")
 """Scenes of the paper's comparison."""
@@ -42,7 +44,35 @@ def recipe(base: TrainConfig, encoder: Encoder, loss: Loss) -> TrainConfig | Non
         epochs=base.epochs * own.epochs / PRESETS["paper"].epochs,
         queries=base.queries,
         holdout=base.holdout,
+        learned_box=base.learned_box,
     )
+
+
+def features(config: TrainConfig) -> tuple[str, ...]:
+    """Words for what a recipe adds to the paper's (docs/design/0002-learning.md)."""
+    additions, augment = config.network.additions, replace(config.augment, observations=AugmentConfig.observations)
+    added = {
+        "local features": additions.local_neighbors,
+        "lines of sight": additions.sight_neighbors,
+        "alignment": additions.align_points,
+        "template": additions.rest_template,
+        "augmentation": augment != AugmentConfig(),
+        "weight decay": config.weight_decay,
+        "a falling rate": config.schedule != "constant",
+        "clipped gradients": config.clip_norm,
+        "averaged weights": config.ema_decay,
+        "class offsets": config.offset_examples,
+    }
+    return tuple(name for name, is_there in added.items() if is_there)
+
+
+def lacks(base: TrainConfig, encoder: Encoder, loss: Loss) -> str:
+    """Words for what an encoder's recipe lacks of those that another encoder's has; empty where all are alike."""
+    each = {name: recipe(base, name, loss) for name in ENCODERS}
+    own, others = each[encoder], [found for name, found in each.items() if found is not None and name != encoder]
+    assert own is not None, "nothing is asked of encoder and loss that do not go together"
+    everything = dict.fromkeys(name for config in others for name in features(config))
+    return ", ".join(name for name in everything if name not in features(own))
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
@@ -61,7 +91,7 @@ def run(store: Store, scale: ExperimentScale) -> Result:
                 score = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
                 scores[scene, encoder, loss] = score
                 paper = published()["encoders-losses"].get(scene, {}).get(encoder, {}).get(loss)
-                rows.append(Row(scene, f"{encoder}, {loss}", score, paper))
+                rows.append(Row(scene, f"{encoder}, {loss}", score, paper, lacks(scale.recipe, encoder, loss)))
     notes = (
         "L1 alone knows no segments and has no mIoU; cross-entropy alone leaves the autodecoder nothing to search by.",
     )

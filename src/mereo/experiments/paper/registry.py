@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import get_args
+from typing import Protocol, cast, get_args, runtime_checkable
 
 from mereo.experiments.paper.result import Result, write_result
 from mereo.experiments.paper.scales import SCALES, ExperimentName, ExperimentScale
@@ -12,6 +12,24 @@ from mereo.experiments.paper.store import Store
 from mereo.io.output_folders import check_new_directory
 
 EXPERIMENTS = get_args(ExperimentName)
+
+
+@runtime_checkable
+class Experiment(Protocol):
+    """Module of an experiment: what it answers, and how it is run."""
+
+    QUESTION: str
+    run: Callable[[Store, ExperimentScale], Result]
+
+
+def experiment(name: str) -> Experiment:
+    """Module of an experiment."""
+    return cast(Experiment, import_module(f"mereo.experiments.paper.{name.replace('-', '_')}"))
+
+
+def results_directory(root: Path, name: str, scale: str) -> Path:
+    """Folder of an experiment's results at a scale."""
+    return root / "results" / f"{name}-{scale}"
 
 
 def run_experiment(name: str, scale: str, root: Path, workers: int = 1) -> Path:
@@ -26,11 +44,9 @@ def run_experiment(name: str, scale: str, root: Path, workers: int = 1) -> Path:
         raise ValueError(f"experiment {name!r} is unknown; it must be one of {', '.join(EXPERIMENTS)}: correct it")
     if scale not in SCALES:
         raise ValueError(f"scale {scale!r} is unknown; it must be one of {', '.join(SCALES)}: correct it")
-    directory = root / "results" / f"{name}-{scale}"
+    directory = results_directory(root, name, scale)
     _check_results(directory)  # before hours of work
-    module = import_module(f"mereo.experiments.paper.{name.replace('-', '_')}")
-    run: Callable[[Store, ExperimentScale], Result] = module.run
-    result = run(Store(root, workers), SCALES[scale])
+    result = experiment(name).run(Store(root, workers), SCALES[scale])
     if not SCALES[scale].decides:
         untried = tuple(replace(claim, holds={}) for claim in result.claims)
         result = replace(result, claims=untried, notes=(*result.notes, "It only shows that the experiment runs."))

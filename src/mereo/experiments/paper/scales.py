@@ -5,7 +5,9 @@ from typing import Literal
 
 from mereo.training.config import PRESETS, TrainConfig
 
-ExperimentName = Literal["reconstruction", "encoders-losses", "sampling", "positional-encoding", "noise", "real-world"]
+ExperimentName = Literal[
+    "reconstruction", "encoders-losses", "encoders", "sampling", "positional-encoding", "noise", "real-world"
+]
 ScaleName = Literal["smoke", "cpu", "paper"]
 
 TRAINING_SEED = 1
