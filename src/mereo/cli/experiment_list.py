@@ -16,8 +16,8 @@ def list_experiments(root: Path) -> None:
     Console(markup=False, emoji=False).print(
         f"\nRun one by: mereo experiment NAME --scale cpu. Results are in {root / 'results'}, each with a table.md. "
         f"{counted(finished, 'finished training')} there: experiments share them and repeat none. Costs are those of "
-        "an empty folder; hours of one core as they were measured (docs/experiments.md, entry 10). Scale paper is for a "
-        "GPU, on which nobody has timed it; scale smoke takes minutes, and shows only that an experiment runs.",
+        "an empty folder; hours of one core as they were measured (docs/experiments.md, entry 10). Scale paper is for "
+        "a GPU, on which nobody has timed it; scale smoke takes minutes, and shows only that an experiment runs.",
         highlight=False,
     )
 

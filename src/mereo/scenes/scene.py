@@ -79,7 +79,7 @@ class Scene:
 
     Attributes:
         name: stable identifier.
-        rest: the segments at rest, in scene units (shortest dimension about 20).
+        rest: the segments at rest, in scene units (shortest dimension about 20, less for what is long and thin).
         sample_deformations: draws one deformation per segment; segments that move together share one object.
         workspace: where the camera may be.
         source: where the mesh comes from, and its licence.

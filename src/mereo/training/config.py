@@ -2,7 +2,8 @@
 
 Light, so that the command line may import them.
 
-Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise.
+Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise. What it
+does not say, such as the optimizer, is chosen as docs/paper-notes.md tells.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -127,11 +128,11 @@ class TrainConfig:
 PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
 """Recipes to start from.
 
-    paper              as published
+    paper              as published, as far as it is (docs/paper-notes.md)
     paper-autodecoder  the same for the autodecoder, whose hyperparameters the paper lists apart (appendix B)
     base               what to train for real, also on a CPU: the paper's network at half its widths, local features at
                        the query, a modern schedule, and many small steps (docs/design/0002-learning.md)
-    large              the same with the paper's widths and larger steps, for a GPU
+    large              the same with the widths of `paper` and larger steps, for a GPU
     tiny               two minutes on two CPU cores: for tests; objects of one's own are learnt by `mereo learn`
 """
 

@@ -115,8 +115,8 @@ def comparison_picture(path: str | Path, comparison: Comparison, size: int = 320
     images: list[Picture] = []
     captions: list[str] = []
     for views, words in zip(comparison.rows, comparison.captions, strict=True):
-        bounds = np.stack([_bounds(view) for view in views])
-        front = Viewpoint.along(np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)]), *CAMERA)
+        # around the truth, however far from it one of the answers strays
+        front = Viewpoint.along(_bounds(replace(views[0], predicted=views[0].reference)), *CAMERA, margin=1.3)
         segments = np.asarray(views[0].colors, dtype=float).reshape(-1, 3)
         drawn = [_labelled(views[0], views[0].reference, segments)]
         for view in views:
