@@ -102,6 +102,17 @@ def test_small_scales_need_no_download() -> None:
     assert SCALES["paper"].choose(("human", "rope", "shapes")) == ("human", "rope", "shapes")
 
 
+def test_objects_can_be_asked_for_by_name(tmp_path: Path) -> None:
+    asked = replace(SCALES["cpu"], chosen=("engine", "robot"))
+    assert asked.choose(("lizard", "human", "engine")) == ("engine",)
+    result = experiment("sampling").run(ToyStore(tmp_path), asked)
+    assert {row.object for row in result.rows} == {"engine"} and len(result.comparisons["samplers.png"].rows) == 1
+    assert {row.object for row in experiment("encoders-losses").run(ToyStore(tmp_path), asked).rows} == {"robot"}
+    with pytest.raises(ValueError, match="'noise' has no object 'engine'; it has robot, rope: name some of these"):
+        run_experiment("noise", "cpu", tmp_path, objects=["engine"])
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name, scale", [("nose", "smoke"), ("noise", "huge")])
 def test_unknown_names_are_refused(name: str, scale: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is unknown; it must be one of"):
@@ -130,12 +141,13 @@ def test_costs_are_those_of_what_experiments_do() -> None:
 
 def test_the_list_says_which_results_are_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = Result("noise", "Noise", "cpu", (Row("rope", "x", score(0.5, NAN)),), ())
-    write_result(result, tmp_path / "results" / "noise-cpu")
+    for folder in ("noise-cpu", "noise-smoke-rope"):
+        write_result(result, tmp_path / "results" / folder)
     (tmp_path / "runs" / "rope-1").mkdir(parents=True)
     (tmp_path / "runs" / "rope-1" / "finished.json").write_text("{}")
     assert command_line.main(["experiment", "list", "--output", str(tmp_path)]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert said.count("results here: none") == len(EXPERIMENTS) - 1 and "results here: cpu" in said
+    assert said.count("results here: none") == len(EXPERIMENTS) - 1 and "results here: cpu, smoke-rope" in said
     assert "1 finished training there" in said
     assert all(f"{name}: " in said for name in EXPERIMENTS) and said.count("?") == len(EXPERIMENTS)
     assert {path.name for path in tmp_path.iterdir()} == {"results", "runs"}, "nothing is made"

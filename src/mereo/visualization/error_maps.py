@@ -138,10 +138,7 @@ def _error_row(case: EvaluatedView, direction: Vector, up: Vector, size: int) ->
     offset, wrong = offset_triangles(case), segmentation_triangles(case)
     shown = (
         *((found, front), (offset, front), (offset, behind), (_labelled(case, case.predicted, segments), front)),
-        *(
-            (wrong, front),
-            (_labelled(case, case.reference, segments), front),
-        ),
+        *((wrong, front), (_labelled(case, case.reference, segments), front)),
     )
     pictures = [_solid_picture(triangles, view, size) for triangles, view in shown]
     return [cloud_picture(case.cloud.points, front, (size, size)), *pictures]

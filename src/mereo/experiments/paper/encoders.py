@@ -1,7 +1,7 @@
 """Lizard and Human by each encoder, in a picture (paper, section 4.4, figure of encoders)."""
 
 from mereo.evaluation.results import EvaluatedView
-from mereo.experiments.paper.encoders_losses import ENCODERS, lacks, recipe
+from mereo.experiments.paper.encoders_losses import ENCODERS, OWN_RECIPE, lacks, recipe
 from mereo.experiments.paper.result import Claim, Result, Row, better, compare, published
 from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
@@ -46,5 +46,6 @@ def run(store: Store, scale: ExperimentScale) -> Result:
         scale.name,
         tuple(rows),
         (claim,),
+        (OWN_RECIPE,),
         comparisons={"encoders.png": compare("segmentation", views, rows)},
     )

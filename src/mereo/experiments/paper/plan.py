@@ -97,21 +97,22 @@ class Listed:
         name: as the command takes it.
         question: what it answers.
         costs: by scale.
-        here: scales of which a folder holds results, with their paths.
+        here: scales of which a folder holds results, with the objects where these were chosen by name.
     """
 
     name: str
     question: str
     costs: dict[ScaleName, Cost]
-    here: dict[ScaleName, Path]
+    here: tuple[str, ...]
 
 
 def listed(root: Path) -> tuple[list[Listed], int]:
     """All experiments, with those results that are in ``root``, and how many finished trainings are there."""
     found = []
     for name in EXPERIMENTS:
-        places = {scale.name: results_directory(root, name, scale.name) for scale in SCALES.values()}
-        here = {scale: path for scale, path in places.items() if (path / "results.json").is_file()}
+        places = [results_directory(root, name, scale) for scale in SCALES]
+        written = [path.parent.name for place in places for path in root.glob(f"results/{place.name}*/results.json")]
+        here = tuple(sorted(folder.removeprefix(f"{name}-") for folder in written))
         costs = {scale.name: cost(name, scale.name) for scale in SCALES.values()}
         found.append(Listed(name, experiment(name).QUESTION, costs, here))
     return found, len(list(root.glob(f"runs/*/{FINISHED}")))

@@ -11,6 +11,8 @@ from mereo.synthesis.config import GenerateConfig
 
 QUESTION = "How much worse are real scans than synthetic views?"
 
+OBJECTS = ("bunny",)
+
 NOTES = ("The paper's figures are those of its printed lizard (15 scans), ours of the bunny (4 scans).",)
 
 

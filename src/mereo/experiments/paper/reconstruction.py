@@ -17,7 +17,7 @@ def run(store: Store, scale: ExperimentScale) -> Result:
     views: list[EvaluatedView] = []
     ours: dict[str, Score] = {}
     recipes = {"recipe": scale.recipe} if scale.rival is None else {"paper": scale.recipe, "large": scale.rival}
-    for scene in OBJECTS if scale.decides else scale.choose(OBJECTS):
+    for scene in scale.choose(OBJECTS) if scale.chosen or not scale.decides else OBJECTS:
         dataset = store.dataset(scene, GenerateConfig(), scale.examples)
         for variant, recipe in recipes.items():
             weights = store.run(dataset, recipe)

@@ -1,6 +1,6 @@
 """Experiments by name, and how one is run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -16,9 +16,10 @@ EXPERIMENTS = get_args(ExperimentName)
 
 @runtime_checkable
 class Experiment(Protocol):
-    """Module of an experiment: what it answers, and how it is run."""
+    """Module of an experiment: what it answers, on which objects, and how it is run."""
 
     QUESTION: str
+    OBJECTS: tuple[str, ...]
     run: Callable[[Store, ExperimentScale], Result]
 
 
@@ -27,27 +28,33 @@ def experiment(name: str) -> Experiment:
     return cast(Experiment, import_module(f"mereo.experiments.paper.{name.replace('-', '_')}"))
 
 
-def results_directory(root: Path, name: str, scale: str) -> Path:
-    """Folder of an experiment's results at a scale."""
-    return root / "results" / f"{name}-{scale}"
+def results_directory(root: Path, name: str, scale: str, objects: Sequence[str] = ()) -> Path:
+    """Folder of an experiment's results at a scale, on these objects or on the scale's own."""
+    return root / "results" / "-".join([name, scale, *objects])
 
 
-def run_experiment(name: str, scale: str, root: Path, workers: int = 1) -> Path:
+def run_experiment(name: str, scale: str, root: Path, workers: int = 1, objects: Sequence[str] = ()) -> Path:
     """Run or finish an experiment; returns the folder of its results, ``ROOT/results/NAME-SCALE``.
 
     Datasets, runs and scores are kept in ``root`` and shared between experiments: the same command again continues
-    where it stopped, and when all is there it only writes the results again.
+    where it stopped, and when all is there it only writes the results again. With ``objects``, some of the
+    experiment's own instead of those that the scale takes, the folder has their names in its own.
 
-    Raises ``ValueError`` for an unknown name or scale, ``FileExistsError`` where that folder holds other things.
+    Raises ``ValueError`` for an unknown name, scale or object, ``FileExistsError`` where that folder holds other
+    things.
     """
     if name not in EXPERIMENTS:
         raise ValueError(f"experiment {name!r} is unknown; it must be one of {', '.join(EXPERIMENTS)}: correct it")
     if scale not in SCALES:
         raise ValueError(f"scale {scale!r} is unknown; it must be one of {', '.join(SCALES)}: correct it")
-    directory = results_directory(root, name, scale)
+    known = experiment(name).OBJECTS
+    if odd := [one for one in objects if one not in known]:
+        raise ValueError(f"experiment {name!r} has no object {odd[0]!r}; it has {', '.join(known)}: name some of these")
+    budget = replace(SCALES[scale], chosen=tuple(one for one in known if one in objects))
+    directory = results_directory(root, name, scale, budget.chosen)
     _check_results(directory)  # before hours of work
-    result = experiment(name).run(Store(root, workers), SCALES[scale])
-    if not SCALES[scale].decides:
+    result = experiment(name).run(Store(root, workers), budget)
+    if not budget.decides:
         untried = tuple(replace(claim, holds={}) for claim in result.claims)
         result = replace(result, claims=untried, notes=(*result.notes, "It only shows that the experiment runs."))
     write_result(result, directory)
