@@ -179,7 +179,7 @@ def test_a_comparison_has_the_reference_and_a_column_for_each_answer(tmp_path: P
     truth = np.zeros((20, 20, 20), np.uint8)
     truth[5:15, 5:10, 5:15], truth[5:15, 10:15, 5:15] = 1, 2
     other = truth.copy()
-    other[15:18, 5:15, 5:15] = 1
+    other[7:13, 7:13, 1:5] = 1  # toward the camera
     views, captions = [[labelled(truth, truth), labelled(truth, other)]], [["one", "two"]]
     colored = {}
     for shown in ("segmentation", "reconstruction error"):
