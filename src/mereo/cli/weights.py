@@ -11,7 +11,7 @@ from rich.table import Table
 from mereo.io.atomic_files import to_json
 from mereo.models.weights import SHIPPED, shipped_names
 from mereo.models.weights_facts import WeightsFacts, read_facts
-from mereo.training.examples_seen import told
+from mereo.training.examples_seen import seen_in_all, told
 from mereo.training.model_card import CardResult, card_results, nearest_preset
 
 LIST_COLUMNS = ("name", "object", "segments", "parameters", "size", "IoU mIoU", "of scans")
@@ -109,6 +109,7 @@ def _everything(facts: WeightsFacts) -> dict[str, Any]:
         "parameters": facts.parameters,
         "network": facts.network.to_dict(),
         "statistical_model": None if states is None else vars(states),
+        "examples_seen": seen_in_all(facts.header.provenance),
         "provenance": facts.header.provenance,
         "results": [{"title": result.title, **result.scores} for result in _card(facts.path)],
     }

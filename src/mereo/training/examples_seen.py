@@ -51,16 +51,18 @@ def seen_before(provenance: Mapping[str, Any]) -> int | None:
     )
 
 
+def seen_in_all(provenance: Mapping[str, Any]) -> int | None:
+    """Number of examples of a training and of the chain behind it; None where the weights do not say."""
+    own, before = seen_in_training(provenance), seen_before(provenance)
+    return None if own is None or before is None else own + before
+
+
 def seen_by(init: str) -> int | None:
     """Number of examples that weights have seen in all, by a shipped name or a file; empty are random ones.
 
     None where they do not say. Raises as ``read_facts`` does.
     """
-    if not init:
-        return 0
-    provenance = read_facts(init).header.provenance
-    own, before = seen_in_training(provenance), seen_before(provenance)
-    return None if own is None or before is None else own + before
+    return seen_in_all(read_facts(init).header.provenance) if init else 0
 
 
 def told(provenance: Mapping[str, Any]) -> str:
