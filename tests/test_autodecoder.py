@@ -45,6 +45,7 @@ SMALL = TrainConfig(
     epochs=250,
     learning_rate=4e-3,
     l1_weight=10.0,
+    learned_box=True,
     holdout=0,
     precision="float32",
     compile="off",

@@ -23,7 +23,10 @@ from mereo.__main__ import main
 
 BEFORE = Path(__file__).parent / "before"
 SHARD = "shard-00000.safetensors"
-GENERATE = "generate rope --examples 12 --seed 7 --workers 1 --points 96 --per-segment 12"
+GENERATE = (
+    "generate rope --examples 12 --seed 7 --workers 1 --points 96 --per-segment 12 "
+    "--uniform-fraction 0.15"  # the default then
+)
 TRAIN = (
     "--preset tiny --precision float32 --compile off --batch 4 --queries 96 --epochs 4 --network.points 64 "
     "--network.neighbors 8 --network.mlp1 8 8 --network.mlp2 8 16 --network.mlp-global 16 16 --network.width 16 "
@@ -157,6 +160,7 @@ def test_an_interrupted_run_is_continued(tmp_path: Path, capsys: pytest.CaptureF
     now, then = header(run / "weights.safetensors"), header(BEFORE / "weights.safetensors")
     offsets = [part["provenance"].pop("class_offsets") for part in (now, then)]
     np.testing.assert_allclose(*offsets, atol=0.0 if EXACT else 1.0)  # from a choice among a few steps
+    assert now["provenance"].pop("examples_before") == 0 and now["provenance"]["recipe"].pop("learned_box") is True
     assert now == then
     ended = [load_file(folder / "weights.safetensors") for folder in (run, BEFORE)]
     for tensors in () if EXACT else ended:

@@ -4,13 +4,21 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
-from mereo.experiments.paper.registry import EXPERIMENTS, run_experiment
+from mereo import __main__ as command_line
+from mereo.evaluation.results import EvaluatedView
+from mereo.experiments.paper.encoders_losses import ENCODERS, lacks, recipe
+from mereo.experiments.paper.plan import Cost, Plan, cost
+from mereo.experiments.paper.registry import EXPERIMENTS, experiment, run_experiment
 from mereo.experiments.paper.result import Claim, Result, Row, better, markdown, published, write_result
 from mereo.experiments.paper.scales import SCALES
 from mereo.experiments.paper.store import Score, Store, content_key, read_score
+from mereo.geometry.camera import PointCloud
 from mereo.synthesis.config import GenerateConfig
+from mereo.visualization.error_maps import comparison_picture
 
 NAN = float("nan")
 
@@ -21,7 +29,7 @@ def score(iou: float, miou: float) -> Score:
 
 def test_published_figures_are_the_papers() -> None:
     figures = published()
-    assert set(EXPERIMENTS) <= set(figures)
+    assert set(EXPERIMENTS) - {"encoders"} <= set(figures), "whose figures are bars of encoders-losses"
     assert len(figures["reconstruction"]) == 10
     assert figures["reconstruction"]["rope"] == {"iou": 0.815, "miou": 0.375}
     assert figures["noise"]["0.1"]["2.0"] == {"iou": 0.346, "miou": 0.289}
@@ -46,6 +54,11 @@ def test_the_table_shows_both_figures_and_the_verdict() -> None:
     assert "| rope | on | 0.800 | 0.600 | 0.800 | 0.600 |  | 0.375 |" in text
     assert "| rope | off | 0.700 |  | 0.700 |  |  |  |" in text
     assert "- On is better. We agree for rope, not for shapes." in text
+    assert "paper's scene: IoU" in text and "are no measure for ours" in text and "lacks" not in text
+    other = replace(rows[1], lacks="local features, lines of sight")
+    text = markdown(Result("encoders", "Encoders", "cpu", (rows[0], other), ()))
+    assert "| mIoU | lacks |" in text and "|  |  | local features, lines of sight |" in text
+    assert "| 0.375 |  |" in text, "who lacks nothing has an empty cell"
 
 
 def test_verdicts() -> None:
@@ -89,11 +102,91 @@ def test_small_scales_need_no_download() -> None:
     assert SCALES["paper"].choose(("human", "rope", "shapes")) == ("human", "rope", "shapes")
 
 
+def test_objects_can_be_asked_for_by_name(tmp_path: Path) -> None:
+    asked = replace(SCALES["cpu"], chosen=("engine", "robot"))
+    assert asked.choose(("lizard", "human", "engine")) == ("engine",)
+    result = experiment("sampling").run(ToyStore(tmp_path), asked)
+    assert {row.object for row in result.rows} == {"engine"} and len(result.comparisons["samplers.png"].rows) == 1
+    assert {row.object for row in experiment("encoders-losses").run(ToyStore(tmp_path), asked).rows} == {"robot"}
+    with pytest.raises(ValueError, match="'noise' has no object 'engine'; it has robot, rope: name some of these"):
+        run_experiment("noise", "cpu", tmp_path, objects=["engine"])
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name, scale", [("nose", "smoke"), ("noise", "huge")])
 def test_unknown_names_are_refused(name: str, scale: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is unknown; it must be one of"):
         run_experiment(name, scale, tmp_path)
     assert not any(tmp_path.iterdir())
+
+
+def test_an_encoder_is_compared_like_for_like_or_the_table_says_what_it_lacks() -> None:
+    cpu = SCALES["cpu"].recipe
+    assert [lacks(cpu, encoder, "ce+l1") for encoder in ("pointnet2", "point-transformer")] == ["", ""]
+    missing = lacks(cpu, "autodecoder", "ce+l1")
+    assert missing.startswith("local features, lines of sight, augmentation, ")
+    for encoder in ENCODERS:
+        assert lacks(SCALES["paper"].recipe, encoder, "ce+l1") == "", "as published none has what is ours"
+        for scale in SCALES.values():
+            config = recipe(scale.recipe, encoder, "ce+l1")
+            assert config is not None and config.learned_box == scale.recipe.learned_box
+
+
+def test_costs_are_those_of_what_experiments_do() -> None:
+    """By hand: 28,672 of 28,800 examples in 300 passes, steps of 40; three levels of noise on two objects."""
+    assert cost("real-world", "paper") == Cost(1, 28_800, 28_672 * 300, 128)
+    assert cost("noise", "cpu") == Cost(6, 6 * 1536, 6 * 376 * 32, 18 * 32)
+    assert cost("encoders", "paper").trainings == 6 and cost("encoders-losses", "paper").trainings == 5 * 11
+
+
+def test_the_list_says_which_results_are_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = Result("noise", "Noise", "cpu", (Row("rope", "x", score(0.5, NAN)),), ())
+    for folder in ("noise-cpu", "noise-smoke-rope"):
+        write_result(result, tmp_path / "results" / folder)
+    (tmp_path / "runs" / "rope-1").mkdir(parents=True)
+    (tmp_path / "runs" / "rope-1" / "finished.json").write_text("{}")
+    assert command_line.main(["experiment", "list", "--output", str(tmp_path)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("results here: none") == len(EXPERIMENTS) - 1 and "results here: cpu, smoke-rope" in said
+    assert "1 finished training there" in said
+    assert all(f"{name}: " in said for name in EXPERIMENTS) and said.count("?") == len(EXPERIMENTS)
+    assert {path.name for path in tmp_path.iterdir()} == {"results", "runs"}, "nothing is made"
+
+
+def toy_view(name: str) -> EvaluatedView:
+    truth = np.zeros((12, 12, 12), np.uint8)
+    truth[3:9, 3:6, 3:9], truth[3:9, 6:9, 3:9] = 1, 2
+    cloud = PointCloud(np.argwhere(truth)[::5].astype(float))
+    return EvaluatedView(name, cloud, truth, np.roll(truth, 1, axis=2), np.zeros(3), np.ones(3), [(255, 0, 0)] * 2)
+
+
+class ToyStore(Plan):
+    """Store whose every network scores and answers alike."""
+
+    def score(self, weights: Path, settings: GenerateConfig, examples: int, cells: int) -> Score:
+        return score(0.8, 0.6)
+
+    def view(self, weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
+        return toy_view(weights.parent.name.partition("-")[0])
+
+
+@pytest.mark.parametrize("name, picture, columns", [("encoders", "encoders.png", 4), ("sampling", "samplers.png", 6)])
+def test_answers_side_by_side_are_drawn_from_results(name: str, picture: str, columns: int, tmp_path: Path) -> None:
+    """Lizard and Human by three encoders and by all samplers, the reference before them."""
+    result = experiment(name).run(ToyStore(tmp_path), SCALES["cpu"])
+    comparison = result.comparisons[picture]
+    assert [len(row) for row in comparison.rows] == [columns - 1] * 2
+    assert [row[0].name for row in comparison.rows] == ["lizard", "human"]
+    assert all(words.endswith(": IoU 0.800, mIoU 0.600") for row in comparison.captions for words in row)
+    comparison_picture(tmp_path / picture, comparison, size=40)
+    drawn = np.asarray(Image.open(tmp_path / picture))
+    assert drawn.shape[1] == 12 + columns * 52 and drawn.shape[0] >= 12 + 2 * 76
+
+
+@pytest.mark.slow
+def test_encoders_are_trained_and_drawn(tmp_path: Path) -> None:
+    folder = run_experiment("encoders", "smoke", tmp_path)
+    assert (folder / "encoders.png").is_file() and "autodecoder" in (folder / "table.md").read_text()
 
 
 @pytest.mark.slow

@@ -12,14 +12,18 @@ from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid
 from mereo.synthesis.examples import View
-from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb
+from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb, legend
 from mereo.visualization.error_maps import (
     FULL_CELLS,
+    ONE_SIDED,
     OVER,
     PALE,
+    SEGMENTATION_WORDS,
     TOLERANCE_CELLS,
     UNDER,
     WRONG,
+    Comparison,
+    comparison_picture,
     error_picture,
     offset_colors,
     offset_triangles,
@@ -161,13 +165,33 @@ def labelled(
     return EvaluatedView("case", cloud, truth, found, np.zeros(3), np.array(spacing), colors)
 
 
-def test_wrong_segments_are_those_of_the_confusion_matrix() -> None:
+def test_the_segmentation_is_wrong_anywhere_it_differs() -> None:
     rng = np.random.default_rng(4)
     truth, found = (rng.integers(0, 4, (8, 9, 10)).astype(np.uint8) for _ in range(2))
     error = segmentation_error(labelled(truth, found))
-    assert (error == 2).sum() == ((truth > 0) & (found > 0) & (truth != found)).sum()
-    assert (error > 0).sum() == ((truth > 0) & (found > 0)).sum()
-    assert not (segmentation_error(labelled(truth, truth)) == 2).any()
+    assert np.array_equal(error >= 2, truth != found), "the paper's definition"
+    assert np.array_equal(error == 2, (truth > 0) & (found > 0) & (truth != found)), "as the confusion matrix has it"
+    assert np.array_equal(error == 0, (truth == 0) & (found == 0))
+    assert set(np.unique(segmentation_error(labelled(truth, truth)))) == {0, 1}
+
+
+def test_a_comparison_has_the_reference_and_a_column_for_each_answer(tmp_path: Path) -> None:
+    truth = np.zeros((20, 20, 20), np.uint8)
+    truth[5:15, 5:10, 5:15], truth[5:15, 10:15, 5:15] = 1, 2
+    other = truth.copy()
+    other[7:13, 7:13, 1:5] = 1  # toward the camera
+    views, captions = [[labelled(truth, truth), labelled(truth, other)]], [["one", "two"]]
+    colored = {}
+    for shown in ("segmentation", "reconstruction error"):
+        comparison_picture(tmp_path / "c.png", Comparison(shown, views, captions), size=60)  # type: ignore[arg-type]
+        picture = np.asarray(Image.open(tmp_path / "c.png"))
+        tiles = [picture[12:72, 12 + column * 72 :][:, :60] for column in range(3)]
+        colored[shown] = tiles
+        assert picture.shape == (12 + 60 + 24 + 12 + 44 * (shown != "segmentation"), 12 + 3 * 72, 3)
+    segmentation, error = colored["segmentation"], colored["reconstruction error"]
+    assert np.array_equal(segmentation[0], segmentation[1]) and not np.array_equal(segmentation[0], segmentation[2])
+    assert [bool(hue_is(tile, OVER).sum() > 20) for tile in error] == [False, False, True]
+    assert np.array_equal(error[0], segmentation[0]), "the reference stays what it is"
 
 
 def test_offsets_are_pale_within_the_tolerance_and_full_at_the_end_of_the_scale() -> None:
@@ -188,6 +212,11 @@ def test_a_reconstruction_that_is_right_but_for_rounding_is_drawn_pale() -> None
     np.testing.assert_allclose(exact, np.broadcast_to(np.asarray(PALE) / 255, exact.shape))
 
 
+def strips(picture: np.ndarray) -> int:
+    """Height of the scale and of the legend below a picture of errors."""
+    return 44 + len(legend(SEGMENTATION_WORDS, (PALE, WRONG, ONE_SIDED), picture.shape[1]))
+
+
 def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -> None:
     truth = np.zeros((20, 20, 20), np.uint8)
     truth[5:15, 5:10, 5:15], truth[5:15, 10:15, 5:15] = 1, 2
@@ -195,12 +224,12 @@ def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -
     found[15:18, 5:15, 5:15], found[5:8, 5:15, 5:15], found[10:12, 5:15, 5:15] = 1, 0, 1
     error_picture(tmp_path / "e.png", [labelled(truth, found)], size=60)
     picture = np.asarray(Image.open(tmp_path / "e.png"))
-    assert hue_is(picture[-44:], OVER).any()
-    assert hue_is(picture[-44:], UNDER).any()
-    columns = np.array_split(picture[:-44, 12:], 8, axis=1)
+    below = picture[-strips(picture) :]
+    assert all(hue_is(below, color).any() for color in (OVER, UNDER, WRONG, ONE_SIDED))
+    columns = np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
     shows = [[bool(hue_is(column, c).sum() > 20) for c in (OVER, UNDER, WRONG)] for column in columns]
     assert shows[3] == shows[4] == [True, True, False]
-    assert shows[6] == [False, False, True]
+    assert shows[6] == [False, False, True] and hue_is(columns[6], ONE_SIDED).sum() > 20
     for plain in (0, 1, 2, 7):
         assert not any(shows[plain])
     assert [f.name for f in tmp_path.iterdir()] == ["e.png"]
@@ -212,7 +241,8 @@ def test_an_error_on_the_far_side_is_seen_from_behind_only(tmp_path: Path) -> No
     found = truth.copy()
     found[7:13, 7:13, 12:16] = 1
     error_picture(tmp_path / "e.png", [labelled(truth, found)], size=60)
-    columns = np.array_split(np.asarray(Image.open(tmp_path / "e.png"))[:-44, 12:], 8, axis=1)
+    picture = np.asarray(Image.open(tmp_path / "e.png"))
+    columns = np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
     assert [bool(hue_is(columns[k], OVER).sum() > 20) for k in (3, 4)] == [False, True]
 
 
@@ -220,7 +250,8 @@ def test_an_empty_prediction_can_be_drawn(tmp_path: Path) -> None:
     truth = np.zeros((6, 6, 6), np.uint8)
     truth[2:4, 2:4, 2:4] = 1
     error_picture(tmp_path / "e.png", [labelled(truth, np.zeros_like(truth))], size=40)
-    assert hue_is(np.asarray(Image.open(tmp_path / "e.png"))[:-44], UNDER).any()  # all of it is missing
+    picture = np.asarray(Image.open(tmp_path / "e.png"))
+    assert hue_is(picture[: -strips(picture)], UNDER).any()  # all of it is missing
 
 
 # --- sheets ----------------------------------------------------------------------------------------------------------

@@ -228,6 +228,13 @@ def test_queries_of_an_example(sampler: str) -> None:
     assert np.abs(unit.mean(axis=0) - 0.5).max() < 4 * np.sqrt(1 / 12 / 96)
 
 
+def test_uniform_points_are_the_papers_share_of_all() -> None:
+    """Appendix B: "15% of total points"."""
+    for segments in range(1, 40):
+        total, near = SamplingConfig().total(segments), 256 * segments
+        assert abs((total - near) - 0.15 * total) < 1
+
+
 def test_settings_reach_the_sampler() -> None:
     shape, config = shapes()["balls"], SamplingConfig(per_segment=80, oversample=3, box_margin=0.8, uniform_fraction=0)
     queries = sample_queries(shape, config, np.random.default_rng(4))

@@ -26,9 +26,13 @@ def test_every_scene_has_a_view() -> None:
     assert set(previews.SCENE_VIEWS) == set(SCENES)
 
 
-def test_a_row_is_three_states_at_one_scale_and_a_depth_image() -> None:
-    rest, first, second, depth = scene_row(toy("robot"), seed=1)
-    assert all(picture.shape == (TILE_PX, TILE_PX, 3) for picture in (rest, first, second, depth))
+def test_a_row_is_three_states_at_one_scale_their_overlay_and_a_depth_image() -> None:
+    rest, first, second, laid, depth = scene_row(toy("robot"), seed=1)
+    assert all(picture.shape == (TILE_PX, TILE_PX, 3) for picture in (rest, first, second, laid, depth))
+    drawn = [(picture < 255).any(axis=-1) for picture in (rest, first, second)]
+    assert np.array_equal((laid < 255).any(axis=-1), np.logical_or.reduce(drawn)), "what any shows, the overlay shows"
+    only = drawn[1] & ~drawn[0] & ~drawn[2]
+    assert only.any() and np.abs(laid[only] - (510.0 + first[only]) / 3).max() <= 0.5
     shown = [colored(picture) for picture in (rest, first, second)]
     assert all(700 < mask.sum() < 0.8 * TILE_PX**2 for mask in shown)
     margin = np.ones((TILE_PX, TILE_PX), dtype=bool)
@@ -40,10 +44,10 @@ def test_a_row_is_three_states_at_one_scale_and_a_depth_image() -> None:
     assert (rest != first).any() and (first != second).any()
     assert (np.abs(depth.astype(int) - 237).max(axis=-1) > 20).mean() > 0.02
     again = scene_row(toy("robot"), seed=1)
-    assert all(np.array_equal(a, b) for a, b in zip(again, (rest, first, second, depth), strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(again, (rest, first, second, laid, depth), strict=True))
 
 
-def test_the_sheet_has_a_row_of_four_for_every_scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_sheet_has_a_row_of_five_for_every_scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     loaded: list[str] = []
 
     def load(name: str) -> Scene:
@@ -56,11 +60,11 @@ def test_the_sheet_has_a_row_of_four_for_every_scene(monkeypatch: pytest.MonkeyP
     assert loaded == ["robot", "sheet", "tumor"]
     picture = np.asarray(Image.open(tmp_path / "all.png"))
     row = TILE_PX + 24 + 12
-    assert picture.shape == (12 + 2 * row, 12 + 8 * (TILE_PX + 12), 3)
-    cells = [picture[12 + r * row :, 12 + c * (TILE_PX + 12) :][:TILE_PX, :TILE_PX] for r in (0, 1) for c in range(8)]
+    assert picture.shape == (12 + 2 * row, 12 + 10 * (TILE_PX + 12), 3)
+    cells = [picture[12 + r * row :, 12 + c * (TILE_PX + 12) :][:TILE_PX, :TILE_PX] for r in (0, 1) for c in range(10)]
     filled = [bool((cell < 250).any()) for cell in cells]
-    assert filled == [True] * 12 + [False] * 4
-    assert np.array_equal(cells[4], scene_row(toy("sheet"), 2)[0])
+    assert filled == [True] * 15 + [False] * 5
+    assert np.array_equal(cells[5], scene_row(toy("sheet"), 2)[0])
 
 
 @pytest.mark.parametrize("scene, all_scenes, said", [("", False, "neither"), ("rope", True, "both 'rope' and --all")])

@@ -17,6 +17,7 @@ from training_runs import assert_resumes_exactly, train_in_two_processes
 from mereo.models.weights import load_model
 from mereo.training import trainer
 from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
+from mereo.training.examples_seen import seen_before, seen_by, seen_in_training, told
 from mereo.training.run_directory import claim_run, start_network
 
 SMALL = replace(
@@ -56,6 +57,7 @@ def test_a_run_of_an_older_mereo_is_continued(dataset: Path, tmp_path: Path) -> 
     path = tmp_path / "run" / "config.json"
     settings = json.loads(path.read_text())
     del settings["train"]["network"]["encoder"], settings["train"]["network"]["dropout"], settings["train"]["init"]
+    del settings["train"]["learned_box"]  # which every network had then
     path.write_text(json.dumps(settings))
     assert trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes() == first
     with pytest.raises(ValueError, match="another train setting network"):
@@ -239,3 +241,19 @@ def test_paper_preset_is_the_papers_recipe() -> None:
     assert paper == TrainConfig()
     assert (paper.batch, paper.learning_rate, paper.epochs, paper.l1_weight) == (40, 5e-4, 300.0, 100.0)
     assert paper.augment == AugmentConfig() and paper.schedule == "constant" and paper.loss == "ce+l1"
+    assert [preset for preset, recipe in PRESETS.items() if not recipe.learned_box] == ["paper", "paper-autodecoder"]
+
+
+def test_a_chain_of_trainings_adds_up_and_only_a_learned_box_limits_it(dataset: Path, tmp_path: Path) -> None:
+    first = trainer.train(dataset, tmp_path / "1", replace(SMALL, epochs=0.3, learned_box=False))
+    second = trainer.train(dataset, tmp_path / "2", replace(SMALL, epochs=0.2, init=str(first)))
+    third = trainer.train(dataset, tmp_path / "3", replace(SMALL, epochs=0.1, init=str(second)))
+    models = [load_model(path) for path in (first, second, third)]
+    shown = [seen_in_training(model.provenance) for model in models]
+    assert shown == [int(str(model.provenance["steps"])) * 8 for model in models] and shown[0] > shown[2] > 0
+    assert [model.provenance["examples_before"] for model in models] == [0, shown[0], shown[0] + shown[1]]
+    assert seen_by(str(third)) == sum(shown)
+    assert f"{sum(shown)} with those of the weights" in told(models[2].provenance)
+    assert [model.domain is None for model in models] == [True, False, False]
+    old = {key: value for key, value in models[2].provenance.items() if key != "examples_before"}
+    assert seen_before(old) is None and "which do not say how many" in told(old)

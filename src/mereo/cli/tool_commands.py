@@ -210,30 +210,38 @@ class BenchCommand:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Repeat one of the paper's experiments; the same command again continues a stopped one.
+    """Repeat one of the paper's experiments; the same command again continues a stopped one. `list` says which.
 
     Attributes:
-        name: which one.
+        name: which one; list shows what each answers and costs, and which results are here.
         scale: smoke shows in minutes that it runs, cpu takes hours on two cores, paper is the full recipe for a GPU.
+        objects: some of the experiment's own, whatever the scale takes: --objects engine.
         output: folder for datasets, runs, scores and results, shared by all experiments.
         workers: processes that make datasets; 0 means as many as --threads.
         threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
     """
 
-    name: Positional[ExperimentName]
+    name: Positional[Literal["list", ExperimentName]]
     scale: ScaleName = "smoke"
+    objects: tuple[str, ...] = ()
     output: Path = Path("out/experiments")
     workers: Workers = 0
     threads: Threads = 0
 
     def run(self) -> None:
-        """Run the experiment and print its table."""
+        """Run the experiment and print its table, or list all."""
+        if self.name == "list":
+            from mereo.cli.experiment_list import list_experiments
+
+            list_experiments(self.output)
+            return
         from mereo.io.plots import pyplot
 
         pyplot()  # before the hours that it takes
         from mereo.experiments.paper.registry import run_experiment
 
-        directory = run_experiment(self.name, self.scale, self.output, workers_for(self.workers, self.threads))
+        workers = workers_for(self.workers, self.threads)
+        directory = run_experiment(self.name, self.scale, self.output, workers, self.objects)
         print((directory / "table.md").read_text("utf-8"))
         print(f"wrote {directory}")
 

@@ -11,6 +11,7 @@ from rich.table import Table
 from mereo.io.atomic_files import to_json
 from mereo.models.weights import SHIPPED, shipped_names
 from mereo.models.weights_facts import WeightsFacts, read_facts
+from mereo.training.examples_seen import seen_in_all, told
 from mereo.training.model_card import CardResult, card_results, nearest_preset
 
 LIST_COLUMNS = ("name", "object", "segments", "parameters", "size", "IoU mIoU", "of scans")
@@ -108,6 +109,7 @@ def _everything(facts: WeightsFacts) -> dict[str, Any]:
         "parameters": facts.parameters,
         "network": facts.network.to_dict(),
         "statistical_model": None if states is None else vars(states),
+        "examples_seen": seen_in_all(facts.header.provenance),
         "provenance": facts.header.provenance,
         "results": [{"title": result.title, **result.scores} for result in _card(facts.path)],
     }
@@ -161,6 +163,7 @@ def _training(made: dict[str, Any]) -> str:
         f"on {made['training_examples']:,} of seed {made.get('training_seed')}"
         if made.get("training_examples")
         else "",
+        told(made),
         f"preset {nearest_preset(recipe)}" if recipe.get("network") else "",
         f"started from {recipe['init']}" if recipe.get("init") else "",
         f"mereo {made['mereo']}" if made.get("mereo") else "",

@@ -169,6 +169,7 @@ def score_cases(
     count: int,
     progress: bool,
     registrar: Registrar | None = None,
+    kept: int = KEPT_VIEWS,
 ) -> Evaluation:
     """Scores on ``case(0) ... case(count - 1)``, which are made one at a time, as they may be large.
 
@@ -178,6 +179,7 @@ def score_cases(
         count: how many.
         progress: whether to show a bar with the time left.
         registrar: of the model's object; None scores the network alone.
+        kept: how many cases, the first ones, keep their labels for pictures.
     """
     names, colors = segment_names(model)
     examples: dict[str, Scores] = {}
@@ -196,7 +198,7 @@ def score_cases(
         if registration is not None and one.material is not None and one.scene_unit is not None:
             truth = one.material(registration.model)
             errors.append(RegistrationErrors.of(registration, truth, one.cloud, one.scene_unit))
-        if len(views) < KEPT_VIEWS:
+        if len(views) < kept:
             views.append(_evaluated_view(one, model, found, colors))
     return Evaluation(
         names=names,

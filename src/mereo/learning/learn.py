@@ -22,12 +22,11 @@ from mereo.io.scratch_folders import scratch_folder
 from mereo.learning.example_frame import FRAME, write_example_frame
 from mereo.learning.object_files import SCENE, check, names_scene, scene_for
 from mereo.learning.outcome import show_outcome
-from mereo.learning.probe import measure
+from mereo.learning.probe import MADE_AS, measure
 from mereo.learning.schedule import OFFSET_EXAMPLES, Plan, Rates, epochs_for, holdout, plan_for, views_for
 from mereo.models.weights import find_weights, load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
-from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.shards import generate
 from mereo.training.config import PRESETS, TrainConfig
 from mereo.training.trainer import WEIGHTS, train
@@ -110,7 +109,7 @@ def learn(
         clock.stage(2, "measure this machine, and choose weights to start from")
         plan = _measured(scene, output, recipe, clock, init, workers)
     clock.stage(3, f"generate {plan.examples} examples, about {_duration(plan.generation_s)}")
-    generate(scene, output / DATA, GenerateConfig(), examples=plan.examples, seed=SEED, workers=workers, resume=True)
+    generate(scene, output / DATA, MADE_AS, examples=plan.examples, seed=SEED, workers=workers, resume=True)
     if fresh:
         plan = _revised(output, plan, clock, recipe.batch)
     clock.stage(

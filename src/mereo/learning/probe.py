@@ -7,10 +7,13 @@ from io import StringIO
 from pathlib import Path
 
 from mereo.learning.schedule import Rates
-from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
 from mereo.training.config import TrainConfig
 from mereo.training.trial import STEPS, nearest, small_dataset, timed
+
+MADE_AS = GenerateConfig(sampling=SamplingConfig(uniform_fraction=0.15))
+"""How examples are made: with the share of uniform queries that the schedule was measured with; the paper's is more."""
 
 EXAMPLES = 48
 """Examples that are measured; they are of the seed of training, and are made again with the others."""
@@ -34,7 +37,7 @@ def measure(scene: str, folder: Path, recipe: TrainConfig, *, init: str, seed: i
     """
     started = time.monotonic()
     with redirect_stdout(StringIO()):  # nobody waits for these few
-        generate(scene, folder / "data", GenerateConfig(), examples=EXAMPLES, seed=seed, workers=1)
+        generate(scene, folder / "data", MADE_AS, examples=EXAMPLES, seed=seed, workers=1)
     # with the template and 100 states, so a little too long
     generate_s = (time.monotonic() - started) / EXAMPLES / (1 + PARALLEL * (workers - 1))
     data = small_dataset(folder / "data")

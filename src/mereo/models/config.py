@@ -2,7 +2,8 @@
 
 Light, so that the command line may import them.
 
-Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise.
+Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise. What it
+does not say, such as the sizes of its encoders, is chosen as docs/paper-notes.md tells.
 """
 
 from collections.abc import Mapping
@@ -117,7 +118,7 @@ class PointNet2Config:
 
 @dataclass(frozen=True)
 class PointTransformerConfig:
-    """Settings of the Point Transformer.
+    """Settings of the Point Transformer; sizes are those of its authors' code, the paper says five blocks.
 
     Attributes:
         transformer_widths: one block of the Point Transformer per width; each has a quarter of the last one's points.

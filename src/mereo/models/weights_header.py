@@ -30,6 +30,7 @@ class Provenance(BaseModel):
     scene: str | None = None
     source: str | None = None
     steps: int | None = None
+    examples_before: Annotated[int, Field(ge=0)] | None = None
     visible_m: tuple[FiniteFloat, FiniteFloat] | None = None
     data: dict[str, Any] | None = None
     recipe: dict[str, Any] | None = None

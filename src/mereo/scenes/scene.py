@@ -85,7 +85,7 @@ class Scene:
 
     Attributes:
         name: stable identifier.
-        rest: the segments at rest, in scene units (shortest dimension about 20).
+        rest: the segments at rest, in scene units (shortest dimension about 20, less for what is long and thin).
         sample_deformations: draws one deformation per segment; segments that move together share one object.
         workspace: where the camera may be.
         cone: where else it may be, of a scene whose ``workspace`` is the whole sphere; by default the paper's cone

@@ -2,7 +2,8 @@
 
 Light, so that the command line may import them.
 
-Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise.
+Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise. What it
+does not say, such as the optimizer, is chosen as docs/paper-notes.md tells.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -67,12 +68,14 @@ class TrainConfig:
         epochs: passes over the dataset.
         learning_rate: peak rate.
         code_rate: peak rate of an autodecoder's codes.
-        weight_decay: decoupled (AdamW); 0 is the paper's Adam.
+        weight_decay: decoupled (AdamW); at 0 the optimizer is Adam. The paper names none.
         schedule: constant, or linear warm-up followed by a half cosine to zero.
         warmup: fraction of all steps spent warming up.
         clip_norm: largest gradient norm; 0 means no clipping.
         ema_decay: decay of the exponential moving average of the weights that is saved; 0 is off.
         augment: changes to the observed clouds.
+        learned_box: answer everything outside the box in which the training examples have segments as empty; the paper
+            says nothing of such a box.
         offset_examples: training examples from which the finished network's class offsets are chosen; 0 is off.
         holdout: examples at the end of the dataset kept for the validation curve.
         precision: auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
@@ -95,6 +98,7 @@ class TrainConfig:
     clip_norm: NotNegative = 0.0
     ema_decay: BelowOne = 0.0
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    learned_box: bool = False
     offset_examples: CountOrNone = 0
     holdout: CountOrNone = 128
     precision: Precision = "auto"
@@ -124,11 +128,11 @@ class TrainConfig:
 PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
 """Recipes to start from.
 
-    paper              as published
+    paper              as published, as far as it is (docs/paper-notes.md)
     paper-autodecoder  the same for the autodecoder, whose hyperparameters the paper lists apart (appendix B)
     base               what to train for real, also on a CPU: the paper's network at half its widths, local features at
                        the query, a modern schedule, and many small steps (docs/design/0002-learning.md)
-    large              the same with the paper's widths and larger steps, for a GPU
+    large              the same with the widths of `paper` and larger steps, for a GPU
     tiny               two minutes on two CPU cores: for tests; objects of one's own are learnt by `mereo learn`
 """
 
@@ -166,6 +170,7 @@ _RECIPE: Table = {
     "warmup":           (0.0,              0.0,              0.05,             0.05,             0.05),
     "clip_norm":        (0.0,              0.0,              1.0,              1.0,              1.0),
     "ema_decay":        (0.0,              0.0,              0.999,            0.999,            0.99),
+    "learned_box":      (False,            False,            True,             True,             True),
     "offset_examples":  (0,                0,                1000,             1000,             1000),
     "holdout":          (128,              128,              128,              128,              32),
 }

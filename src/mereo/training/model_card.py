@@ -23,6 +23,7 @@ from mereo.scenes.random_states import built_in_model, with_frame
 from mereo.scenes.statistical_model_file import modes_within, with_fewer_modes
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS
+from mereo.training.examples_seen import told
 
 MOST_BYTES = 8_000_000
 """Size of a released file at most; modes that do not fit are left out."""
@@ -104,7 +105,7 @@ def _object(model: Model) -> str:
 def _training(provenance: dict[str, object]) -> str:
     recipe: Any = provenance.get("recipe") or {}
     batch, steps = recipe.get("batch"), provenance.get("steps")
-    seen = f", {int(str(steps)) * batch:,} examples seen" if batch and steps else ""
+    seen = told(provenance)
     lines = [
         "## Training\n",
         f"- data: {provenance.get('training_examples', 'unknown')} examples of seed {provenance.get('training_seed')}, "
@@ -113,7 +114,7 @@ def _training(provenance: dict[str, object]) -> str:
     if provenance.get("data"):
         lines.append(f"- how they were generated: `{json.dumps(provenance['data'])}`")
     lines += _observations(provenance)
-    lines.append(f"- {steps} steps of {batch} examples{seen}")
+    lines.append(f"- {steps} steps of {batch} examples" + f", {seen}" * bool(seen))
     if recipe:
         lines.append(f"- recipe, nearest preset `{nearest_preset(recipe)}`: `{json.dumps(recipe)}`")
     return "\n".join([*lines, ""])

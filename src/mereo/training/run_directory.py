@@ -84,9 +84,17 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
 
 
 def trained_model(
-    average: Network, data: Dataset, config: TrainConfig, step: int, offsets: Float[Tensor, " c"] | None
+    average: Network,
+    data: Dataset,
+    config: TrainConfig,
+    step: int,
+    offsets: Float[Tensor, " c"] | None,
+    before: int | None = 0,
 ) -> Model:
-    """Model of the averaged network after ``step`` steps, class offsets in its last bias, with its weights' header."""
+    """Model of the averaged network after ``step`` steps, class offsets in its last bias, with its weights' header.
+
+    ``before`` is the number of examples that the weights it started from had seen (``examples_seen.seen_by``).
+    """
     network = average
     if offsets is not None:
         network = copy.deepcopy(average)  # the running average must stay what it is
@@ -100,6 +108,7 @@ def trained_model(
         "training_seed": manifest["seed"],
         "training_examples": manifest["examples"],
         "steps": step,
+        "examples_before": before,
         "mereo": manifest["version"],
         "visible_m": data.visible_m,
         "class_offsets": None if offsets is None else offsets.tolist(),
@@ -111,7 +120,7 @@ def trained_model(
         colors=tuple(tuple(s["color"]) for s in manifest["segments"]),
         loss=config.loss,
         provenance=provenance,
-        domain=data.domain(),
+        domain=data.domain() if config.learned_box else None,
         nested=tuple((inner, outer) for inner, outer in manifest.get("nested", ())),
         statistical_model=data.statistical_model,
     )
@@ -180,7 +189,7 @@ def _with_defaults(run_dir: Path, settings: dict[str, Any]) -> dict[str, Any]:
     groups = [settings.get("dataset", {}), given := settings.get("train", {})]
     if not all(isinstance(group, dict) for group in groups) or not isinstance(given.get("network", {}), dict):
         raise ValueError(f"{run_dir / 'config.json'} holds no settings of a training run: choose another --output")
-    train = default | given
+    train = default | {"learned_box": True} | given  # every network had one
     return settings | {"train": train | {"network": default["network"] | train["network"]}}
 
 

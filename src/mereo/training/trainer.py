@@ -26,6 +26,7 @@ from mereo.models.weights import save_model, trained_steps
 from mereo.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mereo.training.config import TrainConfig
 from mereo.training.dataset import Batch, Dataset
+from mereo.training.examples_seen import seen_by
 from mereo.training.going_nowhere import EXAMPLES, ConstantAnswer, Judge
 from mereo.training.losses import supervised_loss
 from mereo.training.metrics_log import MetricsLog
@@ -102,6 +103,7 @@ class Trainer:
         self.average = copy.deepcopy(self.network)
         self.optimizer = torch.optim.AdamW(parameter_groups(self.network, config), lr=config.learning_rate, fused=True)
         self.examples = len(data) - config.holdout
+        self.before = seen_by(config.init)  # now: the file may be gone when the weights are saved
         self.orders: dict[int, Tensor] = {}
         self.total = max(1, math.ceil(config.epochs * self.examples / config.batch))
         self.step = self.saved_step = 0
@@ -258,7 +260,8 @@ class Trainer:
         self._update_codes()
         log.write()
         offsets = choose_offsets(self.average, self.data, self.config) if finished else None
-        save_model(trained_model(self.average, self.data, self.config, self.step, offsets), self.run_dir / WEIGHTS)
+        model = trained_model(self.average, self.data, self.config, self.step, offsets, self.before)
+        save_model(model, self.run_dir / WEIGHTS)
         save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
         self.say(f"saved at step {self.step}: {log.summary()}{self.judge.doubt(log.rows)}")
 

@@ -1,18 +1,30 @@
 """Error pictures after the paper's: what lies too far out or in, and wrong segments (figure of section 4.2)."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from mereo.evaluation.results import EvaluatedView
 from mereo.geometry.mesh import Color
-from mereo.visualization.contact_sheets import Picture, cloud_picture, contact_sheet, name_plate, save_png, scale_bar
-from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
+from mereo.visualization.contact_sheets import (
+    Picture,
+    cloud_picture,
+    contact_sheet,
+    legend,
+    name_plate,
+    save_png,
+    scale_bar,
+)
+from mereo.visualization.renderer import Canvas, Triangles, Vector, Viewpoint
 from mereo.visualization.surface_offsets import surface_offset
+
+CAMERA: tuple[Vector, Vector] = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+"""Direction in which a camera looks, and what is up in its picture."""
 
 COLUMNS = (
     *("point cloud", "reconstruction", "reconstruction error", "error from behind"),
@@ -23,6 +35,12 @@ PALE: Color = (222, 224, 228)
 OVER: Color = (31, 119, 214)
 UNDER: Color = (245, 130, 20)
 WRONG: Color = (214, 39, 60)
+ONE_SIDED: Color = (240, 158, 168)
+SEGMENTATION_WORDS = (
+    "segmentation error: none",
+    "another segment than in the reference",
+    "a segment in one of the two, empty space in the other",
+)
 TOLERANCE_CELLS = 0.5
 """Surfaces that are no farther apart cannot be told apart on a grid; they count as right."""
 
@@ -36,15 +54,16 @@ SCALE_WORDS = (f"-{FULL_CELLS:g}, too far in", "right", f"{FULL_CELLS:g}, too fa
 def error_picture(
     path: str | Path,
     cases: Sequence[EvaluatedView],
-    direction: tuple[float, float, float] = (0.0, 0.0, 1.0),
-    up: tuple[float, float, float] = (0.0, -1.0, 0.0),
+    direction: Vector = CAMERA[0],
+    up: Vector = CAMERA[1],
     size: int = 240,
 ) -> None:
     """Write the paper's figure of reconstructions, one row for each case, eight columns, and a scale of the errors.
 
     Name, point cloud, reconstruction (all segments as one), reconstruction error (blue where the surface lies too far
-    out, orange where it lies too far in), the same from behind, segmentation, segmentation error (red where both are
-    occupied, by different segments), reference. What is right is pale.
+    out, orange where it lies too far in), the same from behind, segmentation, segmentation error (anywhere it differs
+    from the reference: red by another segment, light red where one of the two is empty), reference. What is right is
+    pale.
 
     Args:
         path: the .png file.
@@ -60,29 +79,100 @@ def error_picture(
         captions += ["", *COLUMNS]
     sheet = contact_sheet(images, captions, 1 + len(COLUMNS))
     scale = offset_colors(np.linspace(-FULL_CELLS, FULL_CELLS, 181))
-    save_png(path, np.concatenate([sheet, scale_bar(scale, SCALE_TITLE, SCALE_WORDS, sheet.shape[1])]))
+    strips = [
+        scale_bar(scale, SCALE_TITLE, SCALE_WORDS, sheet.shape[1]),
+        legend(SEGMENTATION_WORDS, (PALE, WRONG, ONE_SIDED), sheet.shape[1]),
+    ]
+    save_png(path, np.concatenate([sheet, *strips]))
 
 
-def _error_row(
-    case: EvaluatedView, direction: tuple[float, float, float], up: tuple[float, float, float], size: int
-) -> list[Picture]:
+Shown = Literal["segmentation", "reconstruction error"]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Pictures of the same views as several networks answer them, side by side.
+
+    Attributes:
+        shown: what is drawn of each answer.
+        rows: views, one row for each object; those of a row are of one truth, from one camera.
+        captions: words below each picture, as ``rows``.
+    """
+
+    shown: Shown
+    rows: Sequence[Sequence[EvaluatedView]]
+    captions: Sequence[Sequence[str]]
+
+
+def comparison_picture(path: str | Path, comparison: Comparison, size: int = 320) -> None:
+    """Write a picture of a comparison, seen by the camera: after the reference, a column for each network's answer.
+
+    Args:
+        path: the .png file.
+        comparison: what is compared.
+        size: width and height of each picture in pixels.
+    """
+    images: list[Picture] = []
+    captions: list[str] = []
+    for views, words in zip(comparison.rows, comparison.captions, strict=True):
+        # around the truth, however far from it one of the answers strays
+        front = Viewpoint.along(_bounds(replace(views[0], predicted=views[0].reference)), *CAMERA, margin=1.3)
+        segments = np.asarray(views[0].colors, dtype=float).reshape(-1, 3)
+        drawn = [_labelled(views[0], views[0].reference, segments)]
+        for view in views:
+            error = comparison.shown == "reconstruction error"
+            drawn.append(offset_triangles(view) if error else _labelled(view, view.predicted, segments))
+        images += [_solid_picture(triangles, front, size) for triangles in drawn]
+        captions += [f"{views[0].name}, reference", *words]
+    sheet = contact_sheet(images, captions, 1 + len(comparison.rows[0]))
+    if comparison.shown == "reconstruction error":
+        scale = offset_colors(np.linspace(-FULL_CELLS, FULL_CELLS, 181))
+        sheet = np.concatenate([sheet, scale_bar(scale, SCALE_TITLE, SCALE_WORDS, sheet.shape[1])])
+    save_png(path, sheet)
+
+
+def _error_row(case: EvaluatedView, direction: Vector, up: Vector, size: int) -> list[Picture]:
     front, behind = (Viewpoint.along(_bounds(case), tuple(sign * np.asarray(direction)), up) for sign in (1, -1))
     segments = np.asarray(case.colors, dtype=float).reshape(-1, 3)
-    found, wrong = _labelled(case, (case.predicted > 0).astype(np.uint8), [PLAIN]), segmentation_error(case)
-    offset = offset_triangles(case)
+    found = _labelled(case, (case.predicted > 0).astype(np.uint8), [PLAIN])
+    offset, wrong = offset_triangles(case), segmentation_triangles(case)
     shown = (
         *((found, front), (offset, front), (offset, behind), (_labelled(case, case.predicted, segments), front)),
-        *((_labelled(case, wrong, [PALE, WRONG]), front), (_labelled(case, case.reference, segments), front)),
+        *((wrong, front), (_labelled(case, case.reference, segments), front)),
     )
     pictures = [_solid_picture(triangles, view, size) for triangles, view in shown]
     return [cloud_picture(case.cloud.points, front, (size, size)), *pictures]
 
 
 def segmentation_error(case: EvaluatedView) -> UInt8[np.ndarray, "x y z"]:
-    """Grid of right and wrong segments: 1 where truth and prediction are the same, 2 where not, 0 if one is empty."""
-    both = (case.reference > 0) & (case.predicted > 0)
-    wrong: UInt8[np.ndarray, "x y z"] = (both * 1 + (both & (case.reference != case.predicted)) * 1).astype(np.uint8)
+    """Grid of where the segmentation differs from the reference: anywhere, as in the paper (appendix A).
+
+    0 where both are empty, 1 where both are the same segment, 2 where they are different ones, 3 where one of the two
+    is empty.
+    """
+    reference, predicted = case.reference, case.predicted
+    both, either = (reference > 0) & (predicted > 0), (reference > 0) | (predicted > 0)
+    kinds = np.select([~either, ~both, reference != predicted], [0, 3, 2], default=1)
+    wrong: UInt8[np.ndarray, "x y z"] = kinds.astype(np.uint8)
     return wrong
+
+
+def segmentation_triangles(case: EvaluatedView) -> Triangles:
+    """Surface of truth and reconstruction together, coloured by ``segmentation_error``.
+
+    Light red grows with the distance between the two surfaces as the colours of ``offset_triangles`` do. Where it is
+    within ``TOLERANCE_CELLS``, so that rounding decides which cell is empty, the nearest cell of both shows instead.
+    """
+    kinds = segmentation_error(case)
+    both = (kinds == 1) | (kinds == 2)
+    beneath = kinds
+    if both.any():
+        beneath = kinds[tuple(distance_transform_edt(~both, case.spacing, return_distances=False, return_indices=True))]
+    shown = np.where(kinds == 3, 2 + np.minimum(beneath, 2), kinds).astype(np.uint8)
+    surface = _labelled(case, shown, [PALE, WRONG, PALE, WRONG])
+    share = np.where(surface.owner > 2, np.repeat(_full_share(_union_offset(case, surface)), 2), 0.0)[:, None]
+    colors = (1 - share) * surface.colors + share * np.asarray(ONE_SIDED) / 255.0
+    return replace(surface, colors=colors, owner=np.zeros_like(surface.owner))
 
 
 def offset_triangles(case: EvaluatedView) -> Triangles:
@@ -90,19 +180,30 @@ def offset_triangles(case: EvaluatedView) -> Triangles:
 
     So what was invented is seen, and what is missing as well, each the stronger the farther it is from the truth.
     """
-    reference, predicted = case.reference > 0, case.predicted > 0
-    surface = voxel_triangles((reference | predicted).astype(np.uint8), np.zeros((1, 3)), case.origin, case.spacing)
+    either = (case.reference > 0) | (case.predicted > 0)
+    surface = _labelled(case, either.astype(np.uint8), [PALE])
+    return replace(surface, colors=np.repeat(offset_colors(_union_offset(case, surface)) / 255.0, 2, axis=0))
+
+
+def _union_offset(case: EvaluatedView, surface: Triangles) -> Float[np.ndarray, " n"]:
+    """Offset in cells (``surface_offset``) at the middle of each of the squares of a surface of both together."""
     middles = surface.vertices.reshape(-1, 4, 3).mean(axis=1)
-    cells = surface_offset(reference, predicted, case.spacing, (middles - case.origin) / case.spacing)
-    return replace(surface, colors=np.repeat(offset_colors(cells) / 255.0, 2, axis=0))
+    places = (middles - case.origin) / case.spacing
+    return surface_offset(case.reference > 0, case.predicted > 0, case.spacing, places)
 
 
 def offset_colors(cells: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     """Colours of distances: pale up to ``TOLERANCE_CELLS``, then blue (above 0: too far out) or orange; 0..255."""
-    share = np.clip((np.abs(cells) - TOLERANCE_CELLS) / (FULL_CELLS - TOLERANCE_CELLS), 0.0, 1.0)[:, None]
+    share = _full_share(cells)[:, None]
     full = np.where(cells[:, None] > 0, np.asarray(OVER, dtype=float), np.asarray(UNDER, dtype=float))
     colors: Float[np.ndarray, "n 3"] = (1 - share) * np.asarray(PALE, dtype=float) + share * full
     return colors
+
+
+def _full_share(cells: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Share of the full colour of an error at each distance: 0 within the tolerance, 1 from ``FULL_CELLS`` on."""
+    share: Float[np.ndarray, " n"] = (np.abs(cells) - TOLERANCE_CELLS) / (FULL_CELLS - TOLERANCE_CELLS)
+    return np.clip(share, 0.0, 1.0)
 
 
 def _bounds(case: EvaluatedView) -> Float[np.ndarray, "2 3"]:

@@ -28,9 +28,7 @@ from mereo.visualization.contact_sheets import (
     legend,
     save_png,
 )
-from mereo.visualization.renderer import Viewpoint, shade, shaded_canvas
-
-Vector = tuple[float, float, float]
+from mereo.visualization.renderer import Vector, Viewpoint, shade, shaded_canvas
 
 CAMERA_VIEWS = {
     "as the camera sees it": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
@@ -206,10 +204,11 @@ def _arrow(center: Float[np.ndarray, "3"], toward: Float[np.ndarray, "3"], radiu
 
 
 def preview_all(path: str | Path, seed: int = 0) -> None:
-    """Write one sheet of all built-in scenes: each at rest, in two random states, and the second one's depth image.
+    """Write one sheet of all built-in scenes: each at rest, in two random states, these overlaid, and a depth image.
 
-    The first three pictures of a scene have one viewpoint and one scale; the depth image is that of a random camera.
-    State i comes from (seed, i) alone.
+    The first four pictures of a scene have one viewpoint and one scale; the paper's figure of scenes has the overlay as
+    its last row. The depth image is that of the second random state by a random camera. State i comes from (seed, i)
+    alone.
 
     Raises ``AssetUnavailable`` where a scene's mesh is neither here nor to be had.
     """
@@ -218,19 +217,24 @@ def preview_all(path: str | Path, seed: int = 0) -> None:
     for name in SCENES:
         scene = load_scene(name)
         images += scene_row(scene, seed)
-        captions += [f"{name}, {len(scene.rest.segments)} segments", "random state", "random state", "its depth image"]
-    save_png(path, contact_sheet(images, captions, 8))
+        words = ("random state", "another", "overlaid", "depth image of the other")
+        captions += [f"{name}, {len(scene.rest.segments)} segments", *words]
+    save_png(path, contact_sheet(images, captions, 10))
 
 
 def scene_row(scene: Scene, seed: int) -> list[Picture]:
-    """Pictures of a scene at rest and in two random states, from ``SCENE_VIEWS``, and the depth image of the second."""
+    """Pictures of a scene at rest, in two random states and of all three overlaid, and the second's depth image."""
     views = [sample_view(scene, GenerateConfig(), example_rng(seed, index)) for index in (0, 1)]
     meshes = [scene.rest, *(view.mesh.transformed(view.T_world_camera) for view in views)]
     viewpoint = common_viewpoint(meshes, *SCENE_VIEWS[scene.name])
-    return [
-        *(shade(mesh, viewpoint, (TILE_PX, TILE_PX)) for mesh in meshes),
-        enlarge(depth_to_rgb(views[1].depth), TILE_PX),
-    ]
+    states = [shade(mesh, viewpoint, (TILE_PX, TILE_PX)) for mesh in meshes]
+    return [*states, overlaid(states), enlarge(depth_to_rgb(views[1].depth), TILE_PX)]
+
+
+def overlaid(pictures: Sequence[Picture]) -> Picture:
+    """Picture of several on white, laid over each other half transparent: each shows as much as any other."""
+    mean: Picture = np.rint(np.mean([picture.astype(float) for picture in pictures], axis=0)).astype(np.uint8)
+    return mean
 
 
 def common_viewpoint(meshes: list[SegmentedMesh], direction: Vector, up: Vector) -> Viewpoint:

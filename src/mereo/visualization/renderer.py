@@ -17,6 +17,8 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, look_at, rigid
 
+Vector = tuple[float, float, float]
+
 SUPERSAMPLE = 2
 BACKGROUND = 1.0
 SEE_THROUGH = 0.55
@@ -44,8 +46,8 @@ class Viewpoint:
     def along(
         cls,
         bounds: Float[np.ndarray, "2 3"],
-        direction: tuple[float, float, float],
-        up: tuple[float, float, float],
+        direction: Vector,
+        up: Vector,
         margin: float = 1.08,
     ) -> "Viewpoint":
         """Orthographic view along ``direction``, with ``up`` upwards, that shows the whole box ``bounds``."""

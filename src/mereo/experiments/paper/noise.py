@@ -7,6 +7,8 @@ from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
 from mereo.synthesis.config import GenerateConfig
 
+QUESTION = "What does noise in the depth cost, seen in training or not?"
+
 OBJECTS = ("robot", "rope")
 """Scenes: the paper's, and one more."""
 

@@ -7,6 +7,8 @@ from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Store
 from mereo.synthesis.config import GenerateConfig
 
+QUESTION = "Does encoding the position by frequencies help?"
+
 OBJECTS = ("rope", "shapes", "lizard", "robot", "human")
 
 

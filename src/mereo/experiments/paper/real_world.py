@@ -4,12 +4,14 @@ The paper scans a printed lizard; its scans are not public. Ours are four range 
 poses.
 """
 
-from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.experiments.paper.result import Claim, Result, Row, published
 from mereo.experiments.paper.scales import ExperimentScale
-from mereo.experiments.paper.store import Score, Store
-from mereo.models.weights import load_model
+from mereo.experiments.paper.store import Store
 from mereo.synthesis.config import GenerateConfig
+
+QUESTION = "How much worse are real scans than synthetic views?"
+
+OBJECTS = ("bunny",)
 
 NOTES = ("The paper's figures are those of its printed lizard (15 scans), ours of the bunny (4 scans).",)
 
@@ -18,14 +20,11 @@ def run(store: Store, scale: ExperimentScale) -> Result:
     """Result of one training: the synthetic score beside the real one."""
     weights = store.run(store.dataset("bunny", GenerateConfig(), scale.examples), scale.recipe)
     synthetic = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
-    evaluation = evaluate_scans(load_model(weights), cells=scale.cells)
-    scores, mean = evaluation.scores, evaluation.example_mean
-    per_segment = dict(zip(evaluation.names, map(float, scores.per_segment), strict=True))
-    real = Score(scores.iou, scores.miou, *mean, per_segment)
+    real, views = store.scans(weights, scale.cells)
     paper = published()["real-world"]["lizard"]
     rows = (Row("bunny", "synthetic", synthetic, paper["synthetic"]), Row("bunny", "real", real, paper["real"]))
     claim = Claim(
         "Scores on real scans are considerably lower than on synthetic views (IoU by more than 0.1).",
         {"bunny": real.iou < synthetic.iou - 0.1},
     )
-    return Result("real-world", "Real scans", scale.name, rows, (claim,), NOTES, evaluation.views)
+    return Result("real-world", "Real scans", scale.name, rows, (claim,), NOTES, views)

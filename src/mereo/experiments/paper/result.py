@@ -1,7 +1,7 @@
 """Result of an experiment, beside what the paper says: as Markdown, JSON and a bar chart."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import resources
@@ -18,7 +18,7 @@ from mereo.experiments.paper.store import Score
 from mereo.io.atomic_files import atomic_file, write_json
 from mereo.io.output_folders import new_directory
 from mereo.io.plots import pyplot
-from mereo.visualization.error_maps import error_picture
+from mereo.visualization.error_maps import Comparison, Shown, comparison_picture, error_picture
 from mereo.visualization.viridis import viridis
 
 Figures = dict[str, float]
@@ -41,13 +41,15 @@ class Row:
         object: name of the scene.
         variant: what was varied, in words.
         score: what was measured here.
-        paper: what the paper says of it, where it does.
+        paper: what the paper says of it on its own scene, where it does.
+        lacks: what this variant has not, and others of the table have.
     """
 
     object: str
     variant: str
     score: Score
     paper: Figures | None = None
+    lacks: str = ""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,8 @@ class Result:
         claims: claims of the paper.
         notes: sentences on what differs from the paper's experiment.
         views: rows of the paper's figure of reconstructions.
-        figures: further pictures by the names of their files.
+        figures: drawings of further pictures by the names of their files.
+        comparisons: pictures of answers side by side by the names of their files.
     """
 
     name: str
@@ -98,7 +101,8 @@ class Result:
     claims: tuple[Claim, ...]
     notes: tuple[str, ...] = ()
     views: tuple[EvaluatedView, ...] = ()
-    figures: Mapping[str, Figure] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
+    comparisons: Mapping[str, Comparison] = field(default_factory=dict)
 
 
 def better(score: Score, other: Score) -> bool:
@@ -106,6 +110,16 @@ def better(score: Score, other: Score) -> bool:
     if isnan(score.miou) or isnan(other.miou):
         return score.iou > other.iou
     return score.miou > other.miou
+
+
+def compare(shown: Shown, views: Sequence[Sequence[EvaluatedView]], rows: Sequence[Row]) -> Comparison:
+    """Picture of one view of each of a table's rows, in its order: an object's variants side by side."""
+    words = iter(f"{row.variant}: {_scores(row.score)}" for row in rows)
+    return Comparison(shown, views, [[next(words) for _ in each] for each in views])
+
+
+def _scores(score: Score) -> str:
+    return f"IoU {score.iou:.3f}" + ("" if isnan(score.miou) else f", mIoU {score.miou:.3f}")
 
 
 def write_result(result: Result, directory: Path, force: bool = True) -> None:
@@ -117,23 +131,32 @@ def write_result(result: Result, directory: Path, force: bool = True) -> None:
         draw_bars(result, partial / "figure.png")
         if result.views:
             error_picture(partial / "reconstructions.png", result.views)
-        for name, figure in result.figures.items():
-            _save(figure, partial / name)
+        for name, draw in result.figures.items():
+            _save(draw(), partial / name)
+        for name, comparison in result.comparisons.items():
+            comparison_picture(partial / name, comparison)
+
+
+NOT_COMPARED = (
+    "The paper's figures are of its own scenes, which are not published: they tell which variant was better there, and "
+    "are no measure for ours."
+)
 
 
 def markdown(result: Result) -> str:
-    """Markdown table with the paper's scores beside ours, and each claim with its verdict."""
+    """Markdown table with the paper's scores behind ours, and each claim with its verdict."""
+    head = ["object", "variant", "IoU", "mIoU", "mean IoU", "mean mIoU", "paper's scene: IoU", "mIoU"]
+    lacking = any(row.lacks for row in result.rows)
+    head += ["lacks"] * lacking
     lines = [f"# {result.title}", "", f"Scale `{result.scale}`. {' '.join(result.notes)}".rstrip(), ""]
-    lines += [
-        "| object | variant | IoU | mIoU | mean IoU | mean mIoU | paper IoU | paper mIoU |",
-        "|---|---|" + "---|" * 6,
-    ]
+    lines += [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for row in result.rows:
         score, paper = row.score, row.paper or {}
         ours = (score.iou, score.miou, score.example_iou, score.example_miou)
         figures = [*ours, paper.get("iou", float("nan")), paper.get("miou", float("nan"))]
-        lines.append(f"| {row.object} | {row.variant} | {' | '.join(format_score(value, '') for value in figures)} |")
-    lines += ["", "IoU and mIoU are over the whole test set, the means over its examples.", ""]
+        cells = [row.object, row.variant, *(format_score(value, "") for value in figures), *[row.lacks] * lacking]
+        lines.append(f"| {' | '.join(cells)} |")
+    lines += ["", f"IoU and mIoU are over the whole test set, the means over its examples. {NOT_COMPARED}", ""]
     lines += [f"- {claim.text} {claim.verdict}" for claim in result.claims]
     return "\n".join(lines) + "\n"
 
@@ -147,7 +170,7 @@ def _plain(result: Result) -> dict[str, Any]:
 
 
 def draw_bars(result: Result, path: Path) -> None:
-    """Draw a group of bars per object: IoU (pale) and mIoU (full) of each variant, and the paper's as black lines."""
+    """Draw a group of bars per object: IoU (pale) and mIoU (full) of each variant; lines: the paper's, on its scene."""
     from matplotlib.patches import Patch
 
     objects = list(dict.fromkeys(row.object for row in result.rows))
@@ -170,7 +193,7 @@ def draw_bars(result: Result, path: Path) -> None:
     figure.legend(handles, variants, fontsize=8, ncols=columns, loc="outside lower center")
     axes.set_xticks(range(len(objects)), objects)
     axes.set_ylim(0, 1)
-    axes.set_ylabel("IoU (pale), mIoU (full), paper (line)")
+    axes.set_ylabel("IoU (pale), mIoU (full), the paper's scene (line)")
     axes.set_title(f"{result.title} ({result.scale})", fontsize=10)
     _save(figure, path)
     plt.close(figure)

@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from mereo.experiments.paper.result import Claim, Result, Row, better, published
+from mereo.evaluation.results import EvaluatedView
+from mereo.experiments.paper.result import Claim, Result, Row, better, compare, published
 from mereo.experiments.paper.sampling_figure import draw_figure
 from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
 from mereo.synthesis.config import GenerateConfig, Sampler, SamplingConfig
+
+QUESTION = "Which sampler of training queries teaches most?"
 
 OBJECTS = ("lizard", "human", "engine")
 
@@ -24,17 +27,25 @@ SETTINGS: dict[str, SamplingConfig] = {
 
 def run(store: Store, scale: ExperimentScale) -> Result:
     """Result of one training per object and sampler, with one recipe and one seed."""
-    rows = []
+    rows: list[Row] = []
+    views: list[list[EvaluatedView]] = []
     for scene in scale.choose(OBJECTS):
+        views.append([])
         paper = published()["sampling"].get(scene, {})
         for variant, sampling in SETTINGS.items():
             settings = replace(GenerateConfig(), sampling=sampling)
             weights = store.run(store.dataset(scene, settings, scale.examples), scale.recipe)
             score = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
             rows.append(Row(scene, variant, score, paper.get(variant)))
-    figures = {"sampling_2d.png": draw_figure(np.random.default_rng(0))}
+            views[-1].append(store.view(weights, GenerateConfig(), scale.cells))
     return Result(
-        "sampling", "Where training queries are drawn", scale.name, tuple(rows), _claims(rows), figures=figures
+        "sampling",
+        "Where training queries are drawn",
+        scale.name,
+        tuple(rows),
+        _claims(rows),
+        figures={"sampling_2d.png": lambda: draw_figure(np.random.default_rng(0))},
+        comparisons={"samplers.png": compare("reconstruction error", views, rows)},
     )
 
 

@@ -5,7 +5,9 @@ from typing import Literal
 
 from mereo.training.config import PRESETS, TrainConfig
 
-ExperimentName = Literal["reconstruction", "encoders-losses", "sampling", "positional-encoding", "noise", "real-world"]
+ExperimentName = Literal[
+    "reconstruction", "encoders-losses", "encoders", "sampling", "positional-encoding", "noise", "real-world"
+]
 ScaleName = Literal["smoke", "cpu", "paper"]
 
 TRAINING_SEED = 1
@@ -26,6 +28,7 @@ class ExperimentScale:
         objects: most objects on which variants are compared, in an experiment's own order; None means all.
         downloads: whether objects are taken whose meshes are downloaded.
         decides: whether networks learn enough for claims to be judged.
+        chosen: objects that were asked for by name, of an experiment's own, whatever the budget; empty for none.
     """
 
     name: ScaleName
@@ -37,9 +40,12 @@ class ExperimentScale:
     objects: int | None
     downloads: bool
     decides: bool = True
+    chosen: tuple[str, ...] = ()
 
     def choose(self, objects: tuple[str, ...]) -> tuple[str, ...]:
-        """Objects of an experiment that fit the budget, in its order."""
+        """Objects of an experiment that were asked for, or those that fit the budget, in its order."""
+        if self.chosen:
+            return tuple(name for name in objects if name in self.chosen)
         known = objects if self.downloads else tuple(name for name in objects if name not in DOWNLOADED)
         return known[: self.objects]
 

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from mereo.evaluation.results import EvaluatedView
+from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.evaluation.scoring import evaluate
 from mereo.evaluation.tables import read_metrics
 from mereo.experiments.paper.scales import TRAINING_SEED
+from mereo.fitting.config import FitChoice
 from mereo.io.atomic_files import write_json
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
@@ -24,6 +26,9 @@ from mereo.synthesis.shards import MANIFEST, NOT_COMPARED, generate, make_manife
 from mereo.training.config import TrainConfig
 from mereo.training.trainer import train
 from mereo.visualization.result_files import evaluate_weights
+
+NETWORK: FitChoice = "off"
+"""The paper's experiments are about networks: no registered model answers in their place."""
 
 FINISHED = "finished.json"
 """Name of a file that is written into a run's folder after its last step."""
@@ -72,7 +77,7 @@ class Store:
 
     def run(self, dataset: Path, config: TrainConfig) -> Path:
         """Weights' file of a training run, made, continued or found."""
-        path = self.root / "runs" / f"{_scene_of(dataset)}-{content_key([dataset.name, config.to_dict()])}"
+        path = self.root / "runs" / f"{scene_of(dataset)}-{content_key([dataset.name, config.to_dict()])}"
         weights = path / "weights.safetensors"
         _say("run", path)
         if not (path / FINISHED).exists():
@@ -81,20 +86,25 @@ class Store:
         return weights
 
     def score(self, weights: Path, settings: GenerateConfig, examples: int, cells: int) -> Score:
-        """Score of a run's weights on test views that are seen as ``settings`` say."""
-        scene = _scene_of(weights.parent)
-        key = content_key([weights.parent.name, asdict(settings), examples, cells, TEST_SEED_START])
+        """Score of a run's network, which answers alone, on test views that are seen as ``settings`` say."""
+        scene = scene_of(weights.parent)
+        key = content_key([weights.parent.name, asdict(settings), examples, cells, TEST_SEED_START, NETWORK])
         path = self.root / "scores" / f"{scene}-{key}"
         _say("score", path)
         if not path.exists():
-            evaluate_weights(weights, path, examples=examples, cells=cells, settings=settings)
+            evaluate_weights(weights, path, examples=examples, cells=cells, settings=settings, choice=NETWORK)
         return read_score(path / "metrics.json")
 
+    def view(self, weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
+        """First test view of a run's network with its labels, for pictures."""
+        return evaluate(load_model(weights), examples=1, cells=cells, settings=settings, choice=NETWORK).views[0]
 
-def example_view(weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
-    """First test view of a run's weights with its labels, for pictures."""
-    evaluation = evaluate(load_model(weights), examples=1, cells=cells, settings=settings)
-    return evaluation.views[0]
+    def scans(self, weights: Path, cells: int) -> tuple[Score, tuple[EvaluatedView, ...]]:
+        """Score of a run's network on the real scans of the bunny, and each of them with its labels."""
+        evaluation = evaluate_scans(load_model(weights), cells=cells, choice=NETWORK)
+        scores, mean = evaluation.scores, evaluation.example_mean
+        per_segment = dict(zip(evaluation.names, map(float, scores.per_segment), strict=True))
+        return Score(scores.iou, scores.miou, *mean, per_segment), evaluation.views
 
 
 def read_score(path: Path) -> Score:
@@ -115,7 +125,8 @@ def content_key(value: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def _scene_of(path: Path) -> str:
+def scene_of(path: Path) -> str:
+    """Scene of a folder of datasets, runs or scores."""
     return path.name.rsplit("-", 1)[0]
 
 

@@ -27,6 +27,6 @@ def _check(config: NetworkConfig) -> None:
     widths = config.transformer.transformer_widths
     if config.encoder == "point-transformer" and len(widths) < 3:
         raise ValueError(
-            f"transformer_widths are {widths}; a Point Transformer needs at least three: the paper has "
-            "32 64 128 256 512"
+            f"transformer_widths are {widths}; a Point Transformer needs at least three: give for "
+            "example 32 64 128 256 512"
         )
