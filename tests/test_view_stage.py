@@ -13,6 +13,7 @@ from toy_scene import toy_scene
 from mereo.models.weights import load_model
 from mereo.scenes.parameters import Parameter, random_state
 from mereo.scenes.registry import load_scene
+from mereo.visualization.units import Unit
 from mereo.visualization.viewer import display
 from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, SegmentControls, point_size
 from mereo.visualization.viewer.frame_page import FramePage
@@ -48,7 +49,7 @@ def test_points_take_a_share_of_their_spacing_within_bounds() -> None:
 
 @needs_viser
 def test_points_give_way_to_the_colours_of_a_frame(server: object) -> None:
-    page = FramePage(server, toy_inspection(), "toy", "closed form", "mm")
+    page = FramePage(server, toy_inspection(), "toy", "closed form", Unit(0.001))
     (cloud,) = (handle for name, handle in nodes(server).items() if name == "/cloud")
     assert cloud.visible
     page.coloring.value = "distance"
