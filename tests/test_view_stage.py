@@ -86,31 +86,31 @@ def test_undo_takes_back_what_one_hand_did(server: object) -> None:
     page = LabPage(server, Laboratory(toy_scene(), None), "toy", "no weights")
     try:
         until(lambda: page.moment is not None)
-        first = page.shape
-        freedom = page.laboratory.freedom
+        wishes, freedom = page.wishes, page.laboratory.freedom
+        first = wishes.shape
         assert page._undo.disabled
         one, other = freedom.parameters(first)[:2]
 
-        def change(act: Callable[[], None]) -> None:
+        def change(ask: Callable[[], None]) -> None:
             before = page.moment
-            act()
+            page.wish(ask)
             until(lambda: page.moment is not before)
 
         def value(of: Parameter) -> float:
-            return next(p.value for p in freedom.parameters(page.shape) if p.key == of.key and p.index == of.index)
+            return next(p.value for p in freedom.parameters(wishes.shape) if p.key == of.key and p.index == of.index)
 
         middle, end = (one.low + one.high) / 2, 0.9 * one.high + 0.1 * one.low
-        change(lambda: page._wish(one, middle))
-        change(lambda: page._wish(one, end))  # the same slider, still being dragged
-        change(lambda: page._wish(other, (other.low + other.high) / 2))
-        change(page._wish_anew)
+        change(lambda: wishes.move(one, middle))
+        change(lambda: wishes.move(one, end))  # the same slider, still being dragged
+        change(lambda: wishes.move(other, (other.low + other.high) / 2))
+        change(wishes.anew)
         assert not page._undo.disabled
-        change(page._wish_back)
+        change(wishes.back)
         assert value(one) == pytest.approx(end)
-        change(page._wish_back)
+        change(wishes.back)
         assert value(one) == pytest.approx(end) and value(other) == pytest.approx(other.value)
-        change(page._wish_back)
-        assert page.shape is first
+        change(wishes.back)
+        assert wishes.shape is first
         until(lambda: page._undo.disabled)
     finally:
         page.close()

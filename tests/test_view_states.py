@@ -255,7 +255,7 @@ def test_while_a_slider_moves_the_modes_alone_are_fitted(model: Model) -> None:
 
 
 def test_sliders_of_modes_move_the_model(states: StatisticalModel) -> None:
-    freedom = ModeShapes(states, np.where(np.arange(states.count) == 1, 4.2, 0.5))
+    freedom = ModeShapes("rope", states, np.where(np.arange(states.count) == 1, 4.2, 0.5))
     shape = freedom.first(7)
     sliders = freedom.parameters(shape)
     assert [slider.name for slider in sliders] == [f"mode {number}" for number in range(1, 11)]
@@ -273,7 +273,7 @@ def test_sliders_of_modes_move_the_model(states: StatisticalModel) -> None:
 
 @pytest.mark.slow
 def test_a_modes_state_is_seen_and_rebuilt(states: StatisticalModel, model: Model) -> None:
-    freedom = ModeShapes(states, states.library[4].astype(np.float64))
+    freedom = ModeShapes("rope", states, states.library[4].astype(np.float64))
     laboratory = Laboratory(load_scene("rope"), model, shapes=freedom)
     view = laboratory.look(freedom.first(0), laboratory.first_place())
     assert laboratory.rebuild(view, 16, 12).scores.iou > 0.5

@@ -9,11 +9,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mereo.fitting.playback import SMOOTH, Drawn, shares_of
+from mereo.fitting.playback import Drawn, shares_of
 from mereo.scenes.draw_recorder import Call, OutOfDraws, Recorder
 from mereo.scenes.given_draws import played_back
 from mereo.scenes.parameters import play
 from mereo.scenes.scene import Scene
+from mereo.scenes.walks import SMOOTH
 
 MORE_CALLS = 12
 """Calls that another choice may ask for in addition; a scene that asks for more has thrown its first attempt away."""

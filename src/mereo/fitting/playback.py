@@ -21,12 +21,10 @@ from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel, following
+from mereo.scenes.walks import SMOOTH
 
 STATES_SEED = 400_000
 """A training seed."""
-
-SMOOTH = ("uniform", "normal", "triangular")
-"""Kinds of draws that move the state continuously; the others stay as they are."""
 
 MOST = 2.0
 """Standard deviations of a draw that is guessed."""

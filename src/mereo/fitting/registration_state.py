@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo.fitting.answer import Answer
-from mereo.fitting.playback import SMOOTH, Drawn, material_moved, shares_of
+from mereo.fitting.playback import Drawn, material_moved, shares_of
 from mereo.fitting.register import Registrar, same_topology
 from mereo.fitting.registration import Registration
 from mereo.fitting.state_file import FORMAT, STATE, WITNESSES, RegistrationState, StateDraws, read_state, save_state
@@ -26,6 +26,7 @@ from mereo.scenes.parameters import Played
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.walks import SMOOTH
 
 AGREE = 1e-3
 """Distance, of half the rest box's longest side, up to which a state that is played again is the same."""

@@ -207,7 +207,7 @@ def shapes_of(state: RegistrationState, scene: Scene, model: Model | None) -> Fr
             f"the state is one of the modes of weights {state.weights!r}, which are needed: name them with --weights"
         )
     registration = restored(state, statistical_model_of(model))
-    return ModeShapes(registration.model, registration.z)
+    return ModeShapes(scene.name, registration.model, registration.z)
 
 
 def weights_of(state: RegistrationState, weights: str | None) -> str:
