@@ -45,7 +45,7 @@ def picture(
     view: Viewpoint,
     meshes: list[SegmentedMesh],
     points: Float[np.ndarray, "n 3"],
-    depth: UInt8[np.ndarray, "h w 3"],
+    depth: UInt8[np.ndarray, "r c 3"],
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Picture of a moment.
 
