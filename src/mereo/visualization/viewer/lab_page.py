@@ -95,7 +95,8 @@ class LabPage:
         self._coloring.on_update(lambda _: setattr(self._points, "value", self._coloring.value == "segment"))
         self._shown.on_update(lambda _: self._look())
         gui.add_button("Random state").on_click(lambda _: self.wish(self.wishes.anew))
-        gui.add_button("Rest state").on_click(lambda _: self.wish(self.wishes.rest))
+        hint = "The object undeformed. Where no draws lead there, sliders stay, and the next move goes on from them."
+        gui.add_button("Rest state", hint=hint).on_click(lambda _: self.wish(self.wishes.rest))
         self._undo = gui.add_button("Undo", disabled=True)
         self._undo.on_click(lambda _: self.wish(self.wishes.back))
         with gui.add_folder("Camera"):
@@ -135,6 +136,13 @@ class LabPage:
     # --- the worker's thread ------------------------------------------------------------------------------------------
 
     def _quick(self, _: None) -> None:
+        try:
+            self._show()
+        finally:  # the way goes on after a state that the camera cannot see
+            if self.wishes.is_walking:
+                self.worker.submit(None)
+
+    def _show(self) -> None:
         refusal = self.wishes.fulfil()
         shape, freedom = self.wishes.shape, self.laboratory.freedom
         self._undo.disabled = not self.wishes.can_go_back
@@ -148,8 +156,6 @@ class LabPage:
         self._picture.image = depth_picture(view.depth, max(1, PICTURE // view.depth.camera.width))
         self._rebuild(*QUICK, quick=True)
         self.tools.shoot(self._shoot)
-        if self.wishes.is_walking:
-            self.worker.submit(None)
         if refusal is not None:
             raise refusal
 

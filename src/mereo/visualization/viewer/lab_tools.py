@@ -90,8 +90,7 @@ class LabTools:
                 self._tell_film(self.film)
 
     def _tell_film(self, film: Film) -> None:
-        full = ", full" if film.is_full else f" of {MOST_FRAMES}"
-        self._recording.label = f"Stop: {len(film)}{full} pictures"
+        self._recording.label = f"Stop ({len(film)} of {MOST_FRAMES} pictures)"
 
     def _viewpoint(self, client: Any) -> Viewpoint:
         camera = self.server.initial_camera if client is None else client.camera

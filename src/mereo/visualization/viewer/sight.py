@@ -46,16 +46,6 @@ class Sensing:
     front: Front = "nothing"
     hidden: float = 0.1
 
-    @property
-    def told(self) -> str:
-        """What differs from the paper's camera, in a phrase; "" for nothing."""
-        parts = [
-            *([f"{self.sensor} sensor"] if self.sensor != "paper" else []),
-            *([f"{self.image_size} pixels"] if self.image_size != PAPER.image_size else []),
-            *([f"noise {self.noise_std:g}"] if self.noise_std != PAPER.noise_std else []),
-        ]
-        return ", ".join(parts)
-
 
 @dataclass(frozen=True, eq=False)
 class Sight(View):
