@@ -15,6 +15,7 @@ from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import reconstruct
 from mereo.scenes.parameters import random_state
 from mereo.scenes.registry import load_scene
+from mereo.visualization.answering import answer
 from mereo.visualization.result_files import write_reconstruction
 from mereo.visualization.vertex_colors import confidence
 from mereo.visualization.viewer.laboratory import Laboratory
@@ -51,7 +52,8 @@ def test_a_result_that_is_written(encoded: list[np.ndarray], tmp_path: Path) -> 
 
 def test_a_page_of_a_frame(encoded: list[np.ndarray]) -> None:
     cloud = load_view("rope").depth.to_points()
-    inspection = Inspection.of(cloud, load_model("rope"), 16)
+    model = load_model("rope")
+    inspection = Inspection.of_answer(answer(cloud, model, "off", 16), model, None)
     inspection.ask(cloud.points[:5])
     confidence(inspection.surfaces, inspection.network)
     assert len(encoded) == 1

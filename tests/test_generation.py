@@ -274,5 +274,8 @@ def test_progress_tells_rate_and_time_left(
     printed = capsys.readouterr()
     assert printed.out == "modes of 100 random states, for registration\n"
     lines = printed.err.splitlines()
+    assert re.fullmatch(r"model: 1 of 100 states, \d+\.\d states/s, \d+ s left", lines[0])
+    assert re.fullmatch(r"model: 100 states in \d+ s", lines[100])
+    lines = lines[101:]
     assert re.fullmatch(r"generate: 4 of 6 examples, \d+\.\d examples/s, \d+ s left", lines[0])
     assert lines[1].startswith("generate: 6 of 6 ") and re.fullmatch(r"generate: 6 examples in \d+ (s|min)", lines[2])

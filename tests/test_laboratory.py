@@ -71,7 +71,7 @@ def test_a_trial_is_the_reconstruction_of_what_is_seen_and_its_score() -> None:
     wanted = grid_scores(model, view.depth.to_points(), view.mesh, 16)
     assert (trial.scores.iou, trial.scores.miou) == (wanted.iou, wanted.miou)
     assert trial.scores.iou > 0.4
-    assert trial.result.surfaces.names == laboratory.scene.rest.names
+    assert trial.reconstruction.surfaces.names == laboratory.scene.rest.names
     low, high = view.mesh.bounds
-    middle = trial.result.surfaces.segments[0].vertices.mean(axis=0)
+    middle = trial.reconstruction.surfaces.segments[0].vertices.mean(axis=0)
     assert ((middle > low) & (middle < high)).all()  # in the camera frame, as the truth

@@ -201,8 +201,10 @@ def test_one_command_and_the_same_again(
 ) -> None:
     scene, out = write_bar(tmp_path), tmp_path / "out"
     scores = learn([scene], out, minutes=0.05, init="rope")
-    said = capsys.readouterr().out
+    printed = capsys.readouterr()
+    said = printed.out
     assert re.findall(r"\[(\d)/5\]", said) == list("12345")
+    assert f"measure: {trial.trial_steps(compared=False)} steps in" in printed.err
     assert "the least that can be learnt from takes" in said
     assert f"mereo reconstruct {out}/frame.ply --weights {out}/weights.safetensors --scene {scene}" in said
     assert {place.name for place in out.iterdir()} == {
@@ -239,7 +241,9 @@ def test_the_nearest_weights_are_those_that_adapt_fastest(
 ) -> None:
     monkeypatch.setattr(trial, "shipped_names", lambda: ("rope", "skull"))
     _, name = probe.measure(str(write_bar(tmp_path)), tmp_path, LIGHT, init="", seed=1, workers=1)
-    losses = re.findall(r"(rope|skull) (\d+\.\d+)", capsys.readouterr().out)
+    printed = capsys.readouterr()
+    assert f"measure: {trial.trial_steps(compared=True)} steps in" in printed.err
+    losses = re.findall(r"(rope|skull) (\d+\.\d+)", printed.out)
     assert len(losses) == 2 and float(losses[0][1]) <= float(losses[1][1]) and name == losses[0][0]
 
 

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from written_results import CENTER, COLORS, NAMES, SIDES, segments
 
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.writers.glb import write_segments_glb
 from mereo.io.writers.obj import material_names, write_segments_obj
@@ -154,6 +154,26 @@ def test_an_obj_gives_back_names_and_vertices(tmp_path: Path) -> None:
     for found, written in zip(back.segments, (mesh.segments[0], mesh.segments[2]), strict=True):
         np.testing.assert_allclose(found.vertices, written.vertices, atol=1e-9)
         np.testing.assert_array_equal(found.faces, written.faces)
+
+
+def test_an_obj_gives_back_its_colours_from_the_library_beside_it(tmp_path: Path) -> None:
+    write_segments_obj(tmp_path / "s.obj", segments())
+    back = read_segmented_mesh(tmp_path / "s.obj")
+    assert back.colors == (COLORS[0], COLORS[2])
+    library = (tmp_path / "s.mtl").read_text("utf-8")
+    for damaged in (library.replace("Kd", "map_Kd ear.png\nKd"), "newmtl", library.replace("Kd ", "Kd spectral ")):
+        (tmp_path / "s.mtl").write_text(damaged, "utf-8")
+        assert read_segmented_mesh(tmp_path / "s.obj").colors == PALETTE[:2], "a texture, or damage: none"
+    (tmp_path / "s.mtl").unlink()
+    assert read_segmented_mesh(tmp_path / "s.obj").colors == PALETTE[:2]
+
+
+def test_an_obj_does_not_choose_which_other_files_are_opened(tmp_path: Path) -> None:
+    (tmp_path / "inner").mkdir()
+    write_segments_obj(tmp_path / "s.obj", segments())
+    text = (tmp_path / "s.obj").read_text("utf-8").replace("mtllib s.mtl", "mtllib ../s.mtl")
+    (tmp_path / "inner/t.obj").write_text(text, "utf-8")
+    assert read_segmented_mesh(tmp_path / "inner/t.obj").colors == PALETTE[:2]
 
 
 def test_other_programs_see_the_obj_in_its_colours(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.training.config import PRESETS
+from mereo.visualization.units import Unit
 from mereo.visualization.viewer import display, html, open_page
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.lab_page import LabPage
@@ -62,7 +63,7 @@ def server() -> Iterator[object]:
 @needs_viser
 @needs_browser
 def test_the_page_of_a_frame_shows_every_segment_and_answers(tmp_path: Path, server: object) -> None:
-    page = FramePage(server, toy_inspection(), "toy <frame>", "closed form", "mm")
+    page = FramePage(server, toy_inspection(), "toy <frame>", "closed form", Unit(0.001))
     with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (760, 480)) as browser:  # type: ignore[attr-defined]
         until(lambda: "toy <frame>" in browser.text())
         browser.still()
@@ -78,7 +79,7 @@ def test_the_page_of_a_frame_shows_every_segment_and_answers(tmp_path: Path, ser
         # the middle of the stage lies in the middle box: a click there asks the model
         browser.click(220, 250)
         until(lambda: "the nearest surface" in browser.text())
-        assert re.search(r"box_\d at -?[\d.]+", browser.text())
+        assert re.search(r"box_\d at -?[\d.,]+", browser.text())
         page.coloring.value = "distance"
         until(lambda: "distance to the nearest observed point" in browser.text())
 
@@ -199,19 +200,20 @@ def test_names_cannot_break_the_panels() -> None:
     name = "<script>x</script>"
     answer = Probed(
         np.array([1], dtype=np.uint8),
-        np.array([-2.0]),
+        np.array([-0.002]),
         np.array([[0.0, 1.0, 0.0]]),
         np.array([[0.25, 0.75]]),
         np.array([[4.0, 5.0, 6.0]]),
     )
-    text = html.answer(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), (1.0, 2.0, 3.0), " mm")
+    place = np.array([0.001, 0.002, 0.003])
+    text = html.answer(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), place, Unit(1.0))
     shown = re.sub(r"<[^>]+>", " ", text)
     assert "<script" not in text + html.chips((name,), ((1, 2, 3),)) + html.heading(name, name) + html.message(name)
     for told in (
         "0.75",
         "2 mm inside the nearest surface",
         "towards 0, 1, 0",
-        "at 1, 2, 3 mm",
+        "at 1 2 3 mm",
         "at rest at 4, 5, 6 scene units",
     ):
         assert told in shown

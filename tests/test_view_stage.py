@@ -13,6 +13,7 @@ from toy_scene import toy_scene
 from mereo.models.weights import load_model
 from mereo.scenes.parameters import Parameter, random_state
 from mereo.scenes.registry import load_scene
+from mereo.visualization.units import Unit
 from mereo.visualization.viewer import display
 from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, SegmentControls, point_size
 from mereo.visualization.viewer.frame_page import FramePage
@@ -48,7 +49,7 @@ def test_points_take_a_share_of_their_spacing_within_bounds() -> None:
 
 @needs_viser
 def test_points_give_way_to_the_colours_of_a_frame(server: object) -> None:
-    page = FramePage(server, toy_inspection(), "toy", "closed form", "mm")
+    page = FramePage(server, toy_inspection(), "toy", "closed form", Unit(0.001))
     (cloud,) = (handle for name, handle in nodes(server).items() if name == "/cloud")
     assert cloud.visible
     page.coloring.value = "distance"
@@ -85,31 +86,31 @@ def test_undo_takes_back_what_one_hand_did(server: object) -> None:
     page = LabPage(server, Laboratory(toy_scene(), None), "toy", "no weights")
     try:
         until(lambda: page.moment is not None)
-        first = page.shape
-        freedom = page.laboratory.freedom
+        wishes, freedom = page.wishes, page.laboratory.freedom
+        first = wishes.shape
         assert page._undo.disabled
         one, other = freedom.parameters(first)[:2]
 
-        def change(act: Callable[[], None]) -> None:
+        def change(ask: Callable[[], None]) -> None:
             before = page.moment
-            act()
+            page.wish(ask)
             until(lambda: page.moment is not before)
 
         def value(of: Parameter) -> float:
-            return next(p.value for p in freedom.parameters(page.shape) if p.key == of.key and p.index == of.index)
+            return next(p.value for p in freedom.parameters(wishes.shape) if p.key == of.key and p.index == of.index)
 
         middle, end = (one.low + one.high) / 2, 0.9 * one.high + 0.1 * one.low
-        change(lambda: page._wish(one, middle))
-        change(lambda: page._wish(one, end))  # the same slider, still being dragged
-        change(lambda: page._wish(other, (other.low + other.high) / 2))
-        change(page._wish_anew)
+        change(lambda: wishes.move(one, middle))
+        change(lambda: wishes.move(one, end))  # the same slider, still being dragged
+        change(lambda: wishes.move(other, (other.low + other.high) / 2))
+        change(wishes.anew)
         assert not page._undo.disabled
-        change(page._wish_back)
+        change(wishes.back)
         assert value(one) == pytest.approx(end)
-        change(page._wish_back)
+        change(wishes.back)
         assert value(one) == pytest.approx(end) and value(other) == pytest.approx(other.value)
-        change(page._wish_back)
-        assert page.shape is first
+        change(wishes.back)
+        assert wishes.shape is first
         until(lambda: page._undo.disabled)
     finally:
         page.close()

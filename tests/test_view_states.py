@@ -17,6 +17,7 @@ from mereo.fitting.registration import Registration
 from mereo.fitting.registration_state import load_state, state_of
 from mereo.fitting.state_file import STATE, save_state
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
@@ -25,6 +26,7 @@ from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import StatisticalModel
+from mereo.visualization.answering import answer
 from mereo.visualization.viewer import display, serve
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, ModeShapes
@@ -57,9 +59,15 @@ def registrar(model: Model, states: StatisticalModel) -> Registrar:
     return QuickRegistrar(model, states)
 
 
+def inspected(
+    cloud: PointCloud, model: Model, registrar: Registrar | None, resolution: int = 24, axes: CloudAxes = "camera"
+) -> Inspection:
+    return Inspection.of_answer(answer(cloud, model, registrar, resolution, axes=axes), model, registrar)
+
+
 @pytest.fixture(scope="module")
 def inspection(model: Model, seen: PointCloud, registrar: Registrar) -> Inspection:
-    return Inspection.of(seen, model, 32, registrar=registrar)
+    return inspected(seen, model, registrar, 32)
 
 
 def by_modes(states: StatisticalModel, seed: int = 0) -> Registration:
@@ -97,7 +105,7 @@ def test_a_page_of_a_frame_shows_and_asks_the_default_answer(inspection: Inspect
 
 def test_a_scanners_frame_is_asked_in_its_own_axes(model: Model, seen: PointCloud, registrar: Registrar) -> None:
     scan = PointCloud(seen.points @ SCANNER_TO_CAMERA.T)
-    inspection = Inspection.of(scan, model, 24, "scanner", registrar)
+    inspection = inspected(scan, model, registrar, axes="scanner")
     assert inspection.registration is not None
     places = scan.points[:6] - [0.0, 0.0, 2.0]
     found = inspection.ask(places)
@@ -107,7 +115,7 @@ def test_a_scanners_frame_is_asked_in_its_own_axes(model: Model, seen: PointClou
 
 
 def test_weights_without_a_model_are_asked_alone_and_it_is_said(model: Model, seen: PointCloud) -> None:
-    inspection = Inspection.of(seen, replace(model, statistical_model=None), 24)
+    inspection = inspected(seen, replace(model, statistical_model=None), None)
     assert inspection.registration is None and inspection.source == (
         "network alone: the weights carry no statistical model"
     )
@@ -117,7 +125,7 @@ def test_weights_without_a_model_are_asked_alone_and_it_is_said(model: Model, se
 
 def test_an_answer_that_is_not_taken_says_why(model: Model, seen: PointCloud, registrar: Registrar) -> None:
     stretched = PointCloud(seen.points * [1.0, 1.6, 1.0])
-    inspection = Inspection.of(stretched, model, 24, registrar=registrar)
+    inspection = inspected(stretched, model, registrar)
     assert inspection.registration is None
     assert inspection.source.startswith("network alone: the registered model (")
     assert inspection.source.endswith("of the observed points, too few")
@@ -247,7 +255,7 @@ def test_while_a_slider_moves_the_modes_alone_are_fitted(model: Model) -> None:
 
 
 def test_sliders_of_modes_move_the_model(states: StatisticalModel) -> None:
-    freedom = ModeShapes(states, np.where(np.arange(states.count) == 1, 4.2, 0.5))
+    freedom = ModeShapes("rope", states, np.where(np.arange(states.count) == 1, 4.2, 0.5))
     shape = freedom.first(7)
     sliders = freedom.parameters(shape)
     assert [slider.name for slider in sliders] == [f"mode {number}" for number in range(1, 11)]
@@ -265,7 +273,7 @@ def test_sliders_of_modes_move_the_model(states: StatisticalModel) -> None:
 
 @pytest.mark.slow
 def test_a_modes_state_is_seen_and_rebuilt(states: StatisticalModel, model: Model) -> None:
-    freedom = ModeShapes(states, states.library[4].astype(np.float64))
+    freedom = ModeShapes("rope", states, states.library[4].astype(np.float64))
     laboratory = Laboratory(load_scene("rope"), model, shapes=freedom)
     view = laboratory.look(freedom.first(0), laboratory.first_place())
     assert laboratory.rebuild(view, 16, 12).scores.iou > 0.5

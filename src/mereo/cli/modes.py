@@ -56,7 +56,7 @@ def _model_of(scene: str, states: int) -> tuple[str, StatisticalModel]:
     if states < LEAST_STATES:
         raise ValueError(f"{states} states are asked for; fewer than {LEAST_STATES} say little: leave --states out")
     loaded = load_scene(scene)
-    return loaded.name, scene_model(loaded, states)
+    return loaded.name, scene_model(loaded, states, quiet=False)
 
 
 def _table(name: str, model: StatisticalModel) -> Table:

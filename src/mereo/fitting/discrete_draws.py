@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mereo.fitting.playback import SMOOTH, Drawn, shares_of
-from mereo.scenes.draw_recorder import Call, OutOfDraws, Recorder
+from mereo.fitting.playback import Drawn, shares_of
+from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder
 from mereo.scenes.given_draws import played_back
 from mereo.scenes.parameters import play
 from mereo.scenes.scene import Scene

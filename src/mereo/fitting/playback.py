@@ -16,7 +16,7 @@ from scipy.special import ndtr, ndtri
 from mereo.deformation.maps import Deformation
 from mereo.deformation.moving_least_squares import Anchors, PointWeights, spread
 from mereo.geometry.procrustes import best_rotations
-from mereo.scenes.draw_recorder import Call, OutOfDraws, Recorder, Shares
+from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder, Shares
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import Scene
@@ -24,9 +24,6 @@ from mereo.scenes.statistical_model import StatisticalModel, following
 
 STATES_SEED = 400_000
 """A training seed."""
-
-SMOOTH = ("uniform", "normal", "triangular")
-"""Kinds of draws that move the state continuously; the others stay as they are."""
 
 MOST = 2.0
 """Standard deviations of a draw that is guessed."""

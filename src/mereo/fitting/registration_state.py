@@ -15,12 +15,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo.fitting.answer import Answer
-from mereo.fitting.playback import SMOOTH, Drawn, material_moved, shares_of
+from mereo.fitting.playback import Drawn, material_moved, shares_of
 from mereo.fitting.register import CURE, Registrar, other_mesh
 from mereo.fitting.registration import Registration
 from mereo.fitting.state_file import FORMAT, STATE, WITNESSES, RegistrationState, StateDraws, read_state, save_state
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.scenes.draw_recorder import SMOOTH
 from mereo.scenes.given_draws import draw_names, played_back
 from mereo.scenes.parameters import Played
 from mereo.scenes.registry import load_scene

@@ -156,13 +156,18 @@ def read_state(path: str | Path) -> RegistrationState:
         content = file.read(MOST_BYTES + 1)
     if len(content) > MOST_BYTES:
         raise ValueError(f"{path} has more than {MOST_BYTES // 1024} kB; the state of a registration has a few: {CURE}")
+    return parse_state(content, str(path))
+
+
+def parse_state(content: str | bytes, name: str) -> RegistrationState:
+    """State from the content of the file ``name``; raises ``ValueError`` where it is no such state."""
     try:
         return RegistrationState.model_validate_json(content)
     except ValidationError as error:
-        raise ValueError(f"{path} is no state of a registration: {_sentence(error.errors()[0])}: {CURE}") from None
+        raise ValueError(f"{name} is no state of a registration: {said(error.errors()[0])}: {CURE}") from None
 
 
-def _sentence(problem: ErrorDetails) -> str:
+def said(problem: ErrorDetails) -> str:
     """What is wrong first, and its value."""
     place = ".".join(str(step) for step in problem["loc"])
     rule = problem["msg"].removeprefix("Value error, ").replace("Input should", "it must").replace("should", "must")

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.io.errors import readable
+from mereo.io.material_colors import material_colors
 from mereo.io.mesh_headers import check_mesh, stl_segment_name
 
 VIEWER_ROOT = "camera_frame"
@@ -75,18 +76,24 @@ def _obj_parts(path: Path) -> list[Part]:
     positions: list[list[float]] = []
     faces: list[list[int]] = []
     owners: list[tuple[str, str]] = []
-    name = {"o": "", "g": ""}
+    dyes: list[str] = []
+    name, library = {"o": "", "g": "", "usemtl": ""}, ""
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         kind, *cells = line.split() or [""]
         if kind == "v":
             positions.append([float(cell) for cell in cells[:3]])
         elif kind in name:
             name[kind] = " ".join(cells)
+        elif kind == "mtllib":
+            library = " ".join(cells)
         elif kind == "f":
             corners = [_obj_index(cell, len(positions)) for cell in cells]
             faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
             owners += [(name["o"], name["g"])] * (len(corners) - 2)
-    return _split_parts(np.asarray(positions), np.asarray(faces, dtype=np.int64), owners, path.stem)
+            dyes += [name["usemtl"]] * (len(corners) - 2)
+    known = material_colors(path, library)
+    colors = [known.get(material) for material in dyes]
+    return _split_parts(np.asarray(positions), np.asarray(faces, dtype=np.int64), owners, colors, path.stem)
 
 
 def _obj_index(cell: str, count: int) -> int:
@@ -99,9 +106,16 @@ def _obj_index(cell: str, count: int) -> int:
 
 
 def _split_parts(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], owners: list[tuple[str, str]], stem: str
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    owners: list[tuple[str, str]],
+    colors: list[Color | None],
+    stem: str,
 ) -> list[Part]:
-    """Parts of a file: one per object, or per group where there is only one object; unused vertices are left out."""
+    """Parts of a file: one per object, or per group where there is only one object; unused vertices are left out.
+
+    A part has a colour where all its faces have that one.
+    """
     level = 0 if len({key[0] for key in owners}) > 1 else 1
     labels = [key[level] or key[0] for key in owners]
     names = list(dict.fromkeys(labels))
@@ -109,9 +123,10 @@ def _split_parts(
     parts: list[Part] = []
     for i, name in enumerate(names):
         used, local = np.unique(faces[index == i], return_inverse=True)
-        parts.append(
-            (name if name and len(names) > 1 else stem, None, *merge_positions(vertices[used], local.reshape(-1, 3)))
-        )
+        worn = {color for color, label in zip(colors, labels, strict=True) if label == name}
+        color = worn.pop() if len(worn) == 1 else None
+        title = name if name and len(names) > 1 else stem
+        parts.append((title, color, *merge_positions(vertices[used], local.reshape(-1, 3))))
     return parts
 
 

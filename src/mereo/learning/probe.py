@@ -6,11 +6,12 @@ from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
+from mereo.io.progress import progress
 from mereo.learning.schedule import Rates
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
 from mereo.training.config import TrainConfig
-from mereo.training.trial import STEPS, nearest, small_dataset, timed
+from mereo.training.trial import STEPS, nearest, small_dataset, timed, trial_steps
 
 MADE_AS = GenerateConfig(sampling=SamplingConfig(uniform_fraction=0.15))
 """How examples are made: with the share of uniform queries that the schedule was measured with; the paper's is more."""
@@ -41,9 +42,11 @@ def measure(scene: str, folder: Path, recipe: TrainConfig, *, init: str, seed: i
     # with the template and 100 states, so a little too long
     generate_s = (time.monotonic() - started) / EXAMPLES / (1 + PARALLEL * (workers - 1))
     data = small_dataset(folder / "data")
-    if not init:
-        found = nearest(data, recipe, folder)
-        init = next(iter(found))
-        shown = ", ".join(f"{name} {loss:.2f}" for name, loss in found.items())
-        print(f"loss after {STEPS} steps from the weights of {shown}", flush=True)
-    return Rates(generate_s, *timed(data, replace(recipe, init=init), folder)), init
+    with progress("measure", trial_steps(compared=not init), "steps") as shown:
+        found = {} if init else nearest(data, recipe, folder, shown)
+        init = init or next(iter(found))
+        rates = Rates(generate_s, *timed(data, replace(recipe, init=init), folder, shown))
+    if found:
+        told = ", ".join(f"{name} {loss:.2f}" for name, loss in found.items())
+        print(f"loss after {STEPS} steps from the weights of {told}", flush=True)
+    return rates, init

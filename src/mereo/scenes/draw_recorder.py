@@ -31,6 +31,9 @@ Key = tuple[Place, int]
 
 Shares = Float[np.ndarray, " n"]
 
+SMOOTH = ("uniform", "normal", "triangular")
+"""Kinds of draws between whose values there is a way: they move the state continuously. The others stay as they are."""
+
 SMALLEST_SHARE = 1e-9
 """Keeps normal draws finite."""
 

@@ -29,15 +29,17 @@ class InOrder(Recorder):
         return self._shares[number]
 
 
-def played_back(scene: Scene, seed: int, shares: Sequence[np.ndarray]) -> Played:
-    """State of a scene by the shares of each call; raises ``Refused`` where the scene does not take them."""
+def played_back(
+    scene: Scene, seed: int, shares: Sequence[np.ndarray], cure: str = "register the frame again"
+) -> Played:
+    """State of a scene by the shares of each call; raises ``Refused``, with a ``cure``, where it does not take them."""
     recorder = InOrder(seed, shares)
     try:
         deformations = play(scene, recorder)
     except (OutOfDraws, ValueError):
         raise Refused(
             f"the scene {scene.name!r} does not take these {len(shares)} draws; they are of another scene, or of "
-            "another version of it: register the frame again"
+            f"another version of it: {cure}"
         ) from None
     calls = tuple(recorder.calls)
     return Played(seed, calls, deformations, {call.key: call.shares for call in calls}, {})

@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_limits
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
+from mereo.io.progress import tracked
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.principal_components import build_model
 from mereo.scenes.registry import load_scene
@@ -57,11 +58,19 @@ def state_points(
 
 
 def sample_states(
-    scene: Scene, nodes: Float[np.ndarray, "j 3"], labels: UInt8[np.ndarray, " j"], count: int, seed: int
+    scene: Scene,
+    nodes: Float[np.ndarray, "j 3"],
+    labels: UInt8[np.ndarray, " j"],
+    count: int,
+    seed: int,
+    quiet: bool = True,
 ) -> Float32[np.ndarray, "n m 3"]:
-    """Material points of random states; state i comes from (seed, i)."""
+    """Material points of random states; state i comes from (seed, i). Progress is shown unless ``quiet``."""
     return np.stack(
-        [state_points(scene.sample_state(example_rng(seed, i)), nodes, labels).astype(np.float32) for i in range(count)]
+        [
+            state_points(scene.sample_state(example_rng(seed, i)), nodes, labels).astype(np.float32)
+            for i in tracked("model", count, "states", quiet=quiet)
+        ]
     )
 
 
@@ -87,11 +96,14 @@ def states_for(examples: int) -> int:
     return min(max(examples, LEAST_STATES), STATES)
 
 
-def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED) -> StatisticalModel:
-    """Statistical model of a scene, from ``count`` states of a training seed; the same bits on any number of cores."""
+def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED, *, quiet: bool = True) -> StatisticalModel:
+    """Statistical model of a scene, from ``count`` states of a training seed; the same bits on any number of cores.
+
+    The progress of its states is shown unless ``quiet``.
+    """
     frame, scene = scene.source_frame, scene.for_seed(seed)
     nodes, labels = interior_nodes(scene.rest)
-    states = sample_states(scene, nodes, labels, count, seed)
+    states = sample_states(scene, nodes, labels, count, seed, quiet)
     with threadpool_limits(1, "blas"):  # threads add in another order
         model = build_model(scene.rest, nodes, labels, states)
     return replace(model, source_frame=frame)

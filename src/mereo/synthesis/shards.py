@@ -129,7 +129,7 @@ def generate(
     if not test and not _is_whole(output / STATISTICAL_MODEL, lambda path: load_statistical_model(path, key)):
         states = states_for(examples)
         print(f"modes of {states} random states, for registration", flush=True)
-        save_statistical_model(scene_model(loaded, states), output / STATISTICAL_MODEL, key)
+        save_statistical_model(scene_model(loaded, states, quiet=False), output / STATISTICAL_MODEL, key)
     missing = [item for item in shards if not item.is_complete(key)]
     total = sum(item.end - item.first for item in missing)
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mereo.io.progress import Progress
 from mereo.models.device import keep_freed_memory, pick_device
 from mereo.models.weights import shipped_names
 from mereo.training.config import TrainConfig
@@ -39,7 +40,13 @@ def small_dataset(folder: Path) -> Dataset:
     return Dataset.load(folder, pick_device(0))
 
 
-def nearest(data: Dataset, recipe: TrainConfig, folder: Path) -> dict[str, float]:
+def trial_steps(compared: bool) -> int:
+    """Steps of ``timed``, and before it of ``nearest`` where weights are ``compared``, as progress counts them."""
+    shipped = len(shipped_names())
+    return STEPS + (shipped + min(FINALISTS, shipped) * STEPS if compared else 0)
+
+
+def nearest(data: Dataset, recipe: TrainConfig, folder: Path, shown: Progress) -> dict[str, float]:
     """Shipped weights nearest to a dataset, the best first, each with its loss after a trial.
 
     All are compared by their loss as they are; the ``FINALISTS`` among them then by that after a trial.
@@ -48,20 +55,26 @@ def nearest(data: Dataset, recipe: TrainConfig, folder: Path) -> dict[str, float
         data: a few examples.
         recipe: of the training to come.
         folder: for what a run writes.
+        shown: progress, in steps; a comparison counts as one.
     """
-    before = {name: Trial.of(data, replace(recipe, init=name), folder).loss_now() for name in shipped_names()}
+    before = {}
+    for name in shipped_names():
+        before[name] = Trial.of(data, replace(recipe, init=name), folder).loss_now()
+        shown.advance()
     after = {}
     for name in sorted(before, key=lambda name: before[name])[:FINALISTS]:
-        after[name] = Trial.of(data, replace(recipe, init=name), folder).run().latest_loss()
+        after[name] = Trial.of(data, replace(recipe, init=name), folder).run(shown).latest_loss()
     return dict(sorted(after.items(), key=lambda item: item[1]))
 
 
-def timed(data: Dataset, recipe: TrainConfig, folder: Path) -> tuple[float, float]:
+def timed(data: Dataset, recipe: TrainConfig, folder: Path, shown: Progress) -> tuple[float, float]:
     """Seconds that an example takes in a step of training, and to be answered at all its queries.
+
+    The steps are counted by ``shown``.
 
     Raises ``ValueError`` where the weights that ``recipe`` starts from are of another architecture.
     """
-    trial = Trial.of(data, recipe, folder).run()
+    trial = Trial.of(data, recipe, folder).run(shown)
     rounds = []
     for _ in range(2):  # the first one also sets up what later ones find
         started = time.monotonic()
@@ -88,10 +101,11 @@ class Trial(Trainer):
     def say(self, text: str) -> None:
         """Print nothing: nobody waits for these steps."""
 
-    def run(self) -> "Trial":
-        """Take all steps."""
+    def run(self, shown: Progress) -> "Trial":
+        """Take all steps, each counted."""
         for batch in self.batches():
             self.train_step(batch)
+            shown.advance()
         return self
 
     def train_step(self, batch: Batch) -> None:

@@ -162,8 +162,7 @@ class Result(Answer):
         """
         from mereo.visualization.viewer.result_page import open_answer
 
-        unit = "m" if self.unit_stated and self.seen.frame.unit_m == 1.0 else ""
-        page = open_answer(self, self.seen, self.model, self.registrar, unit, port=port or 0, host=host)
+        page = open_answer(self, self.seen, self.model, self.registrar, self.unit, port=port or 0, host=host)
         return page.stay(block)
 
     def _read(self) -> list[Path]:

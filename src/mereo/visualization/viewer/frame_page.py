@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import PointCloud
+from mereo.visualization.units import UNKNOWN, Unit
 from mereo.visualization.vertex_colors import CONFIDENCE, confidence, distance_scale, observed_distance
 from mereo.visualization.viewer import html
 from mereo.visualization.viewer.display import CLOUD_COLOR, Display, SegmentControls, SegmentLayer, point_size
@@ -18,8 +19,8 @@ EMPTY_COLOR = (150, 156, 168)
 class FramePage:
     """Page that shows an ``Inspection`` and answers clicks, check boxes and sliders until its server stops."""
 
-    def __init__(self, server: Any, inspection: Inspection, title: str, facts: str, unit: str = "") -> None:
-        self.server, self.inspection, self.unit = server, inspection, f" {unit}" if unit else ""
+    def __init__(self, server: Any, inspection: Inspection, title: str, facts: str, unit: Unit = UNKNOWN) -> None:
+        self.server, self.inspection, self.unit = server, inspection, unit
         self.mesh = inspection.surfaces
         self._drawing = threading.Lock()
         scanner = not np.allclose(inspection.T_camera_input, np.eye(4))
@@ -105,8 +106,9 @@ class FramePage:
                 values, scale = confidence(self.mesh, self.inspection.network), CONFIDENCE
             else:
                 assert self.inspection.cloud is not None
-                values = observed_distance(self.mesh, self.inspection.cloud.points)
-                scale = distance_scale(values, self.unit)
+                found = observed_distance(self.mesh, self.inspection.cloud.points)
+                values = [value * self.unit.length_factor for value in found]
+                scale = distance_scale(values, f" {self.unit.length_name}")
             self._painted[mode] = [scale.colors(value) for value in values], html.color_bar(scale)
         return self._painted[mode]
 
@@ -142,7 +144,7 @@ class FramePage:
         """Say what is known of a place of the input's frame, and draw the way to the nearest surface."""
         answer = self.inspection.ask(place[None])
         colors = (EMPTY_COLOR, *self.inspection.colors)
-        self.told.content = html.answer(answer, self.inspection.names, colors, tuple(place), self.unit)
+        self.told.content = html.answer(answer, self.inspection.names, colors, place, self.unit)
         distance, direction = float(answer.distance[0]), answer.direction[0]
         if np.isnan(distance) or np.isnan(direction).any():
             return

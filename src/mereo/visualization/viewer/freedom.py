@@ -3,6 +3,7 @@
 shape -parameters-> sliders -moved-> another shape -state-> State (mesh, deformations)
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -12,8 +13,10 @@ from jaxtyping import Float
 from mereo.deformation.draw_names import DrawName
 from mereo.fitting.registration import SegmentMotion
 from mereo.scenes.parameters import Parameter, Played, parameters, random_state, set_value
+from mereo.scenes.rounds import at_rest, blend, smooth_round
 from mereo.scenes.scene import Scene, State
 from mereo.scenes.statistical_model import StatisticalModel
+from mereo.visualization.viewer import state_text
 
 Shape = TypeVar("Shape")
 
@@ -42,6 +45,18 @@ class Freedom(Protocol[Shape]):
 
     def state(self, shape: Shape) -> State:
         """The segments of the shape, in the scene's frame."""
+
+    def rest(self, shape: Shape) -> Shape:
+        """The shape nearest to the object at rest, coming from another one."""
+
+    def walk(self, shape: Shape, seed: int, count: int) -> Iterator[Shape]:
+        """Shapes of a smooth walk of ``count`` steps at most, which ends where it began."""
+
+    def text(self, shape: Shape) -> str:
+        """The shape as text, for ``read``."""
+
+    def read(self, text: str) -> Shape:
+        """The shape that a text says, its own or a ``state.json``; raises ``ValueError`` where it says none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +91,34 @@ class DrawnShapes:
         """The state that the scene has played."""
         return self.scene.deform(shape.deformations)
 
+    def rest(self, shape: Played) -> Played:
+        """The object at rest; sliders stay where they are, because no draws of most scenes lead there."""
+        return at_rest(self.scene, shape)
+
+    def walk(self, shape: Played, seed: int, count: int) -> Iterator[Played]:
+        """Round of all smooth draws, without states that the scene refuses."""
+        return smooth_round(self.scene, shape, seed, count)
+
+    def text(self, shape: Played) -> str:
+        """The draws as shares, in the order of the calls."""
+        return state_text.of_draws(self.scene, shape)
+
+    def read(self, text: str) -> Played:
+        """The state that the scene plays with the draws of a text."""
+        return state_text.to_draws(self.scene, text)
+
 
 @dataclass(frozen=True, eq=False)
 class ModeShapes:
     """Freedom of a statistical model's modes. Satisfies ``Freedom``.
 
     Attributes:
+        scene: name of the object's.
         model: whose modes are moved.
         start: coefficients that are shown first.
     """
 
+    scene: str
     model: StatisticalModel
     start: Float[np.ndarray, " k"]
 
@@ -113,6 +146,23 @@ class ModeShapes:
         material = self.model.material(shape)
         motions = tuple(SegmentMotion(anchors, material) for anchors in self.model.rest_anchors)
         return State(self.model.mesh(material), motions)
+
+    def rest(self, shape: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Coefficients nearest to the rest pose."""
+        return self.model.rest_z
+
+    def walk(self, shape: Float[np.ndarray, " k"], seed: int, count: int) -> Iterator[Float[np.ndarray, " k"]]:
+        """Straight way to a random state and back: a round as of draws would stretch the object on its far side."""
+        other = self.random(seed)
+        return (shape + share * (other - shape) for share in blend(count))
+
+    def text(self, shape: Float[np.ndarray, " k"]) -> str:
+        """The coefficients, and whose."""
+        return state_text.of_modes(self.scene, self.model, shape)
+
+    def read(self, text: str) -> Float[np.ndarray, " k"]:
+        """The coefficients of a text that belong to this model."""
+        return state_text.to_modes(self.scene, self.model, text)
 
 
 def _mode_slider(number: int, value: float) -> Parameter:

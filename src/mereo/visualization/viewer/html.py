@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from html import escape
 
 import numpy as np
+from jaxtyping import Float
 
 from mereo.evaluation.metrics import Scores, format_score
 from mereo.geometry.mesh import Color
+from mereo.visualization.units import Unit, rounded
 from mereo.visualization.vertex_colors import ColorScale
 from mereo.visualization.viewer.probe import Probed
 
@@ -82,17 +84,22 @@ def scores(found: Scores, names: Sequence[str], colors: Sequence[Color]) -> str:
     return head + bars(rows)
 
 
-def answer(found: Probed, names: Sequence[str], colors: Sequence[Color], place: Sequence[float], unit: str) -> str:
+def answer(
+    found: Probed, names: Sequence[str], colors: Sequence[Color], place: Float[np.ndarray, "3"], unit: Unit
+) -> str:
     """Facts about one place: its segment, the network's likeliest classes, distance, direction, and where it rests."""
     label, distance, direction = int(found.label[0]), float(found.distance[0]), found.direction[0]
-    where = "inside" if distance < 0 else "outside"
-    said = "distance not trained" if np.isnan(distance) else f"{abs(distance):.3g}{unit} {where} the nearest surface"
+    side = "inside" if distance < 0 else "outside"
+    said = (
+        "distance not trained" if np.isnan(distance) else _length(abs(distance), unit) + f" {side} the nearest surface"
+    )
     if abs(distance) <= NOTHING * float(np.abs(place).max()):
         said = "on the surface"
     toward = "" if np.isnan(direction).any() else f"towards {_vector(direction.tolist())}"
     rest = "" if found.rest is None else f"<br>at rest at {_vector(found.rest[0].tolist())} scene units"
+    where = f"at {unit.place(place)} {unit.length_name}"
     return (
-        f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">at {_vector(place)}{unit}</span></div>'
+        f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">{where}</span></div>'
         f'{_likeliest(found, names, colors)}<div style="{BOX}">{escape(said)}<br><span style="{SOFT}">{toward}{rest}'
         "</span></div>"
     )
@@ -105,6 +112,11 @@ def _likeliest(found: Probed, names: Sequence[str], colors: Sequence[Color]) -> 
     order = np.argsort(-found.probability[0], kind="stable")[:4]
     shown = bars([(names[k], colors[k], float(found.probability[0, k])) for k in order])
     return shown if found.rest is None else f'<div style="{BOX};{SOFT}">the network says</div>{shown}'
+
+
+def _length(value: float, unit: Unit) -> str:
+    """Length of the input's frame, with its unit."""
+    return f"{rounded(value * unit.length_factor)} {unit.length_name}"
 
 
 def _vector(values: Sequence[float]) -> str:

@@ -4,25 +4,31 @@ Hands only leave wishes; one thread (``LatestWins``) fulfils them, so that the p
 """
 
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.scenes.parameters import Parameter, Refused
 from mereo.visualization.viewer import html
 from mereo.visualization.viewer.display import SegmentControls
+from mereo.visualization.viewer.film import Film, picture
 from mereo.visualization.viewer.lab_stage import COLORINGS, SHOWN, LabStage, Moment
+from mereo.visualization.viewer.lab_tools import LabTools, Ties
 from mereo.visualization.viewer.laboratory import Laboratory, Trial, depth_picture
 from mereo.visualization.viewer.latest_request import LatestWins
-from mereo.visualization.viewer.sliders import CameraSliders, ParameterSliders
+from mereo.visualization.viewer.sliders import CameraSliders, ParameterSliders, SensorControls
+from mereo.visualization.viewer.wishes import Wishes
+
+PICTURE = 288
+"""Width of the depth image on the page in pixels, at least."""
 
 QUICK, FINE = (32, 24), (96, 64)
 """Resolution of surfaces and cells of the score, while a slider moves and when it rests."""
 
 HISTORY = 60
-"""Scores that the curve, and changes that "Undo" remembers."""
+"""Scores that the curve remembers."""
 
 
 class LabPage:
@@ -30,16 +36,9 @@ class LabPage:
 
     def __init__(self, server: Any, laboratory: Laboratory, title: str, facts: str, seed: int = 0) -> None:
         self.server, self.laboratory = server, laboratory
-        self._drawing, self._wishing = threading.Lock(), threading.Lock()
-        self._seeds = np.random.default_rng(seed)
-        self._wishes: dict[tuple[Any, int | None], tuple[Parameter, float]] = {}
-        self._first_seed = seed
-        self._new_seed: int | None = None
-        self._back = False
-        self._past: list[Any] = []
-        self._hand: frozenset[Any] = frozenset()
+        self._drawing = threading.Lock()
+        self.wishes: Wishes[Any] = Wishes(laboratory.freedom, seed)
         self._scores: list[tuple[float, float]] = []
-        self.shape: Any = None
         self.moment: Moment | None = None
         rest = laboratory.scene.rest
         self.stage = LabStage(server, laboratory)
@@ -61,7 +60,7 @@ class LabPage:
         panel.set_width(300)
         with panel.add_tab("What the camera sees"):
             gui.add_html(html.heading(title, facts))
-            self._picture = gui.add_image(np.zeros((288, 288, 3), dtype=np.uint8), format="png")
+            self._picture = gui.add_image(np.zeros((PICTURE, PICTURE, 3), dtype=np.uint8), format="png")
             self._source = gui.add_html("")
             self._score = gui.add_html("")
             axes = ({"show": False}, {"stroke": "#9aa3b2", "grid": {"stroke": "rgba(150,160,175,.18)"}, "size": 34})
@@ -95,12 +94,19 @@ class LabPage:
         # white points would hide the colours that are looked at
         self._coloring.on_update(lambda _: setattr(self._points, "value", self._coloring.value == "segment"))
         self._shown.on_update(lambda _: self._look())
-        gui.add_button("Random state").on_click(lambda _: self._wish_anew())
+        gui.add_button("Random state").on_click(lambda _: self.wish(self.wishes.anew))
+        hint = "The object undeformed. Where no draws lead there, sliders stay, and the next move goes on from them."
+        gui.add_button("Rest state", hint=hint).on_click(lambda _: self.wish(self.wishes.rest))
         self._undo = gui.add_button("Undo", disabled=True)
-        self._undo.on_click(lambda _: self._wish_back())
+        self._undo.on_click(lambda _: self.wish(self.wishes.back))
         with gui.add_folder("Camera"):
-            self._camera = CameraSliders(gui, self.laboratory, lambda: self.worker.submit(None))
-        self._sliders = ParameterSliders(gui, gui.add_folder("Deformation"), self._wish)
+            self._camera = CameraSliders(gui, self.laboratory, self.wish)
+        with gui.add_folder("Sensor", expand_by_default=False):
+            self.sensor = SensorControls(gui, self.wish)
+        move = self.wishes.move
+        self._sliders = ParameterSliders(gui, gui.add_folder("Deformation"), lambda *to: self.wish(lambda: move(*to)))
+        ties = Ties(self._say, lambda: self.moment, self.take, lambda: self.wish(self.wishes.walk))
+        self.tools = LabTools(self.server, self.laboratory, ties)
         self.controls = SegmentControls(gui, rest, self._draw)
 
     def _look(self, name: str = "camera") -> None:
@@ -118,62 +124,38 @@ class LabPage:
 
     # --- wishes -------------------------------------------------------------------------------------------------------
 
-    def _wish(self, parameter: Parameter, value: float) -> None:
-        with self._wishing:
-            self._wishes[parameter.key, parameter.index] = (parameter, value)
+    def wish(self, ask: Callable[[], None] = lambda: None) -> None:
+        """Ask for something, and have the worker see to it."""
+        ask()
         self.worker.submit(None)
 
-    def _wish_anew(self) -> None:
-        with self._wishing:
-            self._new_seed = int(self._seeds.integers(2**31))
-        self.worker.submit(None)
-
-    def _wish_back(self) -> None:
-        with self._wishing:
-            self._wishes, self._new_seed, self._back = {}, None, True
-        self.worker.submit(None)
-
-    def _remember(self, hand: frozenset[Any]) -> None:
-        """Keep the shape that is about to change; what one slider does until another hand moves is one change."""
-        if self.shape is not None and (hand != self._hand or not hand):
-            self._past = [*self._past, self.shape][-HISTORY:]
-        self._hand = hand
-
-    def _fulfil(self) -> tuple[Any, Refused | None]:
-        """The shape that is wished for. Values that are refused are left out, and the last of them is told."""
-        with self._wishing:
-            wishes, hand, seed, back = list(self._wishes.values()), frozenset(self._wishes), self._new_seed, self._back
-            self._wishes, self._new_seed, self._back = {}, None, False
-        freedom, refusal = self.laboratory.freedom, None
-        if back and self._past:
-            *self._past, shape = self._past
-            self._hand = frozenset()
-            return shape, None
-        if seed is not None:
-            self._remember(frozenset())
-            return freedom.random(seed), None
-        shape = freedom.first(self._first_seed) if self.shape is None else self.shape
-        for parameter, value in wishes:
-            try:
-                shape = freedom.moved(shape, parameter, value)
-            except Refused as error:
-                refusal = error
-        if shape is not self.shape and wishes:
-            self._remember(hand)
-        return shape, refusal
+    def take(self, text: str) -> None:
+        """Show the state that a text says; raises ``ValueError`` where it says none."""
+        self.wish(lambda: self.wishes.take(text))
 
     # --- the worker's thread ------------------------------------------------------------------------------------------
 
     def _quick(self, _: None) -> None:
-        self.shape, refusal = self._fulfil()
-        self._undo.disabled = not self._past
-        self._sliders.show(self.laboratory.freedom.parameters(self.shape))
-        view, is_first = self.laboratory.look(self.shape, self._camera.place()), self.moment is None
+        try:
+            self._show()
+        finally:  # the way goes on after a state that the camera cannot see
+            if self.wishes.is_walking:
+                self.worker.submit(None)
+
+    def _show(self) -> None:
+        refusal = self.wishes.fulfil()
+        shape, freedom = self.wishes.shape, self.laboratory.freedom
+        self._undo.disabled = not self.wishes.can_go_back
+        self._sliders.show(freedom.parameters(shape))
+        self.tools.show_text(freedom.text(shape))
+        view, is_first = self.laboratory.look(shape, self._camera.place(), self.sensor.sensing()), self.moment is None
+        self.sensor.tell(view.hidden)
         self.moment = Moment(view)
         if is_first:
             self._look()
-        self._picture.image = depth_picture(view.depth, 3)
+        self._picture.image = depth_picture(view.depth, max(1, PICTURE // view.depth.camera.width))
         self._rebuild(*QUICK, quick=True)
+        self.tools.shoot(self._shoot)
         if refusal is not None:
             raise refusal
 
@@ -191,6 +173,12 @@ class LabPage:
             self._tell(trial)
         self._draw()
 
+    def _shoot(self, film: Film) -> None:
+        assert self.moment is not None
+        meshes, points = self.stage.shown(self.moment, self._shown.value, self.controls)
+        seen = points if self._points.value else points[:0]
+        film.add(picture(film.view, meshes, seen, depth_picture(self.moment.view.depth)))
+
     def _failed(self, error: Exception) -> None:
         self._say(" ".join(str(error).split()) or type(error).__name__, bad=True)
         self._draw()
@@ -201,14 +189,14 @@ class LabPage:
         self._status.content = html.message(text, bad)
 
     def _tell(self, trial: Trial) -> None:
-        surfaces = trial.result.surfaces
+        surfaces = trial.reconstruction.surfaces
         self._score.content = html.scores(trial.scores, surfaces.names, surfaces.colors)
         self._scores = [*self._scores, (trial.scores.iou, trial.scores.miou)][-HISTORY:]
         if len(self._scores) > 1:
             columns = np.array(self._scores).T
             self._curve.data = (np.arange(len(self._scores), dtype=float), columns[0], columns[1])
             self._curve.visible = True
-        resolution = int(max(trial.result.labels.labels.shape)) - 1
+        resolution = int(max(trial.reconstruction.labels.labels.shape)) - 1
         self._source.content = html.message(trial.source)
         self._say(f"{resolution} cells in {trial.seconds:.2f} s; scored on {trial.cells}³ points")
 

@@ -23,6 +23,7 @@ from mereo.visualization.vertex_colors import (
 )
 from mereo.visualization.viewer.display import CLOUD_COLOR, Display, SegmentLayer, Shown, point_size
 from mereo.visualization.viewer.laboratory import Laboratory, Trial, depth_picture
+from mereo.visualization.viewer.sight import Sight
 
 SHOWN = ("reconstruction", "truth", "side by side")
 COLORINGS = ("segment", "error", "confidence", "distance")
@@ -37,7 +38,7 @@ UNDER = 0.12
 class Moment:
     """Moment that the page shows: a state as it is seen, and what has been made of that so far."""
 
-    view: View
+    view: Sight
     trial: Trial | None = None
 
 
@@ -73,7 +74,7 @@ class LabStage:
         if moment.trial is None or mode == "truth":
             self.found.clear_from()
             return None
-        surfaces = moment.trial.result.surfaces
+        surfaces = moment.trial.reconstruction.surfaces
         if both:
             self._name("reconstruction", surfaces, moment.view, -aside)
             self._name("truth", truth, moment.view, aside)
@@ -81,6 +82,26 @@ class LabStage:
         colors, scale = (None, None) if painted is None else painted
         self.found.show(surfaces.transformed(T_world_camera), shown, colors, -aside)
         return scale
+
+    def shown(self, moment: Moment, mode: str, shown: Shown) -> tuple[list[SegmentedMesh], Float[np.ndarray, "n 3"]]:
+        """Meshes and observed points as ``draw`` puts them on the stage, in the segments' own colours."""
+        T_world_camera = moment.view.T_world_camera
+        aside = (ASIDE if mode == "side by side" else 0.0) * T_world_camera[:3, 0]
+        found = None if moment.trial is None or mode == "truth" else moment.trial.reconstruction.surfaces
+        meshes = [(found, -aside)] if found is not None else []
+        meshes += [(moment.view.mesh, aside)] if found is None or mode != "reconstruction" else []
+        points = self.stage.place(transform_points(T_world_camera, moment.view.depth.to_points().points)) - aside
+        return [self._staged(mesh, T_world_camera, shift, shown) for mesh, shift in meshes], points
+
+    def _staged(
+        self, mesh: SegmentedMesh, T: Float[np.ndarray, "4 4"], shift: Float[np.ndarray, "3"], shown: Shown
+    ) -> SegmentedMesh:
+        """Visible segments of a mesh of the camera's frame, on the stage."""
+        chosen = [s for s, visible in zip(mesh.segments, shown.visible(), strict=True) if visible and len(s.faces)]
+        names = {segment.name for segment in chosen}
+        nested = tuple(pair for pair in mesh.nested if names.issuperset(pair))
+        moved = SegmentedMesh(tuple(chosen), nested).transformed(T) if chosen else SegmentedMesh(())
+        return moved.with_vertices([self.stage.place(segment.vertices) + shift for segment in moved.segments])
 
     def _clear_names(self) -> None:
         for name in self._names:
@@ -125,7 +146,7 @@ class LabStage:
 
     def _colors(self, mode: str, view: View, trial: Trial) -> tuple[list[UInt8[np.ndarray, "_ 3"]], ColorScale] | None:
         """Colours of the reconstruction's vertices, and their scale; None for the segments' own."""
-        surfaces = trial.result.surfaces
+        surfaces = trial.reconstruction.surfaces
         if mode == "segment":
             return None
         scale: ColorScale
@@ -133,7 +154,10 @@ class LabStage:
             values, scale = surface_error(surfaces, Solids(view.mesh)), error_scale(view.mesh, "")
         elif mode == "confidence":
             assert self.laboratory.model is not None
-            values, scale = confidence(surfaces, partial(self.laboratory.model.query, trial.result.code)), CONFIDENCE
+            values, scale = (
+                confidence(surfaces, partial(self.laboratory.model.query, trial.reconstruction.code)),
+                CONFIDENCE,
+            )
         else:
             values = observed_distance(surfaces, view.depth.to_points().points)
             scale = distance_scale(values, "")

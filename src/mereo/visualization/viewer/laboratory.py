@@ -1,12 +1,12 @@
 """Laboratory of a scene: any state, seen by any camera of its workspace, reconstructed and compared with the truth.
 
-    shape (see ``freedom``), CameraPlace -look-> View -rebuild-> Trial (default answer, scores)
+    shape (see ``freedom``), CameraPlace, Sensing -look-> Sight -rebuild-> Trial (default answer, scores)
 
 No page is needed for it; ``mereo.visualization.viewer`` puts sliders to it.
 """
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +17,6 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scoring import check_names, predict_grid
-from mereo.fitting.answer import answer
 from mereo.fitting.fit import ModesFit
 from mereo.fitting.register import Registrar, registrar_for
 from mereo.fitting.registration import Registration
@@ -28,11 +27,12 @@ from mereo.geometry.transforms import inverse_rigid
 from mereo.models.model import Model
 from mereo.reconstruction.pipeline import Reconstruction, segment_names
 from mereo.scenes.scene import Scene
-from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View
+from mereo.visualization.answering import answer
+from mereo.visualization.result import Result
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom
 from mereo.visualization.viewer.probe import source_of
+from mereo.visualization.viewer.sight import Sensing, Sight, see
 
 NEAR: tuple[int, int, int] = (255, 236, 190)
 FAR: tuple[int, int, int] = (38, 30, 84)
@@ -59,21 +59,26 @@ class CameraPlace:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Reconstruction of a view, and how good it is.
+    """Answer to a view, and how good it is.
 
     Attributes:
-        result: in the camera frame.
+        result: in the camera frame, as `mereo reconstruct` gives it.
         source: where it comes from, in a phrase.
         scores: against the truth, on ``cells`` ** 3 cells.
         cells: the paper takes 100; fewer are faster and a little off.
         seconds: of the reconstruction.
     """
 
-    result: Reconstruction
+    result: Result
     source: str
     scores: Scores
     cells: int
     seconds: float
+
+    @property
+    def reconstruction(self) -> Reconstruction:
+        """Segments that were found."""
+        return self.result.reconstruction
 
 
 class QuickRegistrar(Registrar):
@@ -91,7 +96,6 @@ class Laboratory:
     Attributes:
         scene: the object, and where its camera may be.
         model: the weights.
-        settings: how a frame is made.
         shapes: what the sliders move; the scene's own draws by default.
 
     Raises ``ValueError`` for a model of another object.
@@ -99,7 +103,6 @@ class Laboratory:
 
     scene: Scene
     model: Model | None
-    settings: GenerateConfig = field(default_factory=GenerateConfig)
     shapes: Freedom[Any] | None = None
 
     def __post_init__(self) -> None:
@@ -122,10 +125,8 @@ class Laboratory:
         full = self.registrar
         return None if full is None else QuickRegistrar(full.network, full.model, full.choice, full.given)
 
-    @property
-    def camera(self) -> Camera:
-        """Virtual depth camera of the scene's workspace."""
-        size = self.settings.image_size
+    def camera(self, size: int) -> Camera:
+        """Virtual depth camera of the scene's workspace, of so many pixels a side."""
         return Camera.from_fov(size, size, self.scene.workspace.fov_rad)
 
     def first_place(self) -> CameraPlace:
@@ -144,43 +145,47 @@ class Laboratory:
         cosine = float(np.cos(place.tilt_rad))
         return self.scene.workspace.pose(target, cosine, place.azimuth_rad, place.distance, place.roll_rad)
 
-    def look(self, shape: Any, place: CameraPlace) -> View:
-        """Shape of ``freedom`` as the camera sees it; noise is the same every time, so that pictures do not flicker.
+    def look(self, shape: Any, place: CameraPlace, sensing: Sensing = Sensing()) -> Sight:  # noqa: B008 (frozen)
+        """Shape of ``freedom`` as a camera at this place gives it.
 
         Raises ``ValueError`` where fewer than ``MIN_POINTS`` points of the object are seen.
         """
         state = self.freedom.state(shape)
         T_world_camera = self.pose(state.mesh.bounds.mean(axis=0), place)
         mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
-        rng = np.random.default_rng(0)
-        seen = observe(Solids(mesh), self.camera, self.settings.noise_std, self.settings.sensor, rng)
+        seen, hidden = see(Solids(mesh), self.camera(sensing.image_size), sensing)
         if seen.object_points < MIN_POINTS:
             raise ValueError(
                 f"the camera sees {seen.object_points} points of the object; at least {MIN_POINTS} are needed: move "
-                "the camera"
+                "the camera, or give it a larger image"
             )
-        return View(mesh, seen.image, T_world_camera, state.deformations)
+        return Sight(mesh, seen.image, T_world_camera, state.deformations, hidden)
 
-    def rebuild(self, view: View, resolution: int, cells: int, quick: bool = False) -> Trial:
-        """Answer to what is seen, as `mereo reconstruct` gives it, scored on a grid of ``cells`` cells a side.
+    def answer(self, view: View, resolution: int = 128, quick: bool = False) -> Result:
+        """Answer to what is seen, as `mereo reconstruct` gives it.
 
         ``quick`` never fits the scene's own draws, which takes seconds. Raises ``ValueError`` without a model, and
         where the model finds nothing.
         """
         if self.model is None:
             raise ValueError("there are no weights; a reconstruction needs them: name them with --weights")
-        cloud, registrar = view.depth.to_points(), self.quick_registrar if quick else self.registrar
+        registrar = self.quick_registrar if quick else self.registrar
+        return answer(view.depth, self.model, registrar or "off", resolution, unit_m=self.scene.unit_m)
+
+    def rebuild(self, view: View, resolution: int, cells: int, quick: bool = False) -> Trial:
+        """Answer to what is seen, scored on a grid of ``cells`` cells a side; raises as ``answer`` does."""
         start = time.perf_counter()
-        found = answer(cloud, self.model, registrar, resolution)
+        result = self.answer(view, resolution, quick)
         seconds = time.perf_counter() - start
+        assert self.model is not None
         truth = truth_grid(view.mesh, cells)
-        if found.taken:
-            predicted = label_grid(found.reconstruction.surfaces, *truth.grid.axes())
+        if result.taken:
+            predicted = label_grid(result.reconstruction.surfaces, *truth.grid.axes())
         else:
-            predicted = predict_grid(self.model, found.reconstruction.code, truth)
+            predicted = predict_grid(self.model, result.reconstruction.code, truth)
         confusion = grid_confusion(truth, predicted, len(segment_names(self.model)[0]))
         scores = intersection_over_union(confusion, self.model.segmented)
-        return Trial(found.reconstruction, source_of(found, registrar), scores, cells, seconds)
+        return Trial(result, source_of(result, result.registrar), scores, cells, seconds)
 
 
 def depth_picture(depth: DepthImage, factor: int = 1) -> UInt8[np.ndarray, "h w 3"]:

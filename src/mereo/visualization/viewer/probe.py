@@ -6,11 +6,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.fitting.answer import Answer as FrameAnswer
-from mereo.fitting.answer import answer
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
@@ -57,22 +55,6 @@ class Inspection:
     cloud: PointCloud | None = None
     code: EncodedCloud | None = None
     registration: Registration | None = None
-
-    @classmethod
-    def of(
-        cls,
-        cloud: PointCloud,
-        model: Model,
-        resolution: int = 128,
-        frame: CloudAxes = "camera",
-        registrar: Registrar | None = None,
-        unit_m: float | None = None,
-        keep_all: bool = False,
-    ) -> "Inspection":
-        """Default answer to a cloud of a unit of ``unit_m`` metres; raises as ``fitting.answer.answer`` does."""
-        stated = None if registrar is None or unit_m is None else registrar.stated_unit(unit_m)
-        found = answer(cloud, model, registrar, resolution, frame, stated_unit=stated, keep_all=keep_all)
-        return cls.of_answer(found, model, registrar)
 
     @classmethod
     def of_answer(cls, found: FrameAnswer, model: Model, registrar: Registrar | None) -> "Inspection":

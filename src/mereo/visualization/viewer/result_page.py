@@ -4,6 +4,7 @@ from mereo.fitting.answer import Answer
 from mereo.fitting.register import Registrar
 from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
+from mereo.visualization.units import Unit
 from mereo.visualization.viewer.display import import_viser, start_server
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.guard import Entry
@@ -12,9 +13,9 @@ from mereo.visualization.viewer.probe import Inspection
 
 
 def open_answer(
-    found: Answer, seen: Observation, model: Model, registrar: Registrar | None, unit: str, *, port: int, host: str
+    found: Answer, seen: Observation, model: Model, registrar: Registrar | None, unit: Unit, *, port: int, host: str
 ) -> OpenPage:
-    """Page of an answer, on the frame that it was given to; ``unit`` is what its lengths are called.
+    """Page of an answer, on the frame that it was given to; ``unit`` is that of its lengths.
 
     Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
     """

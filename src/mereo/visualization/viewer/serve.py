@@ -1,28 +1,27 @@
 """``mereo view``: load what is to be shown, and open its page."""
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mereo.evaluation.sample_views import load_view, shipped_views
-from mereo.fitting.register import registrar_for, statistical_model_of
+from mereo.evaluation.sample_views import load_frame, shipped_views
+from mereo.fitting.register import statistical_model_of
 from mereo.fitting.registration_state import played_state, restored
 from mereo.fitting.state_file import RegistrationState, is_state, read_state
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
-from mereo.io.sensor_frame import read_frame
+from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import find_weights, load_for, shipped_names
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import find_object
+from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
+from mereo.visualization.answering import answer
 from mereo.visualization.result import Result
+from mereo.visualization.units import UNKNOWN, Unit
 from mereo.visualization.viewer.display import import_viser, start_server
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom, ModeShapes
@@ -31,30 +30,10 @@ from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.open_page import OpenPage, is_interactive
 from mereo.visualization.viewer.probe import Inspection
+from mereo.visualization.viewer.result_page import open_answer
 
 PORT = 8080
 """Port of the page where none is chosen."""
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """Frame to be shown: what was seen of the object, its axes, and metres per unit where they are known."""
-
-    cloud: PointCloud
-    title: str
-    axes: CloudAxes
-    unit_m: float | None
-
-    @classmethod
-    def read(cls, path: Path, reading: InputConfig | None, isolation: IsolationConfig | None) -> "Frame":
-        """Frame of a file, without what is not the object."""
-        read = read_frame(path, reading or InputConfig())
-        return cls(find_object(read, isolation or IsolationConfig()).cloud, read.source, read.axes, read.unit_m)
-
-    @property
-    def unit(self) -> str:
-        """Name of the unit, or "" where it is not metres."""
-        return "m" if self.unit_m == 1.0 else ""
 
 
 def view(
@@ -127,22 +106,17 @@ def view_frame(
                 f"there is no frame to show and none is shipped for {name!r}; name a depth image or a point cloud, or "
                 f"take the weights of a shipped frame: {', '.join(shipped_views())}"
             )
-        frame, weights = Frame(load_view(name).depth.to_points(), f"{name}, shipped frame", "camera", None), name
+        frame, weights = load_frame(name), name
     elif weights is None:
         raise ValueError(
             f"{input} is given without weights; the model of its object is needed: give --weights, a file or one of "
             f"{', '.join(shipped_names())}"
         )
     else:
-        frame = Frame.read(input, reading, isolation)
+        frame = read_frame(input, reading or InputConfig())
     model = load_for(weights, inference or InferenceConfig())
-    registrar = registrar_for(model, "auto")
-    keep_all = isolation is not None and isolation.keep_all
-    inspection = Inspection.of(frame.cloud, model, resolution, frame.axes, registrar, frame.unit_m, keep_all)
-    entry = Entry.of(host)
-    server = start_server(port, "mereo", entry)
-    FramePage(server, inspection, frame.title, f"{len(frame.cloud):,} points · weights {weights}", frame.unit)
-    return OpenPage(server, entry)
+    result = answer(frame, model, "auto", resolution, isolation=isolation)
+    return open_answer(result, result.seen, model, result.registrar, result.unit, port=port, host=host)
 
 
 def view_state(
@@ -159,7 +133,8 @@ def view_state(
     """Show a registration by its state (a file, or a folder of results), with its frame where ``input`` names it."""
     import_viser()
     state = read_state(path)
-    frame = None if input is None else Frame.read(input, reading, isolation)
+    seen = None if input is None else _seen(input, reading, isolation)
+    frame = None if seen is None else seen.frame
     if frame is not None and (frame.axes, frame.unit_m) != (state.frame, state.unit_m):
         raise ValueError(
             f"{input} is read with {frame.axes} axes and {frame.unit_m:g} m per unit, but the state has {state.frame} "
@@ -168,13 +143,29 @@ def view_state(
     weights = weights_of(state, weights)
     model = load_for(weights, inference or InferenceConfig())
     registration = restored(state, statistical_model_of(model))
-    cloud = None if frame is None else frame.cloud
+    cloud = None if seen is None else seen.cloud
     inspection = Inspection.of_registration(registration, model, np.array(state.T_camera_input), cloud)
     entry = Entry.of(host)
     server = start_server(port, "mereo", entry)
-    title = str(path) if frame is None else frame.title
-    FramePage(server, inspection, title, f"{state.scene} · weights {weights}", "m" if state.unit_m == 1.0 else "")
+    title = str(path) if frame is None else frame.source
+    FramePage(server, inspection, title, f"{state.scene} · weights {weights}", unit_of(state, frame))
     return OpenPage(server, entry)
+
+
+def _seen(path: Path, reading: InputConfig | None, isolation: IsolationConfig | None) -> Observation:
+    """The object in a file's frame."""
+    return find_object(read_frame(path, reading or InputConfig()), isolation or IsolationConfig())
+
+
+def unit_of(state: RegistrationState, frame: SensorFrame | None) -> Unit:
+    """Unit of a state's lengths, where it is known: its frame's, else its own.
+
+    A state does not say whether its metres were stated or assumed; those of a true size, or of another unit than 1 m,
+    were not assumed.
+    """
+    if frame is not None:
+        return Unit(frame.unit_m) if frame.unit_stated else UNKNOWN
+    return Unit(state.unit_m) if state.unit_known or state.unit_m != 1.0 else UNKNOWN
 
 
 def view_scene(
@@ -216,7 +207,7 @@ def shapes_of(state: RegistrationState, scene: Scene, model: Model | None) -> Fr
             f"the state is one of the modes of weights {state.weights!r}, which are needed: name them with --weights"
         )
     registration = restored(state, statistical_model_of(model))
-    return ModeShapes(registration.model, registration.z)
+    return ModeShapes(scene.name, registration.model, registration.z)
 
 
 def weights_of(state: RegistrationState, weights: str | None) -> str:

@@ -1,4 +1,4 @@
-"""Sliders for degrees of freedom, kept in step with the state, and for the camera."""
+"""Sliders for degrees of freedom, kept in step with the state, for the camera's place, and for its sensor."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,9 +7,21 @@ import numpy as np
 
 from mereo.scenes.draw_recorder import Key
 from mereo.scenes.parameters import Parameter
+from mereo.synthesis.config import SENSORS
+from mereo.visualization.viewer import html
 from mereo.visualization.viewer.laboratory import CameraPlace, Laboratory
+from mereo.visualization.viewer.sight import FRONTS, Sensing
 
 Moved = Callable[[Parameter, float], None]
+
+SIZES = (32, 256)
+"""Fewest and most pixels of the virtual camera's image, a side."""
+
+MOST_NOISE = 1.0
+"""Largest Gaussian noise, in scene units: ten times the paper's."""
+
+MOST_HIDDEN = 70
+"""Largest share of the object, in per cent, that something in front can be asked to hide."""
 
 
 class ParameterSliders:
@@ -109,3 +121,36 @@ class CameraSliders:
             float(self._distance.value),
             float(np.deg2rad(self._roll.value)),
         )
+
+
+class SensorControls:
+    """Controls of the virtual camera's sensor, and of what stands in front of the object."""
+
+    def __init__(self, gui: Any, changed: Callable[[], None]) -> None:
+        plain = Sensing()
+        self._sensor = gui.add_dropdown("sensor", tuple(SENSORS), initial_value=plain.sensor)
+        self._size = gui.add_slider("pixels", *SIZES, 16, plain.image_size)
+        self._noise = gui.add_slider("noise (units)", 0.0, MOST_NOISE, 0.02, plain.noise_std)
+        self._front = gui.add_dropdown("in front", FRONTS, initial_value=plain.front)
+        self._hidden = gui.add_slider("hides (%)", 1, MOST_HIDDEN, 1, round(100 * plain.hidden), visible=False)
+        self._told = gui.add_html("", visible=False)
+        for handle in (self._sensor, self._size, self._noise, self._front, self._hidden):
+            handle.on_update(lambda event: changed() if event.client is not None else None)
+        self._front.on_update(lambda _: self._fold())
+
+    def _fold(self) -> None:
+        self._hidden.visible = self._told.visible = self._front.value != "nothing"
+
+    def sensing(self) -> Sensing:
+        """Camera that the controls say."""
+        return Sensing(
+            self._sensor.value,
+            int(self._size.value),
+            float(self._noise.value),
+            self._front.value,
+            float(self._hidden.value) / 100,
+        )
+
+    def tell(self, hidden: float) -> None:
+        """Say how much of the object is hidden: tools are thin, and not every share can be had."""
+        self._told.content = html.message(f"the {self._front.value} hides {hidden:.0%} of the object")

@@ -1,0 +1,94 @@
+"""What the laboratory's camera gives: a sensor, its image and noise, and what stands in front of the object.
+
+mesh, Camera, Sensing -see-> SimulatedView: the depth image that is answered, and how much of the object it hides
+"""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from mereo.geometry.camera import Camera
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.raycasting import Hits
+from mereo.geometry.solids import Solids
+from mereo.synthesis.clutter import OBJECT, Capsule, Surroundings, sample_hand, sample_tool
+from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
+from mereo.synthesis.depth_sensor import SimulatedView, observe
+from mereo.synthesis.examples import View
+
+Front = Literal["nothing", "tool", "hand"]
+
+FRONTS: tuple[Front, ...] = get_args(Front)
+"""What may stand in front of the object."""
+
+PLACES = 24
+"""Places of a tool or hand among which that is taken which hides nearest to what is asked for."""
+
+PAPER = GenerateConfig()
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """Camera of the laboratory, beside its place.
+
+    Attributes:
+        sensor: name of its model in ``synthesis.config.SENSORS``.
+        image_size: of the square depth image, pixels.
+        noise_std: Gaussian noise on the depth beside the sensor's own, standard deviation in scene units.
+        front: what stands in front of the object.
+        hidden: share of the object's pixels that this should hide, 0 to 1.
+    """
+
+    sensor: Sensor = "paper"
+    image_size: int = PAPER.image_size
+    noise_std: float = PAPER.noise_std
+    front: Front = "nothing"
+    hidden: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Sight(View):
+    """View of the laboratory.
+
+    Attributes:
+        hidden: share of the object's pixels, 0 to 1, that a tool or hand hides.
+    """
+
+    hidden: float = 0.0
+
+
+def see(solids: Solids, camera: Camera, sensing: Sensing) -> tuple[SimulatedView, float]:
+    """Measurement of an object in the camera frame, and the share of its pixels that something hides.
+
+    Noise is the same every time, so that pictures do not flicker.
+    """
+    capsules, hidden = in_front(solids, camera, sensing)
+    rng = np.random.default_rng(0)
+    return observe(solids, camera, sensing.noise_std, SENSORS[sensing.sensor], rng, capsules), hidden
+
+
+def in_front(solids: Solids, camera: Camera, sensing: Sensing) -> tuple[tuple[Capsule, ...], float]:
+    """Tool or hand in front of an object, and the share of its pixels that it hides: nearest to what is asked for.
+
+    It is one of ``PLACES`` that the synthesis of examples could draw (``synthesis.clutter``). Those that leave fewer
+    than ``MIN_POINTS`` points are not taken.
+    """
+    directions = camera.directions().reshape(-1, 3)
+    hits = solids.first_hit(directions)
+    visible = np.isfinite(hits.distance)
+    count = int(visible.sum())
+    if sensing.front == "nothing" or count < MIN_POINTS:
+        return (), 0.0
+    rays, alone = directions[visible], Hits(hits.distance[visible], hits.normal[visible])
+    seen, reach = rays * alone.distance[:, None], float(np.linalg.norm(directions[:, :2], axis=1).max())
+    draw, unit = (sample_tool if sensing.front == "tool" else sample_hand), 1 / SENSORS[sensing.sensor].metres_per_unit
+    best: tuple[Capsule, ...] = ()
+    hidden = 0.0
+    for place in range(PLACES):
+        capsules = tuple(draw(seen, reach, unit, np.random.default_rng(place)))
+        left = int((Surroundings(capsules).join(alone, rays)[1] == OBJECT).sum())
+        share = 1 - left / count
+        if left >= MIN_POINTS and (not best or abs(share - sensing.hidden) < abs(hidden - sensing.hidden)):
+            best, hidden = capsules, share
+    return best, hidden
