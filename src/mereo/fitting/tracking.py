@@ -37,6 +37,7 @@ class Track:
         posed: the state, scene units, without a scale.
         time_s: of the frame.
         velocity: of the parameters, in the order of ``gauss_newton``, a second.
+        unsure: how far the velocity may be off because little is known yet, scene units per second.
     """
 
     problem: Problem
@@ -44,6 +45,7 @@ class Track:
     posed: Posed
     time_s: float
     velocity: Float[np.ndarray, " p"]
+    unsure: float
 
     @classmethod
     def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig) -> "Track":
@@ -54,7 +56,7 @@ class Track:
         scale_std = KNOWN_SCALE_STD if base.scale_std == KNOWN_SCALE_STD else config.scale_std
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
         share_surfaces(base, problem)
-        return cls(problem, fitted.unit * scale, posed, time_s, np.zeros(POSE + model.count))
+        return cls(problem, fitted.unit * scale, posed, time_s, np.zeros(POSE + model.count), config.first_speed)
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
@@ -104,7 +106,7 @@ def next_fit(
         share_surfaces(track.problem, problem)
         start = track.expected(time_s, config)
         passed = max(time_s - track.time_s, 0.0)
-        posed = descend(problem, start, Expectation.of(problem, start, track.velocity, passed, config), config)
+        posed = descend(problem, start, Expectation.of(track, start, passed, config), config)
     fitted = ModesFit(problem, nothing(), track.unit, posed, time.perf_counter() - started)
     return fitted, followed(track, fitted, time_s, config)
 
@@ -114,8 +116,9 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     scale = float(np.exp(fitted.posed.log_scale))
     posed = replace(fitted.posed, translation=fitted.posed.translation / scale, log_scale=0.0)
     passed = max(time_s - track.time_s, 1e-3)
-    velocity = track.velocity + config.beta * (between(track.posed, posed) / passed - track.velocity)
-    return Track(fitted.problem, track.unit * scale, posed, time_s, velocity)
+    velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
+    unsure = track.unsure * (1 - config.smoothing)
+    return Track(fitted.problem, track.unit * scale, posed, time_s, velocity, unsure)
 
 
 def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:
@@ -138,15 +141,16 @@ class Expectation:
     precision: Float[np.ndarray, "p p"]
 
     @classmethod
-    def of(cls, problem: Problem, state: Posed, velocity: Float[np.ndarray, " p"], passed_s: float, config: TrackConfig) -> "Expectation":
-        """Expectation after a time: each point within ``speed`` of where it is in ``state``."""
-        model = problem.model
+    def of(cls, track: Track, state: Posed, passed_s: float, config: TrackConfig) -> "Expectation":
+        """Expectation after a time: each point is where ``state`` has it, up to its speeds times that."""
+        model = track.problem.model
         rows = model.sparse
         modes = model.modes[rows]
         place = state.place(model.mean[rows] + modes @ state.z.astype(np.float32))
         jacobian = in_space(state, place, modes).astype(np.float64)
         squared = jacobian.T @ jacobian / len(rows)
-        speed = config.speed + config.gain * float(np.sqrt(velocity @ squared @ velocity))
+        known = float(np.sqrt(track.velocity @ squared @ track.velocity))
+        speed = config.speed + max(config.gain * max(known - config.dead, 0.0), track.unsure)
         sigma = speed * passed_s + config.least
         return cls(state, squared * (config.motion_worth / sigma**2))
 
@@ -159,7 +163,7 @@ class Expectation:
 def descend(problem: Problem, start: Posed, expectation: Expectation, config: TrackConfig) -> Posed:
     """State that explains cloud, silhouette, prior and expectation, from nearby."""
     constants, half = problem.config, problem.model.half
-    prior = Prior.whole(problem.model) if config.prior == "whole" else Prior.near(problem.model, start.z, constants.neighbors, constants.neighbor_std)
+    prior = Prior.whole(problem.model)
     posed, steps = start, config.steps + config.exact_steps
     for step in range(steps):
         sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)

@@ -1,0 +1,317 @@
+"""A sequence as a folder: frames that `mereo stream` reads, and the truth of each, so that answers can be scored.
+
+    sequence -write_recording-> frames/*.png, camera.json, truth.npz, recording.json -read_recording-> Recording
+
+Frames are depth images in metres with the object cut out, as a camera with a segmentation gives them. The truth holds
+the surface itself, so it is read without the scene, and the scene's draws, which play the state again.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.io.config import InputConfig
+from mereo.io.errors import first_problem, quiet, reason
+from mereo.io.atomic_files import write_json
+from mereo.io.sensor_frame import read_frame
+from mereo.io.size_limits import read_arrays
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis.config import Sensor, SensorConfig
+from mereo.synthesis.sequences import Moment, SequenceConfig, sequence
+
+FRAMES, CAMERA, TRUTH, INDEX = "frames", "camera.json", "truth.npz", "recording.json"
+"""Names in the folder: of the frames' own folder, and of the files beside it."""
+
+FORMAT = 1
+"""Version of the folder; others are not read."""
+
+MOST_BYTES = 2**24
+"""Size above which an index is none: a frame takes 60 bytes."""
+
+FINEST = 10_000.0
+"""Largest number of depth steps in a metre."""
+
+LARGEST_PIXEL = 65_535
+
+Text = Annotated[str, Field(max_length=500)]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+
+
+class _Block(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class RecordedFrame(_Block):
+    """Frame of a recording: its file below ``frames``, when it was taken, and how many pixels show the object."""
+
+    file: Annotated[str, Field(pattern=r"^[0-9]{1,9}\.png$")]
+    time_s: Annotated[FiniteFloat, Field(ge=0)]
+    points: Annotated[int, Field(ge=0)]
+
+
+class RecordedColor(_Block):
+    """Segment of the recorded object: its name and colour."""
+
+    name: Text
+    color: tuple[int, int, int]
+
+
+class RecordingIndex(_Block):
+    """Content of ``recording.json``.
+
+    Attributes:
+        format: version of the folder.
+        scene: name or file, as it was given.
+        seed: of the sequence.
+        rate_hz: frames per second.
+        unit_m: metres in a scene unit.
+        hidden_s: first and last time at which something may be in front of the object.
+        sensor: name of the simulated camera.
+        segments: in the order of their labels.
+        nested: as in ``SegmentedMesh``.
+        frames: in their order.
+    """
+
+    format: int
+    scene: Text
+    seed: Annotated[int, Field(ge=0)]
+    rate_hz: Positive
+    unit_m: Positive
+    hidden_s: tuple[FiniteFloat, FiniteFloat]
+    sensor: Text
+    segments: Annotated[tuple[RecordedColor, ...], Field(min_length=1, max_length=254)]
+    nested: tuple[tuple[Text, Text], ...]
+    frames: Annotated[tuple[RecordedFrame, ...], Field(min_length=1)]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Recorded sequence: its frames, and where the object truly is in each.
+
+    Attributes:
+        folder: where it is.
+        index: what it is of.
+        vertices: of all segments, one after the other, camera frame, scene units.
+        faces: of these.
+        counts: vertices and faces of each segment.
+        T_world_camera: pose of the camera in each frame.
+        draws: of each state in the order of the calls, as shares; ``sizes`` of the calls tell them apart.
+        sizes: numbers of each call.
+    """
+
+    folder: Path
+    index: RecordingIndex
+    vertices: Float[np.ndarray, "n v 3"]
+    faces: np.ndarray
+    counts: np.ndarray
+    T_world_camera: Float[np.ndarray, "n 4 4"]
+    draws: Float[np.ndarray, "n d"]
+    sizes: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.index.frames)
+
+    @property
+    def times_s(self) -> list[float]:
+        """Time of each frame."""
+        return [frame.time_s for frame in self.index.frames]
+
+    @property
+    def reading(self) -> InputConfig:
+        """How its frames are read."""
+        return InputConfig(intrinsics=self.folder / CAMERA)
+
+    def cloud(self, number: int) -> PointCloud:
+        """Points of a frame, camera frame, metres; raises as ``read_frame`` does."""
+        return read_frame(self.folder / FRAMES / self.index.frames[number].file, self.reading).cloud
+
+    def truth(self, number: int) -> SegmentedMesh:
+        """True segments in a frame, camera frame, metres."""
+        return self._rest.with_vertices(self._parts(self.vertices[number].astype(np.float64) * self.index.unit_m))
+
+    @cached_property
+    def _rest(self) -> SegmentedMesh:
+        faces = np.split(self.faces, np.cumsum(self.counts[:, 1])[:-1])
+        first = np.cumsum([0, *self.counts[:-1, 0]])
+        segments = tuple(
+            Segment(one.name, vertices, part - start, one.color)
+            for one, vertices, part, start in zip(
+                self.index.segments, self._parts(self.vertices[0].astype(np.float64)), faces, first, strict=True
+            )
+        )
+        return SegmentedMesh(segments, self.index.nested)
+
+    def _parts(self, vertices: Float[np.ndarray, "v 3"]) -> list[Float[np.ndarray, "_ 3"]]:
+        return np.split(vertices, np.cumsum(self.counts[:, 0])[:-1])
+
+
+def write_recording(
+    folder: Path,
+    scene: Scene,
+    settings: SequenceConfig,
+    sensor: tuple[Sensor, SensorConfig],
+    seed: int,
+    *,
+    named: str = "",
+) -> RecordingIndex:
+    """Write a sequence of a scene into an empty folder.
+
+    Args:
+        folder: exists and is empty.
+        scene: the object.
+        settings: of the sequence.
+        sensor: simulated camera, and its name.
+        seed: of everything.
+        named: how the scene was named; by default by its own name.
+
+    Raises ``ValueError`` as ``sequence`` does.
+    """
+    unit_m = sensor[1].metres_per_unit if scene.unit_m is None else scene.unit_m
+    (folder / FRAMES).mkdir()
+    moments, frames, scale, camera = [], [], FINEST, None
+    digits = max(4, len(str(settings.frames - 1)))
+    for number, moment in enumerate(sequence(scene, settings, sensor[1], seed)):
+        image = moment.seen.image
+        if camera is None:
+            farthest = 2 * float(image.depth.max()) * unit_m
+            scale = min(FINEST, 10.0 ** np.floor(np.log10(LARGEST_PIXEL / farthest)))
+            camera = image.camera
+        steps = np.minimum(np.rint(image.depth * unit_m * scale), LARGEST_PIXEL).astype(np.uint16)
+        file = f"{number:0{digits}}.png"
+        Image.fromarray(steps).save(folder / FRAMES / file)
+        frames.append(RecordedFrame(file=file, time_s=moment.time_s, points=moment.seen.object_points))
+        moments.append(moment)
+    assert camera is not None
+    write_json(folder / CAMERA, _camera(camera, scale))
+    _write_truth(folder / TRUTH, moments)
+    rest = scene.rest
+    index = RecordingIndex(
+        format=FORMAT,
+        scene=named or scene.name,
+        seed=seed,
+        rate_hz=float(settings.rate),
+        unit_m=float(unit_m),
+        hidden_s=settings.hidden_s,
+        sensor=sensor[0],
+        segments=tuple(RecordedColor(name=one.name, color=one.color) for one in rest.segments),
+        nested=rest.nested,
+        frames=tuple(frames),
+    )
+    write_json(folder / INDEX, index.model_dump())
+    return index
+
+
+def _camera(camera: Camera, scale: float) -> dict[str, float]:
+    """Intrinsics as ``read_intrinsics`` reads them."""
+    return {
+        **{"width": camera.width, "height": camera.height, "fx": camera.focal_x_px, "fy": camera.focal_y_px},
+        **{"cx": camera.center_x_px, "cy": camera.center_y_px, "pixel_center": 0.5, "depth_scale": scale},
+    }
+
+
+def _write_truth(path: Path, moments: list[Moment]) -> None:
+    mesh = moments[0].mesh
+    counts = np.array([(len(one.vertices), len(one.faces)) for one in mesh.segments])
+    calls = moments[0].played.calls
+    np.savez_compressed(
+        path,
+        vertices=np.stack([np.concatenate([s.vertices for s in one.mesh.segments]) for one in moments]).astype("f4"),
+        faces=mesh.merged()[1].astype(np.int32),
+        counts=counts,
+        T_world_camera=np.stack([one.T_world_camera for one in moments]),
+        draws=np.stack([np.concatenate([np.empty(0), *(c.shares for c in one.played.calls)]) for one in moments]),
+        sizes=np.array([len(call.shares) for call in calls]),
+    )
+
+
+def is_recording_folder(path: Path | None) -> bool:
+    """Whether a path is a folder that `mereo scene record` wrote, or its ``recording.json``."""
+    return path is not None and (path.name == INDEX or (path / INDEX).is_file())
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Recording from its folder.
+
+    Raises ``FileNotFoundError`` where there is none, and ``ValueError`` where its files are damaged or do not belong
+    together.
+    """
+    folder = Path(path).parent if Path(path).name == INDEX else Path(path)
+    if not (folder / INDEX).is_file():
+        raise FileNotFoundError(f"{folder} has no {INDEX}; `mereo scene record` writes such a folder: check the path")
+    index = _read_index(folder / INDEX)
+    try:
+        with quiet():
+            arrays = read_arrays(folder / TRUTH)
+            kept = {name: arrays[name] for name in Recording.__dataclass_fields__ if name in arrays}
+            result = Recording(folder, index, **kept)
+            _check(result)
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever a damaged archive makes of zlib, tokenize and numpy
+        raise ValueError(
+            f"{folder / TRUTH} is not the truth of this recording ({reason(error)}); record the sequence again"
+        ) from None
+    return result
+
+
+def _read_index(path: Path) -> RecordingIndex:
+    with path.open("rb") as file:
+        content = file.read(MOST_BYTES + 1)
+    try:
+        if len(content) > MOST_BYTES:
+            raise ValueError(f"it has more than {MOST_BYTES // 2**20} MB")
+        json.loads(content)
+        index = RecordingIndex.model_validate_json(content)
+        if index.format != FORMAT:
+            raise ValueError(f"its format is {index.format}; this mereo reads format {FORMAT}")
+    except ValidationError as error:
+        raise ValueError(f"{path} is no recording: {first_problem(error)}: record the sequence again") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no recording ({reason(error)}): record the sequence again") from None
+    return index
+
+
+def _check(found: Recording) -> None:
+    """Raise ``ValueError`` (its reason only) where arrays have other shapes than the index and each other."""
+    frames, segments = len(found), len(found.index.segments)
+    vertices = found.vertices
+    if vertices.ndim != 3 or vertices.shape[0] != frames or vertices.shape[2] != 3 or vertices.dtype.kind != "f":
+        raise ValueError(f"its vertices have the shape {vertices.shape} for {frames} frames")
+    if not np.isfinite(vertices).all() or np.abs(vertices).max(initial=0) > 1e12:
+        raise ValueError("its vertices are not all finite")
+    if found.counts.shape != (segments, 2) or found.counts.dtype.kind != "i" or found.counts.min() < 1:
+        raise ValueError(f"it counts other segments than the {segments} of the index")
+    if tuple(found.counts.sum(axis=0)) != (vertices.shape[1], len(found.faces)):
+        raise ValueError("its counts are not those of its vertices and faces")
+    if found.faces.ndim != 2 or found.faces.shape[1] != 3 or found.faces.dtype.kind != "i":
+        raise ValueError(f"its faces have the shape {found.faces.shape}")
+    last = np.cumsum(found.counts[:, 0])
+    owner = np.repeat(np.arange(segments), found.counts[:, 1])[:, None]
+    if (found.faces < (last - found.counts[:, 0])[owner]).any() or (found.faces >= last[owner]).any():
+        raise ValueError("its faces name vertices that are not there")
+
+
+def scored_frames(recording: Recording) -> Iterator[tuple[float, PointCloud, SegmentedMesh]]:
+    """Time, cloud and true segments of each frame, metres, camera frame."""
+    for number, time_s in enumerate(recording.times_s):
+        yield time_s, recording.cloud(number), recording.truth(number)
+
+
+def training_seed(seed: int, test: bool) -> int:
+    """The seed; raises ``ValueError`` for one for testing that ``test`` does not allow."""
+    if seed >= TEST_SEED_START and not test:
+        raise ValueError(
+            f"the seed is {seed}; seeds from {TEST_SEED_START} up are for testing: take a smaller one, or say --test"
+        )
+    return seed
