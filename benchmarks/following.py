@@ -4,10 +4,10 @@
 
 For each object, with its shipped weights, a sequence of 5 s at 30 Hz (``synthesis.sequences``) from a training seed:
 
-- milliseconds of a tracked frame, median and 90 %, and of one fitted by itself by its modes; frames for which the network
-  was asked;
-- jitter: standard deviation of a vertex' place over 30 frames of one state that differ by noise alone (the 30 before them
-  are left out), and its way from one of these frames to the next; root mean squares over the vertices, scene units;
+- milliseconds of a tracked frame, median and 90 %, and of one fitted by itself by its modes; frames for which the
+  network was asked;
+- jitter: standard deviation of a vertex' place over 30 frames of one state that differ by noise alone (the 30 before
+  them are left out), and its way from one of these frames to the next; root mean squares over the vertices, scene units;
 - mean mIoU over every K-th frame, on a grid of 50^3 cells, tracked and by itself: of all, of those while something is
   in front, and of those afterwards;
 - a jump: the sequence goes on with another one's state and camera; frames until the tracked mIoU is within 0.02 of that
@@ -166,7 +166,9 @@ def main() -> None:
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
     config = TrackConfig(motion=options.motion, check_s=options.check)
-    print("| object | ms tracked 50 / 90 % | alone | asked | jitter | mIoU, tracked / alone | in front | after | jump |")
+    print(
+        "| object | ms tracked 50 / 90 % | alone | asked | jitter | mIoU, tracked / alone | in front | after | jump |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     for name in options.objects:
         row(name, options, config)

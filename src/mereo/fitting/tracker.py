@@ -2,8 +2,8 @@
 
     cloud, time -Tracker.follow-> Followed (registration, or what the network made of the frame)
 
-What can be seen of a lost object is that the model explains fewer of the frame's points than it did. Then, and at first,
-the frame is fitted by itself, as `mereo reconstruct` does, and the better of both is gone on with.
+What can be seen of a lost object is that the model explains fewer of the frame's points than it did. Then, and at
+first, the frame is fitted by itself, as `mereo reconstruct` does, and the better of both is gone on with.
 """
 
 import time
@@ -120,14 +120,16 @@ class Tracker:
         tracked = self._tracked(seen, time_s, axes, keep_all)
         if tracked is not None and self._believed(tracked, time_s):
             return self._gone_on(tracked, started)
-        asked = fitted_frame(
-            seen, self.registrar.network, self.registrar, axes, scene_unit, stated_unit, keep_all
-        )
+        asked = fitted_frame(seen, self.registrar.network, self.registrar, axes, scene_unit, stated_unit, keep_all)
         if asked.modes is None and tracked is None and self.registrar.choice != "auto":
             assert asked.error is not None
             raise asked.error
         own = None if asked.modes is None else _Candidate.of_frame(asked, time_s, self.config)
-        if tracked is not None and self._takes(tracked) and (own is None or own.score <= tracked.score + self.config.margin):
+        if (
+            tracked is not None
+            and self._takes(tracked)
+            and (own is None or own.score <= tracked.score + self.config.margin)
+        ):
             self._asked_s = time_s
             return self._gone_on(tracked, started, restart=True)
         return self._begun(asked, own, axes, time_s, started)

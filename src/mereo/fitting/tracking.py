@@ -70,10 +70,8 @@ def share_surfaces(base: Problem, other: Problem) -> None:
     vars(other).update({"pairs": base.pairs, "samples": base.samples})
 
 
-def gated(
-    track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig
-) -> Bool[np.ndarray, " n"]:
-    """Which points, in the cloud's unit, lie near the expected surface; the others are strays, or the object is lost."""
+def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig) -> Bool[np.ndarray, " n"]:
+    """Which points, in the cloud's unit, lie near the expected surface; others are strays, or the object is lost."""
     samples = track.problem.samples.every(2)
     place = samples.posed(track.expected(time_s, config)).place
     most = config.gate * track.problem.model.half + samples.spacing

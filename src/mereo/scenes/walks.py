@@ -10,6 +10,7 @@ start: whole numbers, choices, permutations, and draws on which it depends what 
 Notation: n times, d numbers, k nodes of the process.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,10 +106,8 @@ def switches(scene: Scene, start: Played) -> set[Key]:
         for share in EXTREMES:
             given = {**start.remembered, call.key: np.array([share])}
             recorder = Recorder(start.seed, given, 2 * len(start.calls) + 10)
-            try:
+            with suppress(OutOfDraws, ValueError):
                 play(scene, recorder)
-            except (OutOfDraws, ValueError):
-                pass
             drawn = {one.key[0] for one in recorder.calls}
             if drawn - places:
                 found.add(call.key)

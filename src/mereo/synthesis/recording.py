@@ -20,9 +20,9 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.io.atomic_files import write_json
 from mereo.io.config import InputConfig
 from mereo.io.errors import first_problem, quiet, reason
-from mereo.io.atomic_files import write_json
 from mereo.io.sensor_frame import read_frame
 from mereo.io.size_limits import read_arrays
 from mereo.scenes.scene import Scene
@@ -214,10 +214,10 @@ def write_recording(
 
 def _camera(camera: Camera, scale: float) -> dict[str, float]:
     """Intrinsics as ``read_intrinsics`` reads them."""
-    return {
-        **{"width": camera.width, "height": camera.height, "fx": camera.focal_x_px, "fy": camera.focal_y_px},
-        **{"cx": camera.center_x_px, "cy": camera.center_y_px, "pixel_center": 0.5, "depth_scale": scale},
-    }
+    size, focal = (camera.width, camera.height), (camera.focal_x_px, camera.focal_y_px)
+    center = (camera.center_x_px, camera.center_y_px)
+    names = ("width", "height", "fx", "fy", "cx", "cy", "pixel_center", "depth_scale")
+    return dict(zip(names, (*size, *focal, *center, 0.5, scale), strict=True))
 
 
 def _write_truth(path: Path, moments: list[Moment]) -> None:

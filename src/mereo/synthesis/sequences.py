@@ -2,8 +2,8 @@
 
     scene, SequenceConfig, seed -sequence-> Moment (state, camera, what the sensor saw), ...
 
-The object follows a walk through its scene's own states (``scenes.walks``), the camera one through its workspace. A tool
-or a hand comes into view from outside, stays, and leaves. Everything comes from the seed alone.
+The object follows a walk through its scene's own states (``scenes.walks``), the camera one through its workspace. A
+tool or a hand comes into view from outside, stays, and leaves. Everything comes from the seed alone.
 """
 
 from collections.abc import Iterator
