@@ -22,6 +22,7 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, Summary, sentence, stream
 from mereo.reconstruction.stream_sources import STANDARD_INPUT, frames_of, watched_frames
+from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 
 
 def stream_reconstructions(
@@ -47,8 +48,9 @@ def stream_reconstructions(
     Raises ``ValueError`` where not one frame could be answered, and what broke the sequence off, where something did;
     ``FileExistsError`` for a folder of surfaces with content, without ``force``.
     """
+    source, reading = frames_of_recording(source, reading or InputConfig())
     folder = None if surfaces is None else SurfaceFolder(surfaces, force)
-    reading, isolation = reading or InputConfig(), isolation or IsolationConfig()
+    isolation = isolation or IsolationConfig()
     model = load_for(weights, inference or InferenceConfig())
     frames: Iterable[StreamFrame[Observation] | None] = (
         watched_frames(source, reading, isolation) if watch else frames_of(source, reading, isolation, rate_hz)
@@ -79,6 +81,14 @@ def stream_reconstructions(
     if not summary.answered and last_error:
         raise ValueError(f"none of the {summary.failed} frames could be answered; the last one: {last_error}")
     return summary
+
+
+def frames_of_recording(source: str, reading: InputConfig) -> tuple[str, InputConfig]:
+    """Folder of the frames and their camera, where the source is a folder of ``mereo scene record``; else as given."""
+    if source == STANDARD_INPUT or not is_recording_folder(Path(source)):
+        return source, reading
+    folder = Path(source)
+    return str(folder / FRAMES), replace(reading, intrinsics=reading.intrinsics or folder / CAMERA)
 
 
 class SurfaceFolder:

@@ -6,93 +6,42 @@ Frames are depth images in metres with the object cut out, as a camera with a se
 the surface itself, so it is read without the scene, and the scene's draws, which play the state again.
 """
 
-import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import write_json
 from mereo.io.config import InputConfig
-from mereo.io.errors import first_problem, quiet, reason
+from mereo.io.errors import quiet, reason
 from mereo.io.sensor_frame import read_frame
 from mereo.io.size_limits import read_arrays
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import Sensor, SensorConfig
-from mereo.synthesis.sequences import Moment, SequenceConfig, sequence
+from mereo.synthesis.recording_index import (
+    FORMAT,
+    INDEX,
+    RecordedColor,
+    RecordedFrame,
+    RecordingIndex,
+    read_index,
+)
+from mereo.synthesis.sequence_config import SequenceConfig
+from mereo.synthesis.sequences import Moment, sequence
 
-FRAMES, CAMERA, TRUTH, INDEX = "frames", "camera.json", "truth.npz", "recording.json"
+FRAMES, CAMERA, TRUTH = "frames", "camera.json", "truth.npz"
 """Names in the folder: of the frames' own folder, and of the files beside it."""
-
-FORMAT = 1
-"""Version of the folder; others are not read."""
-
-MOST_BYTES = 2**24
-"""Size above which an index is none: a frame takes 60 bytes."""
 
 FINEST = 10_000.0
 """Largest number of depth steps in a metre."""
 
 LARGEST_PIXEL = 65_535
-
-Text = Annotated[str, Field(max_length=500)]
-Positive = Annotated[FiniteFloat, Field(gt=0)]
-
-
-class _Block(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-
-class RecordedFrame(_Block):
-    """Frame of a recording: its file below ``frames``, when it was taken, and how many pixels show the object."""
-
-    file: Annotated[str, Field(pattern=r"^[0-9]{1,9}\.png$")]
-    time_s: Annotated[FiniteFloat, Field(ge=0)]
-    points: Annotated[int, Field(ge=0)]
-
-
-class RecordedColor(_Block):
-    """Segment of the recorded object: its name and colour."""
-
-    name: Text
-    color: tuple[int, int, int]
-
-
-class RecordingIndex(_Block):
-    """Content of ``recording.json``.
-
-    Attributes:
-        format: version of the folder.
-        scene: name or file, as it was given.
-        seed: of the sequence.
-        rate_hz: frames per second.
-        unit_m: metres in a scene unit.
-        hidden_s: first and last time at which something may be in front of the object.
-        sensor: name of the simulated camera.
-        segments: in the order of their labels.
-        nested: as in ``SegmentedMesh``.
-        frames: in their order.
-    """
-
-    format: int
-    scene: Text
-    seed: Annotated[int, Field(ge=0)]
-    rate_hz: Positive
-    unit_m: Positive
-    hidden_s: tuple[FiniteFloat, FiniteFloat]
-    sensor: Text
-    segments: Annotated[tuple[RecordedColor, ...], Field(min_length=1, max_length=254)]
-    nested: tuple[tuple[Text, Text], ...]
-    frames: Annotated[tuple[RecordedFrame, ...], Field(min_length=1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +94,7 @@ class Recording:
         faces = np.split(self.faces, np.cumsum(self.counts[:, 1])[:-1])
         first = np.cumsum([0, *self.counts[:-1, 0]])
         segments = tuple(
-            Segment(one.name, vertices, part - start, one.color)
+            Segment(one.name, one.color, vertices, part - start)
             for one, vertices, part, start in zip(
                 self.index.segments, self._parts(self.vertices[0].astype(np.float64)), faces, first, strict=True
             )
@@ -235,9 +184,9 @@ def _write_truth(path: Path, moments: list[Moment]) -> None:
     )
 
 
-def is_recording_folder(path: Path | None) -> bool:
-    """Whether a path is a folder that `mereo scene record` wrote, or its ``recording.json``."""
-    return path is not None and (path.name == INDEX or (path / INDEX).is_file())
+def is_recording_folder(path: Path) -> bool:
+    """Whether a path is a folder that `mereo scene record` wrote."""
+    return (path / INDEX).is_file()
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -246,10 +195,10 @@ def read_recording(path: str | Path) -> Recording:
     Raises ``FileNotFoundError`` where there is none, and ``ValueError`` where its files are damaged or do not belong
     together.
     """
-    folder = Path(path).parent if Path(path).name == INDEX else Path(path)
+    folder = Path(path)
     if not (folder / INDEX).is_file():
         raise FileNotFoundError(f"{folder} has no {INDEX}; `mereo scene record` writes such a folder: check the path")
-    index = _read_index(folder / INDEX)
+    index = read_index(folder / INDEX)
     try:
         with quiet():
             arrays = read_arrays(folder / TRUTH)
@@ -263,23 +212,6 @@ def read_recording(path: str | Path) -> Recording:
             f"{folder / TRUTH} is not the truth of this recording ({reason(error)}); record the sequence again"
         ) from None
     return result
-
-
-def _read_index(path: Path) -> RecordingIndex:
-    with path.open("rb") as file:
-        content = file.read(MOST_BYTES + 1)
-    try:
-        if len(content) > MOST_BYTES:
-            raise ValueError(f"it has more than {MOST_BYTES // 2**20} MB")
-        json.loads(content)
-        index = RecordingIndex.model_validate_json(content)
-        if index.format != FORMAT:
-            raise ValueError(f"its format is {index.format}; this mereo reads format {FORMAT}")
-    except ValidationError as error:
-        raise ValueError(f"{path} is no recording: {first_problem(error)}: record the sequence again") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no recording ({reason(error)}): record the sequence again") from None
-    return index
 
 
 def _check(found: Recording) -> None:
@@ -300,12 +232,6 @@ def _check(found: Recording) -> None:
     owner = np.repeat(np.arange(segments), found.counts[:, 1])[:, None]
     if (found.faces < (last - found.counts[:, 0])[owner]).any() or (found.faces >= last[owner]).any():
         raise ValueError("its faces name vertices that are not there")
-
-
-def scored_frames(recording: Recording) -> Iterator[tuple[float, PointCloud, SegmentedMesh]]:
-    """Time, cloud and true segments of each frame, metres, camera frame."""
-    for number, time_s in enumerate(recording.times_s):
-        yield time_s, recording.cloud(number), recording.truth(number)
 
 
 def training_seed(seed: int, test: bool) -> int:

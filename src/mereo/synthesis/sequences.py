@@ -8,7 +8,6 @@ tool or a hand comes into view from outside, stays, and leaves. Everything comes
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +18,6 @@ from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
-from mereo.io.bounds import ImageSize, NotNegative, Positive, check_bounds
 from mereo.scenes.parameters import Played
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
@@ -27,8 +25,7 @@ from mereo.scenes.walks import process_weights, walk
 from mereo.synthesis.clutter import Backdrop, Capsule, Surroundings, sample_hand, sample_plane, sample_tool
 from mereo.synthesis.config import SensorConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
-
-Occluder = Literal["tool", "hand", "none"]
+from mereo.synthesis.sequence_config import SequenceConfig
 
 ARRIVAL = 0.25
 """Share of its time in view in which an occluder arrives, and in which it leaves."""
@@ -36,55 +33,6 @@ ARRIVAL = 0.25
 CAMERA_REACH, CAMERA_TURN_RAD = 0.35, 0.35
 """How far the camera strays from its first place: the share of its tilt and distance, as normal numbers, that changes;
 the standard deviation of its way around the object."""
-
-
-@dataclass(frozen=True)
-class SequenceConfig:
-    """Settings of a sequence.
-
-    Attributes:
-        seconds: how long it is.
-        rate: frames per second.
-        change: seconds in which the object comes from one state to about an independent one.
-        camera_change: the same of the camera; its way is short.
-        occluder: what passes in front of the object, in the middle of the sequence.
-        occluded: seconds for which it is in view.
-        image_size: the depth image is square, in pixels.
-        noise_std: Gaussian noise on the depth, standard deviation in scene units.
-    """
-
-    seconds: Positive = 5.0
-    rate: Positive = 30.0
-    change: Positive = 1.5
-    camera_change: Positive = 4.0
-    occluder: Occluder = "tool"
-    occluded: Positive = 1.0
-    image_size: ImageSize = 96
-    noise_std: NotNegative = 0.1
-
-    def __post_init__(self) -> None:
-        check_bounds(self)
-        if self.frames < 2:
-            raise ValueError(
-                f"{self.seconds:g} s at {self.rate:g} frames a second are {self.frames} frames; a sequence has at "
-                "least 2: make it longer"
-            )
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return round(self.seconds * self.rate)
-
-    @property
-    def times_s(self) -> Float[np.ndarray, " n"]:
-        """Time of each frame from the first on."""
-        return np.arange(self.frames) / self.rate
-
-    @property
-    def hidden_s(self) -> tuple[float, float]:
-        """First and last time at which the occluder may be in view; the same without one."""
-        span = 0.0 if self.occluder == "none" else min(self.occluded, self.seconds)
-        return (self.seconds - span) / 2, (self.seconds + span) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +80,7 @@ def sequence(scene: Scene, settings: SequenceConfig, sensor: SensorConfig, seed:
     Raises ``ValueError`` as ``walk`` does, and where the camera sees too little of the object in the first frame.
     """
     scene = scene.for_seed(seed)
-    times = settings.times_s
+    times = np.arange(settings.frames) / settings.rate
     states = walk(scene, seed, times, settings.change)
     places = _camera_places(scene, times / settings.camera_change, example_rng(seed, 2))
     camera = Camera.from_fov(settings.image_size, settings.image_size, scene.workspace.fov_rad)

@@ -4,11 +4,10 @@ import gc
 import sys
 import threading
 from html import escape
-from typing import Any
+from typing import Any, Protocol
 
 from mereo.visualization.viewer.display import stop_server
 from mereo.visualization.viewer.guard import Entry
-from mereo.visualization.viewer.lab_page import LabPage
 
 FRAME_PX = 560
 """Height of the page within a notebook."""
@@ -18,6 +17,14 @@ COLLECT_EVERY_S = 5.0
 """Time between two collections of what closed pages leave behind."""
 
 
+class Closing(Protocol):
+    """Page with threads of its own, which end with it."""
+
+    def close(self) -> None:
+        """Stop them."""
+        ...
+
+
 class OpenPage:
     """Page of the viewer, open until ``close``; also a context, which closes it at its end.
 
@@ -25,7 +32,7 @@ class OpenPage:
         address: what to open in a browser.
     """
 
-    def __init__(self, server: Any, entry: Entry, page: LabPage | None = None) -> None:
+    def __init__(self, server: Any, entry: Entry, page: Closing | None = None) -> None:
         self._server, self._page = server, page
         self._closed = False
         self.address = entry.address(server.get_port())
