@@ -21,14 +21,15 @@ from mereo.io.config import InputConfig
 from mereo.io.errors import quiet, reason
 from mereo.io.sensor_frame import read_frame
 from mereo.io.size_limits import read_arrays
+from mereo.scenes.draw_recorder import Call
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import Sensor, SensorConfig
 from mereo.synthesis.recording_index import (
     FORMAT,
     INDEX,
-    RecordedColor,
     RecordedFrame,
+    RecordedSegment,
     RecordingIndex,
     read_index,
 )
@@ -94,7 +95,7 @@ class Recording:
         faces = np.split(self.faces, np.cumsum(self.counts[:, 1])[:-1])
         first = np.cumsum([0, *self.counts[:-1, 0]])
         segments = tuple(
-            Segment(one.name, one.color, vertices, part - start)
+            Segment(one.name, one.color, vertices, part - start, one.solid)
             for one, vertices, part, start in zip(
                 self.index.segments, self._parts(self.vertices[0].astype(np.float64)), faces, first, strict=True
             )
@@ -128,7 +129,7 @@ def write_recording(
     """
     unit_m = sensor[1].metres_per_unit if scene.unit_m is None else scene.unit_m
     (folder / FRAMES).mkdir()
-    moments, frames, scale, camera = [], [], FINEST, None
+    truth, frames, scale, camera = _Truth(), [], FINEST, None
     digits = max(4, len(str(settings.frames - 1)))
     for number, moment in enumerate(sequence(scene, settings, sensor[1], seed)):
         image = moment.seen.image
@@ -140,10 +141,10 @@ def write_recording(
         file = f"{number:0{digits}}.png"
         Image.fromarray(steps).save(folder / FRAMES / file)
         frames.append(RecordedFrame(file=file, time_s=moment.time_s, points=moment.seen.object_points))
-        moments.append(moment)
+        truth.add(moment)
     assert camera is not None
     write_json(folder / CAMERA, _camera(camera, scale))
-    _write_truth(folder / TRUTH, moments)
+    truth.write(folder / TRUTH, scene.rest)
     rest = scene.rest
     index = RecordingIndex(
         format=FORMAT,
@@ -153,7 +154,7 @@ def write_recording(
         unit_m=float(unit_m),
         hidden_s=settings.hidden_s,
         sensor=sensor[0],
-        segments=tuple(RecordedColor(name=one.name, color=one.color) for one in rest.segments),
+        segments=tuple(RecordedSegment(name=one.name, color=one.color, solid=one.solid) for one in rest.segments),
         nested=rest.nested,
         frames=tuple(frames),
     )
@@ -169,19 +170,29 @@ def _camera(camera: Camera, scale: float) -> dict[str, float]:
     return dict(zip(names, (*size, *focal, *center, 0.5, scale), strict=True))
 
 
-def _write_truth(path: Path, moments: list[Moment]) -> None:
-    mesh = moments[0].mesh
-    counts = np.array([(len(one.vertices), len(one.faces)) for one in mesh.segments])
-    calls = moments[0].played.calls
-    np.savez_compressed(
-        path,
-        vertices=np.stack([np.concatenate([s.vertices for s in one.mesh.segments]) for one in moments]).astype("f4"),
-        faces=mesh.merged()[1].astype(np.int32),
-        counts=counts,
-        T_world_camera=np.stack([one.T_world_camera for one in moments]),
-        draws=np.stack([np.concatenate([np.empty(0), *(c.shares for c in one.played.calls)]) for one in moments]),
-        sizes=np.array([len(call.shares) for call in calls]),
-    )
+class _Truth:
+    """Truth of a sequence, gathered frame by frame: the pictures themselves would not fit into memory."""
+
+    def __init__(self) -> None:
+        self.vertices: list[Float[np.ndarray, "v 3"]] = []
+        self.poses: list[Float[np.ndarray, "4 4"]] = []
+        self.calls: list[tuple[Call, ...]] = []
+
+    def add(self, moment: Moment) -> None:
+        self.vertices.append(np.concatenate([one.vertices for one in moment.mesh.segments]).astype(np.float32))
+        self.poses.append(moment.T_world_camera)
+        self.calls.append(moment.played.calls)
+
+    def write(self, path: Path, rest: SegmentedMesh) -> None:
+        np.savez_compressed(
+            path,
+            vertices=np.stack(self.vertices),
+            faces=rest.merged()[1].astype(np.int32),
+            counts=np.array([(len(one.vertices), len(one.faces)) for one in rest.segments]),
+            T_world_camera=np.stack(self.poses),
+            draws=np.stack([np.concatenate([np.empty(0), *(call.shares for call in calls)]) for calls in self.calls]),
+            sizes=np.array([len(call.shares) for call in self.calls[0]], dtype=np.int64),
+        )
 
 
 def is_recording_folder(path: Path) -> bool:

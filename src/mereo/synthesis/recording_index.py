@@ -19,6 +19,7 @@ MOST_BYTES = 2**24
 
 Text = Annotated[str, Field(max_length=500)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
+Level = Annotated[int, Field(ge=0, le=255)]
 
 
 class _Block(BaseModel):
@@ -33,11 +34,12 @@ class RecordedFrame(_Block):
     points: Annotated[int, Field(ge=0)]
 
 
-class RecordedColor(_Block):
-    """Segment of the recorded object: its name and colour."""
+class RecordedSegment(_Block):
+    """Segment of the recorded object: its name, colour, and whether its faces bound a solid."""
 
     name: Text
-    color: tuple[int, int, int]
+    color: tuple[Level, Level, Level]
+    solid: bool
 
 
 class RecordingIndex(_Block):
@@ -63,7 +65,7 @@ class RecordingIndex(_Block):
     unit_m: Positive
     hidden_s: tuple[FiniteFloat, FiniteFloat]
     sensor: Text
-    segments: Annotated[tuple[RecordedColor, ...], Field(min_length=1, max_length=254)]
+    segments: Annotated[tuple[RecordedSegment, ...], Field(min_length=1, max_length=254)]
     nested: tuple[tuple[Text, Text], ...]
     frames: Annotated[tuple[RecordedFrame, ...], Field(min_length=1)]
 
