@@ -36,7 +36,7 @@ class Followed:
     Attributes:
         registration: of the object's model, by its modes, camera frame and input unit; None where none was found.
         taken: whether it is the answer; otherwise that is the network's, from ``asked``.
-        asked: what the network made of the frame; None where it was not asked, as the last state led to this one.
+        asked: what the network made of the frame; None where the last state led to the answer.
         reading: the frame, and which of its points are taken for the object's.
         T_camera_input: from the input's frame to the camera frame.
         seconds: of the whole answer.
@@ -57,7 +57,7 @@ class Followed:
 
     @property
     def tracked(self) -> bool:
-        """Whether the answer was reached from the last state, without the network."""
+        """Whether the answer was reached from the last state, not from what the network says."""
         return self.asked is None
 
     @cached_property

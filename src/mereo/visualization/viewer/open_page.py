@@ -4,7 +4,7 @@ import gc
 import sys
 import threading
 from html import escape
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from mereo.visualization.viewer.display import stop_server
 from mereo.visualization.viewer.guard import Entry
@@ -17,6 +17,7 @@ COLLECT_EVERY_S = 5.0
 """Time between two collections of what closed pages leave behind."""
 
 
+@runtime_checkable
 class Closing(Protocol):
     """Page with threads of its own, which end with it."""
 
