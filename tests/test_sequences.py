@@ -16,7 +16,6 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.scenes.given_draws import played_back
 from mereo.scenes.parameters import random_state
-from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.walks import process_weights, switches, walk
 from mereo.synthesis.clutter import OCCLUDER
@@ -57,16 +56,22 @@ def test_a_walk_starts_in_the_state_of_its_seed_and_moves_on_smoothly() -> None:
     assert not np.allclose(places(scene, 4, np.array([0.0, 1.0])), coarse[[0, 10]])
 
 
-def test_draws_that_decide_what_else_is_drawn_stay_as_they_are() -> None:
-    scene = load_scene("sheet")
-    start = random_state(scene, 1)
-    found = switches(scene, start)
-    states = walk(scene, 1, np.arange(4) / 10, 1.0)
-    for one in states:
-        assert one.keys == start.keys
-        kept = {call.key: call.shares for call in one.calls}
-        assert all(np.array_equal(kept[call.key], call.shares) for call in start.calls if call.key in found)
-    assert found and not np.allclose(states[0].calls[-1].shares, states[-1].calls[-1].shares)
+def bent_or_not(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    shear = 3.0 * float(rng.uniform(-1.0, 1.0))
+    is_bent = float(rng.uniform()) < 0.5
+    bend = float(rng.uniform(0.1, 0.3)) if is_bent else 0.0
+    return 4 * (Shear(shear, bend, 0.0),)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_draws_that_decide_what_else_is_drawn_stay_as_they_are(seed: int) -> None:
+    scene = Scene("bent or not", rest_mesh(), bent_or_not)
+    start = random_state(scene, seed)
+    assert switches(scene, start) == {start.calls[1].key}
+    states = walk(scene, seed, np.arange(20) / 10, 1.0)
+    drawn = np.array([[call.shares[0] for call in one.calls] for one in states])
+    assert all(one.keys == start.keys for one in states) and np.ptp(drawn[:, 1]) == 0
+    assert np.ptp(drawn[:, 0]) > 0.1 and all(np.ptp(drawn[:, k]) > 0.1 for k in range(2, len(start.calls)))
 
 
 def refusing(most: float) -> Scene:
