@@ -93,25 +93,33 @@ def process_weights(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
 
 
 def switches(scene: Scene, start: Played) -> set[Key]:
-    """Draws on which it depends what else is drawn: a corner that is bent or not.
-
-    A refused state, of which the scene draws all or a part again, draws from the same places once more, and counts as
-    none.
-    """
+    """Draws on which it depends what else is drawn: a corner that is bent or not."""
     found = set()
-    places = {call.key[0] for call in start.calls}
     for call in start.calls:
         if call.kind not in CONTINUOUS or len(call.shares) > 1:
             continue
         for share in EXTREMES:
             given = {**start.remembered, call.key: np.array([share])}
-            recorder = Recorder(start.seed, given, 2 * len(start.calls) + 10)
+            recorder, whole = Recorder(start.seed, given, 2 * len(start.calls) + 10), False
             with suppress(OutOfDraws, ValueError):
                 play(scene, recorder)
-            drawn = {one.key[0] for one in recorder.calls}
-            if drawn - places:
+                whole = True
+            if _draws_others(start.keys, tuple(one.key for one in recorder.calls), whole):
                 found.add(call.key)
     return found
+
+
+def _draws_others(before: tuple[Key, ...], after: tuple[Key, ...], whole: bool) -> bool:
+    """Whether other things are drawn than before; ``whole`` is whether a state came out.
+
+    A scene that refuses what it has drawn gives up, or draws once more from places where it has drawn already; neither
+    says that it wants anything else.
+    """
+    differs = (i for i, (one, other) in enumerate(zip(before, after, strict=False)) if one != other)
+    same = next(differs, min(len(before), len(after)))
+    if same == len(after):
+        return whole and len(after) < len(before)
+    return after[same][0] not in {place for place, _ in before[:same]}
 
 
 @dataclass(eq=False)
