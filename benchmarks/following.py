@@ -1,6 +1,6 @@
 """What following an object is worth against fitting every frame by itself: latency, jitter, mIoU, recovery.
 
-    python benchmarks/following.py [OBJECT ...] [--seed S] [--occluder tool|hand] [--every K] [--check SECONDS] ...
+    python benchmarks/following.py [OBJECT ...] [--seed S] [--occluder tool|hand] [--every K] ...
 
 For each object, with its shipped weights, a sequence of 5 s at 30 Hz (``synthesis.sequences``) from a training seed:
 
@@ -165,11 +165,10 @@ def main() -> None:
     parser.add_argument("--occluder", choices=("tool", "hand", "none"), default="tool")
     parser.add_argument("--sensor", choices=tuple(SENSORS), default="paper")
     parser.add_argument("--change", type=float, default=SequenceConfig.change)
-    parser.add_argument("--check", type=float, default=TrackConfig.check_s)
     parser.add_argument("--motion", choices=("pose", "velocity"), default=TrackConfig.motion)
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
-    config = TrackConfig(motion=options.motion, check_s=options.check)
+    config = TrackConfig(motion=options.motion)
     heads = ("object", "ms, 50 / 90 %", "processor ms", "alone", "asked", "jitter, tracked / alone")
     print("|", " | ".join((*heads, "mIoU, tracked / alone", "in front", "after", "jump")), "|")
     print("|---" * (len(heads) + 4) + "|")

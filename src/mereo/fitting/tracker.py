@@ -90,7 +90,7 @@ class Tracker:
         """Start anew: the next frame is fitted by itself."""
         self._track: Track | None = None
         self._T_camera_input, self._axes = np.eye(4), "camera"
-        self._best, self._asked_s = 0.0, 0.0
+        self._best = 0.0
 
     def follow(
         self,
@@ -118,7 +118,7 @@ class Tracker:
         started = time.perf_counter()
         seen = as_cloud(cloud if isinstance(cloud, PointCloud) else np.asarray(cloud, dtype=np.float64))
         tracked = self._tracked(seen, time_s, axes, keep_all)
-        if tracked is not None and self._believed(tracked, time_s):
+        if tracked is not None and self._believed(tracked):
             return self._gone_on(tracked, started)
         asked = fitted_frame(seen, self.registrar.network, self.registrar, axes, scene_unit, stated_unit, keep_all)
         if asked.modes is None and tracked is None and self.registrar.choice != "auto":
@@ -130,9 +130,8 @@ class Tracker:
             and self._takes(tracked)
             and (own is None or own.score <= tracked.score + self.config.margin)
         ):
-            self._asked_s = time_s
             return self._gone_on(tracked, started, restart=True)
-        return self._begun(asked, own, axes, time_s, started)
+        return self._begun(asked, own, axes, started)
 
     def _tracked(self, seen: PointCloud, time_s: float, axes: CloudAxes, keep_all: bool) -> "_Candidate | None":
         """The frame fitted from the last state; None without one that leads here."""
@@ -146,10 +145,9 @@ class Tracker:
         fitted, after = next_fit(track, points[keep], points[~keep], time_s, config)
         return _Candidate(fitted, after, Reading(seen, keep))
 
-    def _believed(self, tracked: "_Candidate", time_s: float) -> bool:
+    def _believed(self, tracked: "_Candidate") -> bool:
         """Whether the network need not be asked."""
-        due = self.config.check_s > 0 and time_s - self._asked_s >= self.config.check_s
-        return not due and self._takes(tracked) and tracked.score >= self._best - self.config.drop
+        return self._takes(tracked) and tracked.score >= self._best - self.config.drop
 
     def _takes(self, candidate: "_Candidate") -> bool:
         return self.registrar.takes(candidate.registration)
@@ -160,14 +158,12 @@ class Tracker:
         seconds = time.perf_counter() - started
         return Followed(tracked.registration, True, None, tracked.reading, self._T_camera_input, seconds)
 
-    def _begun(
-        self, asked: FittedFrame, own: "_Candidate | None", axes: CloudAxes, time_s: float, started: float
-    ) -> Followed:
+    def _begun(self, asked: FittedFrame, own: "_Candidate | None", axes: CloudAxes, started: float) -> Followed:
         """Answer of a frame by itself; the track begins with it, or ends where it is not believed."""
         taken = own is not None and self._takes(own)
         self._track = own.track if own is not None and taken else None
         self._T_camera_input, self._axes = asked.seen.T_camera_input, axes
-        self._best, self._asked_s = 0.0 if own is None else own.score, time_s
+        self._best = 0.0 if own is None else own.score
         registration = None if own is None else own.registration
         reading = asked.reading if taken else asked.unaided.reading
         refusal = None if asked.error is None else str(asked.error)
