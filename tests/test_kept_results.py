@@ -34,6 +34,8 @@ def stream(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: tuple[str, .
     answered = SimpleNamespace(surfaces=segments())
     outcomes = [Outcome(name, 0.0, answered, "", 0.1, 0.1, 0) for name in frames]
     monkeypatch.setattr("mereo.cli.stream.load_for", lambda *_: None)
+    monkeypatch.setattr("mereo.cli.stream.registrar_for", lambda *_: None)
+    monkeypatch.setattr("mereo.cli.stream.Answering", lambda *_: None)
     monkeypatch.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(outcomes))
     monkeypatch.setattr("mereo.cli.stream.line", lambda outcome: {"error": outcome.error})
     return command_line.main(["stream", "-", "--weights", "rope", "--surfaces", str(surfaces), *more])

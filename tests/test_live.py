@@ -100,7 +100,7 @@ def test_names_on_standard_input_are_frames(
     monkeypatch.setattr(sys, "stdin", io.StringIO(f"{folder / '000.png'}\n\n{folder / '001.png'}\n"))
     frames = list(frames_of("-", read(folder), IsolationConfig()))
     assert [Path(frame.name).name for frame in frames] == ["000.png", "001.png"]
-    assert len(frames[1].load()) > 32
+    assert len(frames[1].load().cloud) > 32
 
 
 def damaged_clouds(folder: Path, cloud: np.ndarray) -> set[str]:
@@ -148,7 +148,7 @@ def test_a_file_is_no_place_for_surfaces(tmp_path: Path) -> None:
 def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def frames(*_: object) -> Iterator[StreamFrame]:
+    def frames(*_: object) -> Iterator[StreamFrame[PointCloud]]:
         yield StreamFrame("first", 0.0, lambda: PointCloud(np.ones((40, 3))))
         raise ValueError("it is cut off")
 

@@ -138,7 +138,7 @@ def test_a_stream_reads_the_same_frames(tmp_path: Path) -> None:
     for index, frame in enumerate(frames):
         alone = read_frame(path, InputConfig(frame_index=index))
         assert frame.name == alone.message
-        np.testing.assert_array_equal(frame.load().points, alone.cloud.points)
+        np.testing.assert_array_equal(frame.load().cloud.points, alone.cloud.points)
 
 
 def test_a_recording_that_is_damaged_anywhere_is_a_sentence_after_its_whole_frames(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, stream
 
 
-def frame(number: int, time_s: float = 0.0) -> StreamFrame:
+def frame(number: int, time_s: float = 0.0) -> StreamFrame[PointCloud]:
     return StreamFrame(str(number), time_s, lambda: PointCloud(np.full((40, 3), number, dtype=float)))
 
 
@@ -29,7 +29,7 @@ def test_a_slow_answer_gets_the_latest_frame() -> None:
     """Ten frames arrive while the first is answered: the next answer is for the tenth."""
     arrived, begun = threading.Event(), threading.Event()
 
-    def frames() -> Iterator[StreamFrame]:
+    def frames() -> Iterator[StreamFrame[PointCloud]]:
         yield frame(0)
         begun.wait(10)
         for i in range(1, 11):
@@ -56,7 +56,7 @@ def test_dropped_frames_are_not_decoded() -> None:
     decoded: list[int] = []
     ready = threading.Event()
 
-    def loading(i: int) -> StreamFrame:
+    def loading(i: int) -> StreamFrame[PointCloud]:
         def load() -> PointCloud:
             ready.wait(10)
             decoded.append(i)
@@ -64,7 +64,7 @@ def test_dropped_frames_are_not_decoded() -> None:
 
         return StreamFrame(str(i), 0.0, load)
 
-    def frames() -> Iterator[StreamFrame]:
+    def frames() -> Iterator[StreamFrame[PointCloud]]:
         for i in range(50):
             yield loading(i)
         ready.set()
@@ -121,7 +121,7 @@ def test_the_memory_of_a_summary_is_bounded(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_broken_sequence_is_raised_after_its_frames() -> None:
-    def frames() -> Iterator[StreamFrame]:
+    def frames() -> Iterator[StreamFrame[PointCloud]]:
         yield frame(0)
         raise OSError("the recording is cut off")
 
@@ -142,7 +142,7 @@ def test_frames_keep_their_recorded_pace() -> None:
 def test_leaving_early_ends_a_thread_for_which_nothing_comes() -> None:
     asked = threading.Semaphore(0)
 
-    def quiet() -> Iterator[StreamFrame | None]:
+    def quiet() -> Iterator[StreamFrame[PointCloud] | None]:
         yield frame(0)
         while True:
             asked.acquire(timeout=10)
@@ -159,7 +159,7 @@ def test_leaving_early_ends_a_thread_for_which_nothing_comes() -> None:
 
 
 def test_leaving_early_ends_the_reading_thread() -> None:
-    def endless() -> Iterator[StreamFrame]:
+    def endless() -> Iterator[StreamFrame[PointCloud]]:
         i = 0
         while True:
             yield frame(i)

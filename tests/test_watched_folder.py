@@ -11,9 +11,14 @@ import pytest
 from mereo.cli.stream import stream_reconstructions
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.stream import stream
 from mereo.reconstruction.stream_sources import watched_frames
 from mereo.reconstruction.watched_folder import PATIENCE_S, WatchedFolder
+
+
+def points_of(seen: Observation) -> int:
+    return len(seen.cloud)
 
 
 def write(path: Path, content: bytes, changed_s: int) -> Path:
@@ -72,7 +77,7 @@ def test_frames_are_answered_as_their_files_arrive(tmp_path: Path) -> None:
     (tmp_path / "second.npy").touch()
     (tmp_path / ".third.partial.npy").write_bytes(b"a writer renames it when it is whole")
     isolation = IsolationConfig(box=(-9, -9, 0, 9, 9, 9))
-    outcomes = stream(watched_frames(str(tmp_path), InputConfig(), isolation), len, every_frame=True)
+    outcomes = stream(watched_frames(str(tmp_path), InputConfig(), isolation), points_of, every_frame=True)
     assert (found := next(outcomes)).name == "first.npy" and found.result == 40
     np.save(tmp_path / "second.npy", np.ones((50, 3)))
     assert (found := next(outcomes)).name == "second.npy" and found.result == 50
@@ -88,8 +93,8 @@ def test_watching_ends_with_ctrl_c(
         raise KeyboardInterrupt
 
     np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 2, (500, 3)))
-    monkeypatch.setattr("mereo.cli.stream.reconstruct", interrupted)
-    assert stream_reconstructions(str(tmp_path), "rope", watch=True).answered == 0
+    monkeypatch.setattr("mereo.cli.stream_answers.reconstruct", interrupted)
+    assert stream_reconstructions(str(tmp_path), "rope", watch=True, fit="off").answered == 0
     assert capsys.readouterr().err.startswith("stopped\n0 frames answered")
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mereo.evaluation.sample_views import load_frame as load_frame
     from mereo.fitting.register import Registrar as Registrar
+    from mereo.fitting.tracker import Tracker as Tracker
     from mereo.geometry.camera import Camera as Camera
     from mereo.geometry.camera import DepthImage as DepthImage
     from mereo.geometry.camera import PointCloud as PointCloud
@@ -59,6 +60,7 @@ _HOME = {
     "Result": "visualization.result",
     "Segment": "geometry.mesh",
     "SegmentedMesh": "geometry.mesh",
+    "Tracker": "fitting.tracker",
     "TrainConfig": "training.config",
     "answer": "visualization.answering",
     "evaluate": "learning.steps",

@@ -181,6 +181,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         (scene_commands.ScenePreview, "preview"),
         (scene_commands.SceneModes, "modes"),
         (scene_commands.SceneExport, "export"),
+        (scene_commands.SceneRecord, "record"),
     )
     weights = (
         (weights_commands.WeightsList, "list"),
@@ -193,7 +194,9 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         Annotated[commands.Demo, subcommand("demo")]
         | Annotated[commands.Doctor, subcommand("doctor")]
         | starting(LearnCommand, "learn")
-        | Annotated[_group(scene), subcommand("scene", description="List, write, check, draw or export scenes.")]
+        | Annotated[
+            _group(scene), subcommand("scene", description="List, write, check, draw, record or export scenes.")
+        ]
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
         | Annotated[_group(weights), subcommand("weights", description="List, show, publish or fetch weights.")]
         | starting(commands.Generate, "generate", settings=GenerateConfig(sensor=sensor))

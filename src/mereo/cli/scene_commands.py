@@ -1,14 +1,18 @@
-"""The commands ``mereo scene ...``: list, write, check, draw and export scenes.
+"""The commands ``mereo scene ...``: list, write, check, draw, record and export scenes.
 
 See ``mereo.cli.commands`` for how commands are written.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from tyro.conf import arg
 
 from mereo.cli.positionals import ObjectFiles, SceneName, SceneNameOrNone
 from mereo.io.bounds import CountOrNone, States
+from mereo.synthesis.config import SENSORS, Sensor
+from mereo.synthesis.sequence_config import SequenceConfig
 
 
 @dataclass(frozen=True)
@@ -162,3 +166,42 @@ class SceneExport:
             else:
                 write_segments_glb(partial, rest, np.eye(3))
         print(f"wrote {self.output}")
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """Record a sequence of a scene as a depth camera's frames, with the truth of each: for `mereo stream` and `view`.
+
+    The object walks smoothly through its own random states, the camera moves a little, and a tool passes in front.
+
+    Attributes:
+        scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
+        output: folder to create: frames/*.png, camera.json, truth.npz, recording.json.
+        settings: how long, how fast, and what hides the object.
+        sensor: whose errors the frames have: the paper's noise, or those of a kind of depth camera.
+        seed: another seed, another sequence; seeds from 1,000,000 up are for testing.
+        test: allow a test seed.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
+    """
+
+    scene: SceneName
+    output: Path
+    settings: Annotated[SequenceConfig, arg(name="")] = field(default_factory=SequenceConfig)
+    sensor: Sensor = "paper"
+    seed: CountOrNone = 0
+    test: bool = False
+    force: bool = False
+
+    def run(self) -> None:
+        """Write the folder, and print how it is answered and looked at."""
+        from mereo.io.output_folders import new_directory
+        from mereo.scenes.registry import files_of, load_scene
+        from mereo.synthesis.recording import training_seed, write_recording
+
+        seed = training_seed(self.seed, self.test)
+        with new_directory(self.output, self.force, files_of(self.scene)) as folder:
+            scene, sensor = load_scene(self.scene), (self.sensor, SENSORS[self.sensor])
+            index = write_recording(folder, scene, self.settings, sensor, seed, named=self.scene)
+        print(f"wrote {self.output}: {len(index.frames)} frames in {self.settings.seconds:g} s; then:")
+        print(f"  mereo view {self.output}")
+        print(f"  mereo stream {self.output} --rate {index.rate_hz:g} --weights WEIGHTS")

@@ -5,10 +5,12 @@ import re
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mereo.cli.stream_answers import Answering, FrameAnswer, Seen
+from mereo.fitting.register import registrar_for
+from mereo.fitting.track_config import StreamFit
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.atomic_files import atomic_file, to_json
 from mereo.io.config import InputConfig
@@ -17,9 +19,10 @@ from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, Summary, sentence, stream
 from mereo.reconstruction.stream_sources import STANDARD_INPUT, frames_of, watched_frames
+from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 
 
 def stream_reconstructions(
@@ -35,24 +38,28 @@ def stream_reconstructions(
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
     inference: InferenceConfig | None = None,
+    fit: StreamFit = "auto",
 ) -> Summary:
     """Print a line of JSON for each answered or bad frame, and the summary at the end or after Ctrl-C.
 
-    ``surfaces`` is a folder without content, or with ``force`` one in which files of the same name are replaced.
+    Where the object's model is registered, it is followed from frame to frame (``fitting.tracker``). ``surfaces`` is a
+    folder without content, or with ``force`` one in which files of the same name are replaced.
 
     Raises ``ValueError`` where not one frame could be answered, and what broke the sequence off, where something did;
     ``FileExistsError`` for a folder of surfaces with content, without ``force``.
     """
+    source, reading = frames_of_recording(source, reading or InputConfig())
     folder = None if surfaces is None else SurfaceFolder(surfaces, force)
-    reading, isolation = reading or InputConfig(), isolation or IsolationConfig()
+    isolation = isolation or IsolationConfig()
     model = load_for(weights, inference or InferenceConfig())
-    frames: Iterable[StreamFrame | None] = (
+    frames: Iterable[StreamFrame[Observation] | None] = (
         watched_frames(source, reading, isolation) if watch else frames_of(source, reading, isolation, rate_hz)
     )
-    answer = partial(reconstruct, model=model, resolution=resolution, frame=reading.frame, keep_all=isolation.keep_all)
+    answer = Answering(model, registrar_for(model, fit), resolution, isolation.keep_all)
     # what is written to standard input or into a watched folder arrives when it does
     pace = not every_frame and not watch and source != STANDARD_INPUT
-    outcomes: Iterator[Outcome[Reconstruction]] = stream(frames, answer, recorded_pace=pace, every_frame=every_frame)
+    timed = (None if frame is None else with_time(frame) for frame in frames)
+    outcomes: Iterator[Outcome[FrameAnswer]] = stream(timed, answer, recorded_pace=pace, every_frame=every_frame)
     counter, last_error = Counter(), ""
     broken_off: Exception | None = None
     try:
@@ -76,6 +83,14 @@ def stream_reconstructions(
     return summary
 
 
+def frames_of_recording(source: str, reading: InputConfig) -> tuple[str, InputConfig]:
+    """Folder of the frames and their camera, where the source is a folder of ``mereo scene record``; else as given."""
+    if source == STANDARD_INPUT or not is_recording_folder(Path(source)):
+        return source, reading
+    folder = Path(source)
+    return str(folder / FRAMES), replace(reading, intrinsics=reading.intrinsics or folder / CAMERA)
+
+
 class SurfaceFolder:
     """Folder for the surfaces of answered frames, one file each; what is in it is kept, unless ``force`` is given.
 
@@ -97,7 +112,7 @@ class SurfaceFolder:
                 "--force, which replaces the files of the same names"
             )
 
-    def written(self, outcome: Outcome[Reconstruction], axes: CloudAxes) -> Outcome[Reconstruction]:
+    def written(self, outcome: Outcome[FrameAnswer], axes: CloudAxes) -> Outcome[FrameAnswer]:
         """Write the surfaces of an answered frame; where that fails, the outcome is a failed one.
 
         A frame that comes again replaces its own file; two frames never share one.
@@ -117,7 +132,7 @@ class SurfaceFolder:
         return outcome
 
 
-def line(outcome: Outcome[Reconstruction]) -> dict[str, Any]:
+def line(outcome: Outcome[FrameAnswer]) -> dict[str, Any]:
     """JSON that is printed of one frame; lengths in the input's unit, times in milliseconds."""
     facts: dict[str, Any] = {
         "frame": outcome.name,
@@ -128,13 +143,15 @@ def line(outcome: Outcome[Reconstruction]) -> dict[str, Any]:
     }
     if outcome.result is None:
         return {**facts, "error": outcome.error}
-    found = {
-        segment.name: {
-            "centroid": [round(float(value), 6) for value in segment.centroid],
-            "volume": float(segment.volume),
-            "confidence": round(float(segment.confidence), 3),
-        }
-        for segment in outcome.result.segments
-        if segment.voxels
-    }
-    return {**facts, "strays": outcome.result.reading.dropped, "segments": found}
+    found = outcome.result
+    where = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
+    return {**facts, **where, "strays": found.strays, "segments": found.segments}
+
+
+def with_time(frame: StreamFrame[Observation]) -> StreamFrame[Seen]:
+    """The frame, whose content says when it was recorded."""
+
+    def load() -> Seen:
+        return Seen(frame.load(), frame.time_s)
+
+    return StreamFrame(frame.name, frame.time_s, load)

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
+from mereo.fitting.track_config import StreamFit
 from mereo.io.bounds import Cells, Count, Port, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
 from mereo.io.cores import workers_for
@@ -76,7 +77,8 @@ class ViewCommand:
 
     Attributes:
         input: a point cloud or depth image, as for `mereo reconstruct`, or a result of it with a registered model (the
-            folder, or its state.json); without it (and --scene) a shipped frame.
+            folder, or its state.json); a folder of `mereo scene record`, which is played; without it (and --scene) a
+            shipped frame.
         weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
         scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
         state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
@@ -124,12 +126,16 @@ class StreamCommand:
     """Reconstruct frames as they come: the latest one wins, a bad one is reported and passed over.
 
     Each answer is one line of JSON on standard output, in the input's frame and units; rate and latency come at the
-    end, on standard error. The exit status is 0 where any frame was answered and the sequence was whole, else 2.
+    end, on standard error. Where the weights carry the object's own deformation model, it is followed: each frame's fit
+    starts from the last one's state, and the network is asked at first and where the object is lost. The exit status is
+    0 where any frame was answered and the sequence was whole, else 2.
 
     Attributes:
         input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
         weights: a shipped name or a file.
-        resolution: grid cells along the longest side: fewer are faster.
+        resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
+        fit: auto follows the registered model where it explains the frame, if the weights carry one, and else asks the
+            network; off asks the network alone, for each frame anew; modes takes the model in any case.
         rate: frames per second at which a folder was recorded.
         every_frame: answer all frames, however long it takes, instead of the latest.
         watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
@@ -144,6 +150,7 @@ class StreamCommand:
     input: InputName
     weights: str
     resolution: Cells = 48
+    fit: StreamFit = "auto"
     rate: Positive = 30.0
     every_frame: bool = False
     watch: bool = False
@@ -172,6 +179,7 @@ class StreamCommand:
             reading=self.reading,
             isolation=self.isolation,
             inference=self.inference,
+            fit=self.fit,
         )
 
 

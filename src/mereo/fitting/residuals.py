@@ -146,12 +146,20 @@ class NetworkTerm:
         weights = model.weights(found.rest, found.labels)
         return cls(found.points, weights(model.mean), weights(model.modes), found.confidence)
 
+    @classmethod
+    def none(cls, model: StatisticalModel) -> "NetworkTerm":
+        """Term without correspondences, which adds nothing."""
+        empty = np.empty((0, 3))
+        return cls(empty, empty, np.empty((0, 3, model.count), dtype=np.float32), np.empty(0))
+
     def place(self, posed: Posed) -> Float[np.ndarray, "n 3"]:
         """Positions that the state gives the points."""
         return posed.place(self.mean + self.modes @ posed.z.astype(np.float32))
 
     def energy(self, posed: Posed, sigma: float) -> float:
-        """Mean robust squared distance, in squared sigmas."""
+        """Mean robust squared distance, in squared sigmas; 0 without correspondences."""
+        if len(self.target) == 0:
+            return 0.0
         distance = np.linalg.norm(self.place(posed) - self.target, axis=1)
         return float(self.confidence / self.confidence.sum() @ robust_square(distance, sigma))
 
@@ -159,6 +167,8 @@ class NetworkTerm:
         self, normal: NormalEquations, posed: Posed, sigma: float, worth: float, robust: bool
     ) -> NormalEquations:
         """Sum with the squared distances, together worth as many independent points as ``worth``."""
+        if len(self.target) == 0:
+            return normal
         points = self.place(posed)
         offset = points - self.target
         weight = self.confidence / self.confidence.sum() * (worth / sigma**2)

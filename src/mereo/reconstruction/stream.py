@@ -14,9 +14,9 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from mereo.geometry.camera import PointCloud
 from mereo.reconstruction.latest_slot import LatestSlot
 
+Content = TypeVar("Content")
 Result = TypeVar("Result")
 
 RECENT = 10_000
@@ -24,7 +24,7 @@ RECENT = 10_000
 
 
 @dataclass(frozen=True, eq=False)
-class StreamFrame:
+class StreamFrame(Generic[Content]):
     """Frame of a sequence, decoded when it is answered.
 
     Attributes:
@@ -35,7 +35,7 @@ class StreamFrame:
 
     name: str
     time_s: float
-    load: Callable[[], PointCloud]
+    load: Callable[[], Content]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,8 @@ class Outcome(Generic[Result]):
 
 
 def stream(
-    frames: Iterable[StreamFrame | None],
-    answer: Callable[[PointCloud], Result],
+    frames: Iterable[StreamFrame[Content] | None],
+    answer: Callable[[Content], Result],
     *,
     recorded_pace: bool = False,
     every_frame: bool = False,
@@ -106,12 +106,12 @@ def sentence(problem: Exception, name: str) -> str:
     return f"{name} cannot be answered ({reason}): record or write it again"
 
 
-class _Reading:
+class _Reading(Generic[Content]):
     """The reading thread's side of a stream."""
 
-    def __init__(self, frames: Iterable[StreamFrame | None], recorded_pace: bool, every_frame: bool) -> None:
+    def __init__(self, frames: Iterable[StreamFrame[Content] | None], recorded_pace: bool, every_frame: bool) -> None:
         self.frames, self.recorded_pace, self.every_frame = frames, recorded_pace, every_frame
-        self.slot = LatestSlot[StreamFrame]()
+        self.slot = LatestSlot[StreamFrame[Content]]()
         self.failure: Exception | None = None
 
     def run(self) -> None:

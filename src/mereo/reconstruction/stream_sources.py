@@ -7,14 +7,13 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
 from mereo.io.depth_formats import DEPTH_READERS
 from mereo.io.point_cloud_formats import CLOUD_READERS
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import find_object
+from mereo.reconstruction.observation import Observation, find_object
 from mereo.reconstruction.stream import StreamFrame
 from mereo.reconstruction.watched_folder import LOOK_S, WatchedFolder
 
@@ -24,7 +23,7 @@ STANDARD_INPUT = "-"
 
 def frames_of(
     source: str, reading: InputConfig, isolation: IsolationConfig, rate_hz: float = 30.0
-) -> Iterator[StreamFrame]:
+) -> Iterator[StreamFrame[Observation]]:
     """Frames of a source, in order; each is decoded when it is answered.
 
     Args:
@@ -61,7 +60,9 @@ def frames_in(folder: Path, reading: InputConfig) -> list[Path]:
     return files
 
 
-def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:
+def watched_frames(
+    source: str, reading: InputConfig, isolation: IsolationConfig
+) -> Iterator[StreamFrame[Observation] | None]:
     """Frames of a folder as their files arrive, without end; None where nothing new has come.
 
     Files that are there already come first. One that is written again is a new frame; see ``watched_folder`` on when a
@@ -77,7 +78,9 @@ def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig
     return _arriving(WatchedFolder(path, lambda file: _is_frame(file, reading)), reading, isolation)
 
 
-def _arriving(folder: WatchedFolder, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:
+def _arriving(
+    folder: WatchedFolder, reading: InputConfig, isolation: IsolationConfig
+) -> Iterator[StreamFrame[Observation] | None]:
     start = time.perf_counter()
     while True:
         begun = time.perf_counter()
@@ -94,7 +97,7 @@ def _is_frame(file: Path, reading: InputConfig) -> bool:
     return known and not file.name.startswith(".") and file != reading.mask and file.is_file()
 
 
-def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame]:
+def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame[Observation]]:
     start = time.perf_counter()
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(errors="surrogateescape")  # names are bytes: one that is no UTF-8 is still a file's
@@ -104,10 +107,10 @@ def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamF
             yield StreamFrame(name, time.perf_counter() - start, load)
 
 
-def _recorded(path: Path, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame]:
+def _recorded(path: Path, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame[Observation]]:
     for message, read in read_frames(path, reading):
         yield StreamFrame(message.name, message.time_s, _loader(read, isolation))
 
 
-def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], PointCloud]:
-    return lambda: find_object(read(), isolation).cloud
+def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], Observation]:
+    return lambda: find_object(read(), isolation)

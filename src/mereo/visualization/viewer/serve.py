@@ -19,6 +19,7 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
+from mereo.synthesis.recording import is_recording_folder, read_recording
 from mereo.visualization.answering import answer
 from mereo.visualization.result import Result
 from mereo.visualization.units import UNKNOWN, Unit
@@ -31,6 +32,7 @@ from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.open_page import OpenPage, is_interactive
 from mereo.visualization.viewer.probe import Inspection
 from mereo.visualization.viewer.result_page import open_answer
+from mereo.visualization.viewer.sequence_page import view_recording
 
 PORT = 8080
 """Port of the page where none is chosen."""
@@ -53,8 +55,9 @@ def view(
     """Look at a frame and its reconstruction in a browser, or move a scene by hand: ``mereo view``.
 
     Args:
-        input: a point cloud or depth image; a result of `mereo reconstruct` with a registered model (the folder, or its
-            state.json); a ``Result``; without it (and ``scene``) a shipped frame.
+        input: a point cloud or depth image; a folder of `mereo scene record`, which is played; a result of
+            `mereo reconstruct` with a registered model (the folder, or its state.json); a ``Result``; without it (and
+            ``scene``) a shipped frame.
         weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
         scene: open the laboratory of this scene: its name, or a scene file.
         state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
@@ -77,6 +80,8 @@ def view(
     if known is None and is_state(path):
         path, known = None, path
     named = None if weights is None else str(weights)
+    if path is not None and scene is None and is_recording_folder(path):
+        return view_recording(read_recording(path), named, place, host, inference).stay(block)
     if scene is not None:
         if path is not None:
             raise ValueError(f"both {path} and --scene {scene} are given; one can be shown: drop one")

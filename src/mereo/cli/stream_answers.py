@@ -1,0 +1,117 @@
+"""What ``mereo stream`` says of a frame: of the registered model that is followed, or of the network's surfaces."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.fitting.register import Registrar
+from mereo.fitting.tracker import Followed, Tracker
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.models.model import Model
+from mereo.reconstruction.observation import Observation
+from mereo.reconstruction.pipeline import Reconstruction, extract, reconstruct
+
+DIGITS = 6
+"""Digits of a printed coordinate."""
+
+
+class Seen(NamedTuple):
+    """Content of a frame, and when it was recorded, in seconds from any zero."""
+
+    observation: Observation
+    time_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrameAnswer:
+    """Answer to a frame of a stream, in the input's frame and units.
+
+    Attributes:
+        surfaces: of all segments.
+        segments: facts of each that was found, by its name: ``centroid``, ``volume``, and the network's ``confidence``
+            where the answer is the network's.
+        strays: number of points that were dropped.
+        method: "modes" of the registered model, or "network".
+        tracked: whether the last frame's state led to it, so that the network was not asked.
+        explained: share of the observed points that the registered model explains; None without one.
+    """
+
+    surfaces: SegmentedMesh
+    segments: dict[str, Any]
+    strays: int
+    method: str
+    tracked: bool
+    explained: float | None
+
+    @classmethod
+    def of_network(cls, found: Reconstruction, explained: float | None = None) -> "FrameAnswer":
+        """Answer that is the network's; ``explained`` is of a registration that was not taken."""
+        segments = {
+            segment.name: {
+                **_facts(segment.centroid, float(segment.volume)),
+                "confidence": round(float(segment.confidence), 3),
+            }
+            for segment in found.segments
+            if segment.voxels
+        }
+        return cls(found.surfaces, segments, found.reading.dropped, "network", False, explained)
+
+    @classmethod
+    def of_registration(cls, found: Followed) -> "FrameAnswer":
+        """Answer that is the registered model."""
+        assert found.registration is not None
+        mesh, registration = found.surfaces, found.registration
+        centroids, volumes = owned_centroids(mesh), mesh.owned_volumes
+        segments = {
+            name: _facts(centroid, float(volume))
+            for name, centroid, volume in zip(mesh.names, centroids, volumes, strict=True)
+        }
+        explained = round(registration.explained, 4)
+        return cls(mesh, segments, found.reading.dropped, registration.method, found.tracked, explained)
+
+
+def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
+    return {"centroid": [round(float(value), DIGITS) for value in centroid], "volume": volume}
+
+
+def owned_centroids(mesh: SegmentedMesh) -> Float[np.ndarray, "s 3"]:
+    """Centre of the volume that belongs to each segment: its mesh's without that of the segments nested in it."""
+    volumes, moments = mesh.owned_volumes, np.stack([first_moment(segment) for segment in mesh.segments])
+    for outer in range(len(moments)):  # the inner ones come first and are done
+        moments[outer] -= sum((moments[inner] for inner, other in mesh.nesting if other == outer), np.zeros(3))
+    centroids: Float[np.ndarray, "s 3"] = moments / volumes[:, None]
+    return centroids
+
+
+def first_moment(segment: Segment) -> Float[np.ndarray, "3"]:
+    """Volume times centroid of a closed mesh (divergence theorem), by tetrahedra with one corner at its middle."""
+    middle = segment.vertices.mean(axis=0)
+    a, b, c = (segment.vertices[segment.faces[:, i]] - middle for i in range(3))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
+    moment: Float[np.ndarray, "3"] = (volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle
+    return moment
+
+
+class Answering:
+    """Answers frames one after the other, following the object where there is a registrar."""
+
+    def __init__(self, model: Model, registrar: Registrar | None, resolution: int, keep_all: bool = False) -> None:
+        """Answering with a model; without a registrar the network alone answers each frame."""
+        self.model, self.resolution, self.keep_all = model, resolution, keep_all
+        self.tracker = None if registrar is None else Tracker(registrar)
+
+    def __call__(self, seen: Seen) -> FrameAnswer:
+        """Answer to a frame; raises ``ValueError`` for unusable clouds, and where nothing is found."""
+        frame, cloud = seen.observation.frame, seen.observation.cloud
+        if self.tracker is None:
+            found = reconstruct(cloud, self.model, self.resolution, frame.axes, keep_all=self.keep_all)
+            return FrameAnswer.of_network(found)
+        stated = self.tracker.registrar.stated_unit(frame.unit_m)
+        followed = self.tracker.follow(cloud, seen.time_s, frame.axes, stated_unit=stated, keep_all=self.keep_all)
+        if followed.taken:
+            return FrameAnswer.of_registration(followed)
+        assert followed.asked is not None
+        explained = None if followed.registration is None else round(followed.registration.explained, 4)
+        return FrameAnswer.of_network(extract(followed.asked.unaided, self.model, self.resolution), explained)

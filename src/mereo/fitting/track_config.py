@@ -1,0 +1,56 @@
+"""Constants of following an object from frame to frame; light, so that the command line may import them."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+StreamFit = Literal["off", "auto", "modes"]
+"""Source of the answers to a sequence, as ``FitChoice``; draws take longer than the time between two frames."""
+
+MotionModel = Literal["pose", "velocity"]
+"""What is expected of the next frame: the last state, or the last state moved on as it has moved."""
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """Constants of following an object.
+
+    Attributes:
+        motion: what is expected of the next frame.
+        speed: standard deviation of a material point's way from there, scene units per second.
+        gain: how many times its present speed is added to that: what is still stays still, what moves may turn.
+        dead: speed that noise alone makes a still object seem to have, which is not counted; scene units per second.
+        first_speed: the same while nothing is known of its motion, right after the network was asked.
+        least: standard deviation in however short a time, scene units.
+        smoothing: share of what a frame says of the motion that is believed, the rest is what was known before.
+        motion_worth: how many independent points the expectation is worth, in each direction.
+        points: denser clouds are averaged to so many points.
+        partners: observed points, evenly spread, that are compared with the surface.
+        first_sigma: the cloud's first standard deviation, as a share of half the rest box's longest side; it falls by
+            ``cooling`` in each step to that of the frame's noise.
+        steps, exact_steps: steps that ask samples of the surface, and last ones that ask its faces.
+        gate: distance from the expected surface beyond which a point is left out, as a share of the same half.
+        drop: share of the points by which a frame may be explained less than the best since the network was asked.
+        margin: share of the points that a frame's own fit must explain more than a lost track to take its place.
+        scale_std: standard deviation of the scale's logarithm from frame to frame, where the unit is not known.
+        longest_s: a longer time without a frame ends the track.
+    """
+
+    motion: MotionModel = "velocity"
+    speed: float = 1.0
+    gain: float = 10.0
+    dead: float = 0.5
+    first_speed: float = 20.0
+    least: float = 0.02
+    smoothing: float = 0.2
+    motion_worth: float = 300.0
+    points: int = 2000
+    partners: int = 500
+    first_sigma: float = 0.04
+    cooling: float = 0.5
+    steps: int = 3
+    exact_steps: int = 1
+    gate: float = 0.25
+    drop: float = 0.05
+    margin: float = 0.02
+    scale_std: float = 0.002
+    longest_s: float = 1.0

@@ -1,0 +1,177 @@
+"""One frame's fit of the modes, from the state of the frame before.
+
+    Track (state, time), cloud -next_fit-> ModesFit, another Track
+
+Against a fit of a frame by itself: no network, no wide start, no other states. What takes the network's place is the
+expectation that material points are where they were (or where they were going), up to a speed; as hidden ones hardly
+have any other evidence, they come to rest.
+"""
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mereo.deformation.moving_least_squares import spread
+from mereo.fitting.correspondences import Correspondences
+from mereo.fitting.evidence import Evidence
+from mereo.fitting.fit import KNOWN_SCALE_STD, ModesFit, one_thread
+from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed, in_space
+from mereo.fitting.priors import Prior
+from mereo.fitting.problem import Problem
+from mereo.fitting.residuals import NetworkTerm
+from mereo.fitting.track_config import TrackConfig
+from mereo.geometry.downsampling import means_along_sight
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """State of an object at a time, from which the next frame is fitted.
+
+    Attributes:
+        problem: of that frame, without correspondences: the model, and constants by the frame's noise.
+        unit: length of a scene unit in the clouds' unit.
+        posed: the state, scene units, without a scale.
+        time_s: of the frame.
+        velocity: of the parameters, in the order of ``gauss_newton``, a second.
+        unsure: how far the velocity may be off because little is known yet, scene units per second.
+    """
+
+    problem: Problem
+    unit: float
+    posed: Posed
+    time_s: float
+    velocity: Float[np.ndarray, " p"]
+    unsure: float
+
+    @classmethod
+    def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig) -> "Track":
+        """Track that begins with a frame's own fit."""
+        scale = float(np.exp(fitted.posed.log_scale))
+        posed = replace(fitted.posed, translation=fitted.posed.translation / scale, log_scale=0.0)
+        base, model = fitted.problem, fitted.problem.model
+        scale_std = KNOWN_SCALE_STD if base.scale_std == KNOWN_SCALE_STD else config.scale_std
+        problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
+        share_surfaces(base, problem)
+        return cls(problem, fitted.unit * scale, posed, time_s, np.zeros(POSE + model.count), config.first_speed)
+
+    def expected(self, time_s: float, config: TrackConfig) -> Posed:
+        """State that is expected at a time."""
+        if config.motion == "pose":
+            return self.posed
+        return self.posed.moved(self.velocity * (time_s - self.time_s))
+
+
+def share_surfaces(base: Problem, other: Problem) -> None:
+    """Give a problem of the same model what another has prepared of the model's surface."""
+    vars(other).update({"pairs": base.pairs, "samples": base.samples})
+
+
+def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig) -> Bool[np.ndarray, " n"]:
+    """Which points, in the cloud's unit, lie near the expected surface; others are strays, or the object is lost."""
+    samples = track.problem.samples.every(2)
+    place = samples.posed(track.expected(time_s, config)).place
+    most = config.gate * track.problem.model.half + samples.spacing
+    distance = cKDTree(place).query(points / track.unit, distance_upper_bound=most)[0]
+    return np.isfinite(distance)
+
+
+def next_fit(
+    track: Track,
+    points: Float[np.ndarray, "n 3"],
+    doubtful: Float[np.ndarray, "d 3"],
+    time_s: float,
+    config: TrackConfig,
+) -> tuple[ModesFit, Track]:
+    """Fit of the modes to a frame, and the track that ends with it.
+
+    Args:
+        track: up to the frame before.
+        points: of the object, camera frame, the clouds' unit.
+        doubtful: points that are none of it (``Evidence.of``).
+        time_s: of the frame.
+        config: constants.
+    """
+    started = time.perf_counter()
+    with one_thread():
+        few = means_along_sight(points / track.unit, config.points)
+        evidence = Evidence.of(few, doubtful / track.unit)
+        evidence = replace(evidence, partners=evidence.points[spread(evidence.points, config.partners)])
+        problem = replace(track.problem, evidence=evidence)
+        share_surfaces(track.problem, problem)
+        start = track.expected(time_s, config)
+        passed = max(time_s - track.time_s, 0.0)
+        posed = descend(problem, start, Expectation.of(track, start, passed, config), config)
+    fitted = ModesFit(problem, nothing(), track.unit, posed, time.perf_counter() - started)
+    return fitted, followed(track, fitted, time_s, config)
+
+
+def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig) -> Track:
+    """Track with a further frame."""
+    scale = float(np.exp(fitted.posed.log_scale))
+    posed = replace(fitted.posed, translation=fitted.posed.translation / scale, log_scale=0.0)
+    passed = max(time_s - track.time_s, 1e-3)
+    velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
+    unsure = track.unsure * (1 - config.smoothing)
+    return Track(fitted.problem, track.unit * scale, posed, time_s, velocity, unsure)
+
+
+def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:
+    """Step of the parameters from one state to another: ``first.moved(step)`` is ``second``."""
+    turn = Rotation.from_matrix(second.rotation @ first.rotation.T).as_rotvec()
+    scale = [second.log_scale - first.log_scale]
+    return np.concatenate([turn, second.translation - first.translation, scale, second.z - first.z])
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Expectation of where material points are: a Gaussian of the parameters around a state.
+
+    Attributes:
+        state: the expected one.
+        precision: of the step from it.
+    """
+
+    state: Posed
+    precision: Float[np.ndarray, "p p"]
+
+    @classmethod
+    def of(cls, track: Track, state: Posed, passed_s: float, config: TrackConfig) -> "Expectation":
+        """Expectation after a time: each point is where ``state`` has it, up to its speeds times that."""
+        model = track.problem.model
+        rows = model.sparse
+        modes = model.modes[rows]
+        place = state.place(model.mean[rows] + modes @ state.z.astype(np.float32))
+        jacobian = in_space(state, place, modes).astype(np.float64)
+        squared = jacobian.T @ jacobian / len(rows)
+        known = float(np.sqrt(track.velocity @ squared @ track.velocity))
+        speed = config.speed + max(config.gain * max(known - config.dead, 0.0), track.unsure)
+        sigma = speed * passed_s + config.least
+        return cls(state, squared * (config.motion_worth / sigma**2))
+
+    def add_to(self, normal: NormalEquations, posed: Posed) -> NormalEquations:
+        """Sum with the squared distance from the expectation."""
+        gradient = self.precision @ between(self.state, posed)
+        return NormalEquations(normal.matrix + self.precision, normal.gradient + gradient)
+
+
+def descend(problem: Problem, start: Posed, expectation: Expectation, config: TrackConfig) -> Posed:
+    """State that explains cloud, silhouette, prior and expectation, from nearby."""
+    constants, half = problem.config, problem.model.half
+    prior = Prior.whole(problem.model)
+    posed, steps = start, config.steps + config.exact_steps
+    for step in range(steps):
+        sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)
+        normal = expectation.add_to(problem.known(posed, prior, 0.0), posed)
+        normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
+        posed = posed.moved(normal.step(constants.damping))
+    return posed
+
+
+def nothing() -> Correspondences:
+    """No correspondences."""
+    none = np.empty((0, 3))
+    return Correspondences(none, none, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))

@@ -1,0 +1,254 @@
+"""A sequence as a folder: frames that `mereo stream` reads, and the truth of each, so that answers can be scored.
+
+    sequence -write_recording-> frames/*.png, camera.json, truth.npz, recording.json -read_recording-> Recording
+
+Frames are depth images in metres with the object cut out, as a camera with a segmentation gives them. The truth holds
+the surface itself, so it is read without the scene, and the scene's draws, which play the state again.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+
+from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.io.atomic_files import write_json
+from mereo.io.config import InputConfig
+from mereo.io.errors import quiet, reason
+from mereo.io.sensor_frame import read_frame
+from mereo.io.size_limits import read_arrays
+from mereo.scenes.draw_recorder import Call
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis.config import Sensor, SensorConfig
+from mereo.synthesis.recording_index import (
+    FORMAT,
+    INDEX,
+    RecordedFrame,
+    RecordedSegment,
+    RecordingIndex,
+    read_index,
+)
+from mereo.synthesis.sequence_config import SequenceConfig
+from mereo.synthesis.sequences import Moment, sequence
+
+FRAMES, CAMERA, TRUTH = "frames", "camera.json", "truth.npz"
+"""Names in the folder: of the frames' own folder, and of the files beside it."""
+
+FINEST = 10_000.0
+"""Largest number of depth steps in a metre."""
+
+LARGEST_PIXEL = 65_535
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Recorded sequence: its frames, and where the object truly is in each.
+
+    Attributes:
+        folder: where it is.
+        index: what it is of.
+        vertices: of all segments, one after the other, camera frame, scene units.
+        faces: of these.
+        counts: vertices and faces of each segment.
+        T_world_camera: pose of the camera in each frame.
+        draws: of each state in the order of the calls, as shares; ``sizes`` of the calls tell them apart.
+        sizes: numbers of each call.
+    """
+
+    folder: Path
+    index: RecordingIndex
+    vertices: Float[np.ndarray, "n v 3"]
+    faces: np.ndarray
+    counts: np.ndarray
+    T_world_camera: Float[np.ndarray, "n 4 4"]
+    draws: Float[np.ndarray, "n d"]
+    sizes: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.index.frames)
+
+    @property
+    def times_s(self) -> list[float]:
+        """Time of each frame."""
+        return [frame.time_s for frame in self.index.frames]
+
+    @property
+    def reading(self) -> InputConfig:
+        """How its frames are read."""
+        return InputConfig(intrinsics=self.folder / CAMERA)
+
+    def cloud(self, number: int) -> PointCloud:
+        """Points of a frame, camera frame, metres; raises as ``read_frame`` does."""
+        return read_frame(self.folder / FRAMES / self.index.frames[number].file, self.reading).cloud
+
+    def truth(self, number: int) -> SegmentedMesh:
+        """True segments in a frame, camera frame, metres."""
+        return self._rest.with_vertices(self._parts(self.vertices[number].astype(np.float64) * self.index.unit_m))
+
+    @cached_property
+    def _rest(self) -> SegmentedMesh:
+        faces = np.split(self.faces, np.cumsum(self.counts[:, 1])[:-1])
+        first = np.cumsum([0, *self.counts[:-1, 0]])
+        segments = tuple(
+            Segment(one.name, one.color, vertices, part - start, one.solid)
+            for one, vertices, part, start in zip(
+                self.index.segments, self._parts(self.vertices[0].astype(np.float64)), faces, first, strict=True
+            )
+        )
+        return SegmentedMesh(segments, self.index.nested)
+
+    def _parts(self, vertices: Float[np.ndarray, "v 3"]) -> list[Float[np.ndarray, "_ 3"]]:
+        return np.split(vertices, np.cumsum(self.counts[:, 0])[:-1])
+
+
+def write_recording(
+    folder: Path,
+    scene: Scene,
+    settings: SequenceConfig,
+    sensor: tuple[Sensor, SensorConfig],
+    seed: int,
+    *,
+    named: str = "",
+) -> RecordingIndex:
+    """Write a sequence of a scene into an empty folder.
+
+    Args:
+        folder: exists and is empty.
+        scene: the object.
+        settings: of the sequence.
+        sensor: simulated camera, and its name.
+        seed: of everything.
+        named: how the scene was named; by default by its own name.
+
+    Raises ``ValueError`` as ``sequence`` does.
+    """
+    unit_m = sensor[1].metres_per_unit if scene.unit_m is None else scene.unit_m
+    (folder / FRAMES).mkdir()
+    truth, frames, scale, camera = _Truth(), [], FINEST, None
+    digits = max(4, len(str(settings.frames - 1)))
+    for number, moment in enumerate(sequence(scene, settings, sensor[1], seed)):
+        image = moment.seen.image
+        if camera is None:
+            farthest = 2 * float(image.depth.max()) * unit_m
+            scale = min(FINEST, 10.0 ** np.floor(np.log10(LARGEST_PIXEL / farthest)))
+            camera = image.camera
+        steps = np.minimum(np.rint(image.depth * unit_m * scale), LARGEST_PIXEL).astype(np.uint16)
+        file = f"{number:0{digits}}.png"
+        Image.fromarray(steps).save(folder / FRAMES / file)
+        frames.append(RecordedFrame(file=file, time_s=moment.time_s, points=moment.seen.object_points))
+        truth.add(moment)
+    assert camera is not None
+    write_json(folder / CAMERA, _camera(camera, scale))
+    truth.write(folder / TRUTH, scene.rest)
+    rest = scene.rest
+    index = RecordingIndex(
+        format=FORMAT,
+        scene=named or scene.name,
+        seed=seed,
+        rate_hz=float(settings.rate),
+        unit_m=float(unit_m),
+        hidden_s=settings.hidden_s,
+        sensor=sensor[0],
+        segments=tuple(RecordedSegment(name=one.name, color=one.color, solid=one.solid) for one in rest.segments),
+        nested=rest.nested,
+        frames=tuple(frames),
+    )
+    write_json(folder / INDEX, index.model_dump())
+    return index
+
+
+def _camera(camera: Camera, scale: float) -> dict[str, float]:
+    """Intrinsics as ``read_intrinsics`` reads them."""
+    size, focal = (camera.width, camera.height), (camera.focal_x_px, camera.focal_y_px)
+    center = (camera.center_x_px, camera.center_y_px)
+    names = ("width", "height", "fx", "fy", "cx", "cy", "pixel_center", "depth_scale")
+    return dict(zip(names, (*size, *focal, *center, 0.5, scale), strict=True))
+
+
+class _Truth:
+    """Truth of a sequence, gathered frame by frame: the pictures themselves would not fit into memory."""
+
+    def __init__(self) -> None:
+        self.vertices: list[Float[np.ndarray, "v 3"]] = []
+        self.poses: list[Float[np.ndarray, "4 4"]] = []
+        self.calls: list[tuple[Call, ...]] = []
+
+    def add(self, moment: Moment) -> None:
+        self.vertices.append(np.concatenate([one.vertices for one in moment.mesh.segments]).astype(np.float32))
+        self.poses.append(moment.T_world_camera)
+        self.calls.append(moment.played.calls)
+
+    def write(self, path: Path, rest: SegmentedMesh) -> None:
+        np.savez_compressed(
+            path,
+            vertices=np.stack(self.vertices),
+            faces=rest.merged()[1].astype(np.int32),
+            counts=np.array([(len(one.vertices), len(one.faces)) for one in rest.segments]),
+            T_world_camera=np.stack(self.poses),
+            draws=np.stack([np.concatenate([np.empty(0), *(call.shares for call in calls)]) for calls in self.calls]),
+            sizes=np.array([len(call.shares) for call in self.calls[0]], dtype=np.int64),
+        )
+
+
+def is_recording_folder(path: Path) -> bool:
+    """Whether a path is a folder that `mereo scene record` wrote."""
+    return (path / INDEX).is_file()
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Recording from its folder.
+
+    Raises ``FileNotFoundError`` where there is none, and ``ValueError`` where its files are damaged or do not belong
+    together.
+    """
+    folder = Path(path)
+    if not (folder / INDEX).is_file():
+        raise FileNotFoundError(f"{folder} has no {INDEX}; `mereo scene record` writes such a folder: check the path")
+    index = read_index(folder / INDEX)
+    try:
+        with quiet():
+            arrays = read_arrays(folder / TRUTH)
+            kept = {name: arrays[name] for name in Recording.__dataclass_fields__ if name in arrays}
+            result = Recording(folder, index, **kept)
+            _check(result)
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever a damaged archive makes of zlib, tokenize and numpy
+        raise ValueError(
+            f"{folder / TRUTH} is not the truth of this recording ({reason(error)}); record the sequence again"
+        ) from None
+    return result
+
+
+def _check(found: Recording) -> None:
+    """Raise ``ValueError`` (its reason only) where arrays have other shapes than the index and each other."""
+    frames, segments = len(found), len(found.index.segments)
+    vertices = found.vertices
+    if vertices.ndim != 3 or vertices.shape[0] != frames or vertices.shape[2] != 3 or vertices.dtype.kind != "f":
+        raise ValueError(f"its vertices have the shape {vertices.shape} for {frames} frames")
+    if not np.isfinite(vertices).all() or np.abs(vertices).max(initial=0) > 1e12:
+        raise ValueError("its vertices are not all finite")
+    if found.counts.shape != (segments, 2) or found.counts.dtype.kind != "i" or found.counts.min() < 1:
+        raise ValueError(f"it counts other segments than the {segments} of the index")
+    if tuple(found.counts.sum(axis=0)) != (vertices.shape[1], len(found.faces)):
+        raise ValueError("its counts are not those of its vertices and faces")
+    if found.faces.ndim != 2 or found.faces.shape[1] != 3 or found.faces.dtype.kind != "i":
+        raise ValueError(f"its faces have the shape {found.faces.shape}")
+    last = np.cumsum(found.counts[:, 0])
+    owner = np.repeat(np.arange(segments), found.counts[:, 1])[:, None]
+    if (found.faces < (last - found.counts[:, 0])[owner]).any() or (found.faces >= last[owner]).any():
+        raise ValueError("its faces name vertices that are not there")
+
+
+def training_seed(seed: int, test: bool) -> int:
+    """The seed; raises ``ValueError`` for one for testing that ``test`` does not allow."""
+    if seed >= TEST_SEED_START and not test:
+        raise ValueError(
+            f"the seed is {seed}; seeds from {TEST_SEED_START} up are for testing: take a smaller one, or say --test"
+        )
+    return seed

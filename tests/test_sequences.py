@@ -1,0 +1,230 @@
+"""Walks through a scene's states, sequences of frames, and the folders that they are recorded in."""
+
+import json
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import until
+from toy_scene import Shear, rest_mesh, toy_scene
+
+from mereo import __main__ as command_line
+from mereo.deformation.maps import Deformation
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.scenes.given_draws import played_back
+from mereo.scenes.parameters import random_state
+from mereo.scenes.scene import Scene
+from mereo.scenes.walks import process_weights, switches, walk
+from mereo.synthesis.clutter import OCCLUDER
+from mereo.synthesis.config import SENSORS
+from mereo.synthesis.recording import Recording, is_recording_folder, read_recording, write_recording
+from mereo.synthesis.sequence_config import SequenceConfig
+from mereo.synthesis.sequences import Moment, sequence
+from mereo.visualization.viewer import display
+from mereo.visualization.viewer.sequence_page import SequencePage
+
+needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
+SHORT = SequenceConfig(seconds=1.0, rate=12.0, occluded=0.5, image_size=48)
+
+
+def vertices(mesh: SegmentedMesh) -> np.ndarray:
+    return np.concatenate([segment.vertices for segment in mesh.segments])
+
+
+def places(scene: Scene, seed: int, times_s: np.ndarray, change_s: float = 1.0) -> np.ndarray:
+    return np.stack([vertices(scene.deform(one.deformations).mesh) for one in walk(scene, seed, times_s, change_s)])
+
+
+def test_a_walk_has_the_distribution_of_the_states_at_any_time() -> None:
+    weights = process_weights(np.linspace(0.0, 5.3, 50))
+    np.testing.assert_allclose((weights**2).sum(axis=1), 1.0)
+    assert weights.min() >= 0 and (np.count_nonzero(weights, axis=1) <= 4).all()
+
+
+def test_a_walk_starts_in_the_state_of_its_seed_and_moves_on_smoothly() -> None:
+    scene = toy_scene()
+    coarse, fine = (places(scene, 3, np.arange(0.0, 2.0, step)) for step in (0.1, 0.05))
+    start = vertices(scene.deform(random_state(scene, 3).deformations).mesh)
+    np.testing.assert_allclose(coarse[0], start, atol=1e-9)
+    np.testing.assert_allclose(coarse, fine[::2])
+    largest = [np.linalg.norm(np.diff(one, axis=0), axis=2).max() for one in (coarse, fine)]
+    assert 0.4 < largest[1] / largest[0] < 0.65  # half the time, half the way
+    assert np.linalg.norm(coarse[-1] - coarse[0], axis=1).max() > 1.0
+    assert not np.allclose(places(scene, 4, np.array([0.0, 1.0])), coarse[[0, 10]])
+
+
+def bent_or_not(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    shear = 3.0 * float(rng.uniform(-1.0, 1.0))
+    is_bent = float(rng.uniform()) < 0.5
+    bend = float(rng.uniform(0.1, 0.3)) if is_bent else 0.0
+    return 4 * (Shear(shear, bend, 0.0),)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_draws_that_decide_what_else_is_drawn_stay_as_they_are(seed: int) -> None:
+    scene = Scene("bent or not", rest_mesh(), bent_or_not)
+    start = random_state(scene, seed)
+    assert switches(scene, start) == {start.calls[1].key}
+    states = walk(scene, seed, np.arange(20) / 10, 1.0)
+    drawn = np.array([[call.shares[0] for call in one.calls] for one in states])
+    assert all(one.keys == start.keys for one in states) and np.ptp(drawn[:, 1]) == 0
+    assert np.ptp(drawn[:, 0]) > 0.1 and all(np.ptp(drawn[:, k]) > 0.1 for k in range(2, len(start.calls)))
+
+
+def refusing(most: float) -> Scene:
+    """A scene that draws again until its shear is small, and so refuses most of what lies between its states."""
+
+    def draw(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        for _ in range(2000):
+            a = float(rng.uniform(-1.0, 1.0))
+            if abs(abs(a) - 0.5) < most:
+                return 4 * (Shear(3.0 * a, 0.0, 0.0),)
+        raise ValueError("gave up")
+
+    return Scene("refusing", rest_mesh(), draw)
+
+
+def test_a_walk_goes_round_what_the_scene_refuses() -> None:
+    """And does not jump to the other side, from -0.5 to 0.5, where the scene would draw again."""
+    states = walk(refusing(0.2), 0, np.arange(20) / 10, 1.0)
+    drawn = np.array([2 * one.calls[0].shares[0] - 1 for one in states])
+    assert (np.abs(np.abs(drawn) - 0.5) < 0.2).all() and len(np.unique(np.sign(drawn))) == 1 and np.ptp(drawn) > 0.01
+
+
+def test_a_scene_that_refuses_everything_else_is_told() -> None:
+    allowed: list[float] = []
+
+    def draw(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        a = float(rng.uniform(-1.0, 1.0))
+        allowed.append(a) if not allowed else None
+        if a != allowed[0]:
+            raise ValueError("only the first")
+        return 4 * (Shear(a, 0.0, 0.0),)
+
+    with pytest.raises(ValueError, match="refuses the states between its own .* try another --seed, or a slower walk"):
+        walk(Scene("stubborn", rest_mesh(), draw), 0, np.arange(3) / 10, 1.0)
+
+
+@pytest.fixture(scope="module")
+def moments() -> list[Moment]:
+    return list(sequence(toy_scene(), SHORT, SENSORS["paper"], 5))
+
+
+def test_a_tool_passes_in_the_middle_and_the_camera_stays_near(moments: list[Moment]) -> None:
+    hidden = [bool((one.seen.source == OCCLUDER).any()) for one in moments]
+    start, end = SHORT.hidden_s
+    assert any(hidden) and all(start <= one.time_s < end for one, is_on in zip(moments, hidden, strict=True) if is_on)
+    assert not any((one.seen.mask & (one.seen.source == OCCLUDER)).any() for one in moments)
+    turns = [moments[0].T_world_camera[:3, 2] @ one.T_world_camera[:3, 2] for one in moments]
+    assert min(turns) > np.cos(0.6) and moments[3].time_s == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("sensor", ["paper", "structured-light"])
+def test_the_same_seed_is_the_same_sequence(sensor: str) -> None:
+    settings = SequenceConfig(seconds=0.2, rate=15.0, image_size=32, occluder="hand")
+    first, second = (list(sequence(toy_scene(), settings, SENSORS[sensor], 5)) for _ in range(2))  # type: ignore[index]
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.seen.image.depth, other.seen.image.depth)
+
+
+def test_a_sequence_of_one_frame_is_refused() -> None:
+    with pytest.raises(ValueError, match="0.01 s at 30 frames a second are 0 frames; a sequence has at least 2"):
+        SequenceConfig(seconds=0.01)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    folder = tmp_path_factory.mktemp("recording")
+    write_recording(folder, toy_scene(), SHORT, ("paper", SENSORS["paper"]), 5)
+    return read_recording(folder)
+
+
+def test_a_recording_holds_frames_and_their_truth(recording: Recording, moments: list[Moment]) -> None:
+    unit_m = recording.index.unit_m
+    assert len(recording) == 12 and is_recording_folder(recording.folder) and unit_m == 0.005
+    for number, moment in enumerate(moments):
+        truth, cloud = recording.truth(number), recording.cloud(number)
+        assert truth.names == moment.mesh.names and truth.colors == moment.mesh.colors
+        np.testing.assert_allclose(vertices(truth), unit_m * vertices(moment.mesh), rtol=1e-5)
+        np.testing.assert_allclose(cloud.points, unit_m * moment.seen.image.to_points().points, atol=1e-4)
+        assert np.median(Solids(truth).nearest(cloud.points).distance) < 0.15 * unit_m
+    assert recording.times_s == [one.time_s for one in moments]
+
+
+def test_a_recorded_state_can_be_played_again(recording: Recording) -> None:
+    scene = toy_scene()
+    shares = np.split(recording.draws[7], np.cumsum(recording.sizes)[:-1])
+    mesh = scene.deform(played_back(scene, recording.index.seed, shares).deformations).mesh
+    T_world_camera = recording.T_world_camera[7]
+    seen = (vertices(mesh) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    np.testing.assert_allclose(seen, recording.vertices[7], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "damage, sentence",
+    [
+        (lambda folder: (folder / "recording.json").unlink(), "has no recording.json; `mereo scene record` writes"),
+        (lambda folder: (folder / "recording.json").write_text("{"), "recording.json is no recording .*: record the"),
+        (lambda folder: changed(folder, format=7), "its format is 7; this mereo reads format 1"),
+        (lambda folder: changed(folder, rate_hz=0.0), "recording.json is no recording: its 'rate_hz'"),
+        (lambda folder: changed(folder, frames=[{"file": "../x.png", "time_s": 0, "points": 1}]), "frames.0.file"),
+        (lambda folder: (folder / "truth.npz").write_bytes(b"PK"), "truth.npz is not the truth of this recording"),
+        (lambda folder: changed(folder, segments=[{"name": "a", "color": [0, 0, 0], "solid": True}]), "other segments"),
+    ],
+)
+def test_a_damaged_recording_is_told(
+    recording: Recording, tmp_path: Path, damage: Callable[[Path], object], sentence: str
+) -> None:
+    for name in ("recording.json", "truth.npz", "camera.json"):
+        (tmp_path / name).write_bytes((recording.folder / name).read_bytes())
+    damage(tmp_path)
+    with pytest.raises((ValueError, FileNotFoundError), match=sentence):
+        read_recording(tmp_path)
+
+
+def changed(folder: Path, **fields: object) -> None:
+    path = folder / "recording.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **fields}))
+
+
+def test_the_command_records_what_stream_answers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "rope"
+    small = ["--seconds", "0.2", "--rate", "10", "--seed", "3"]
+    assert command_line.main(["scene", "record", "rope", "--output", str(out), *small]) == 0
+    assert "2 frames in 0.2 s" in capsys.readouterr().out and len(list((out / "frames").iterdir())) == 2
+    assert command_line.main(["stream", str(out), "--weights", "rope", "--every-frame", "--rate", "10"]) == 0
+    lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
+    assert [(one["method"], one["tracked"]) for one in lines] == [("modes", False), ("modes", True)]
+    assert all(one["explained"] > 0.9 for one in lines)
+    truth = read_recording(out).truth(1)
+    base = lines[1]["segments"]["base"]
+    np.testing.assert_allclose(base["centroid"], truth.segments[0].vertices.mean(axis=0), atol=0.02)
+    assert base["volume"] == pytest.approx(truth.segments[0].volume, rel=0.1)
+
+
+def test_test_seeds_are_for_testing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["scene", "record", "rope", "--output", str(tmp_path / "x"), "--seed", "1000000"]
+    assert command_line.main(out) == 2 and not (tmp_path / "x").exists()
+    assert "seeds from 1000000 up are for testing: take a smaller one, or say --test" in capsys.readouterr().err
+
+
+@needs_viser
+def test_the_page_plays_frames_and_answers(recording: Recording) -> None:
+    server = display.start_server(0, "mereo")
+    page = SequencePage(server, recording, lambda number: None if number == 4 else recording.truth(number), "toy")
+    try:
+        until(lambda: len(page.answers) == len(recording))
+        until(lambda: page.number.value > 0)  # it plays by itself
+        page.playing.value = False
+        page.number.value = 5
+        until(lambda: "in front" in page.told.content and len(page.found.handles) == 4)
+        page.number.value = 4
+        until(lambda: "not found" in page.told.content and not page.found.handles)
+        page.shown.value = "answer"
+        until(lambda: not page.true.handles)
+    finally:
+        page.close()
+        display.stop_server(server)

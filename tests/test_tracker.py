@@ -1,0 +1,229 @@
+"""An object that is followed: what is still stays, what jumps is found again, and slow ones are as if fitted alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.register import Registrar
+from mereo.fitting.registration import Registration
+from mereo.fitting.residuals import NetworkTerm
+from mereo.fitting.track_config import TrackConfig
+from mereo.fitting.tracker import Followed, Tracker
+from mereo.fitting.tracking import Expectation, Track, between
+from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid
+from mereo.models.model import Model
+from mereo.models.weights import load_model
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.scenes.walks import walk
+from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
+
+SEED, RATE_HZ = 740_000, 30.0
+
+
+@pytest.fixture(scope="module")
+def network() -> Model:
+    return load_model("engine")
+
+
+@pytest.fixture(scope="module")
+def registrar(network: Model) -> Registrar:
+    return Registrar.of(network, "modes")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene("engine")
+
+
+def seen(scene: Scene, mesh: SegmentedMesh, noise: float = 0.0, seed: int = 0) -> PointCloud:
+    camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
+    return add_depth_noise(render_depth(Solids(mesh), camera), noise, np.random.default_rng(seed)).to_points()
+
+
+def states(scene: Scene, seed: int, count: int, change_s: float) -> list[SegmentedMesh]:
+    """A slow walk, seen from one place; camera frame."""
+    meshes = [scene.deform(one.deformations).mesh for one in walk(scene, seed, np.arange(count) / RATE_HZ, change_s)]
+    T = inverse_rigid(scene.workspace.sample(example_rng(seed, 0), meshes[0].bounds.mean(axis=0)))
+    return [mesh.transformed(T) for mesh in meshes]
+
+
+@pytest.fixture(scope="module")
+def here(scene: Scene) -> SegmentedMesh:
+    return states(scene, SEED, 1, 1.0)[0]
+
+
+@pytest.fixture(scope="module")
+def there(scene: Scene) -> SegmentedMesh:
+    """Another state, seen from elsewhere."""
+    return states(scene, SEED + 5, 1, 1.0)[0]
+
+
+def vertices(mesh: SegmentedMesh) -> np.ndarray:
+    return np.concatenate([segment.vertices for segment in mesh.segments])
+
+
+def apart(found: Followed, mesh: SegmentedMesh) -> float:
+    """Mean distance of the vertices."""
+    return float(np.linalg.norm(vertices(found.surfaces) - vertices(mesh), axis=1).mean())
+
+
+def test_a_still_object_stays_and_the_network_is_asked_once(
+    registrar: Registrar, scene: Scene, here: SegmentedMesh
+) -> None:
+    tracker, cloud = Tracker(registrar), seen(scene, here)
+    found = [tracker.follow(cloud, number / RATE_HZ, scene_unit=1.0) for number in range(6)]
+    assert [one.tracked for one in found] == [False] + 5 * [True] and all(one.taken for one in found)
+    last = [vertices(one.surfaces) for one in found[-3:]]
+    assert np.linalg.norm(last[1] - last[0], axis=1).max() < 0.02 > np.linalg.norm(last[2] - last[1], axis=1).max()
+    assert apart(found[-1], here) < 0.2
+
+
+@pytest.mark.slow
+def test_noise_alone_moves_a_still_object_less_than_it_moves_single_fits(
+    registrar: Registrar, scene: Scene, here: SegmentedMesh
+) -> None:
+    tracker, clouds = Tracker(registrar), [seen(scene, here, 0.1, seed) for seed in range(10)]
+    found = [tracker.follow(cloud, number / RATE_HZ, scene_unit=1.0) for number, cloud in enumerate(clouds)]
+    places = np.stack([vertices(one.surfaces) for one in found[4:]])
+    alone = [registrar.fit_modes(cloud, scene_unit=1.0).registration().mesh for cloud in clouds[4:7]]
+    spread, single = (
+        float(np.sqrt(one.var(axis=0).sum(axis=1).mean())) for one in (places, np.stack([vertices(m) for m in alone]))
+    )
+    assert spread < 0.05 and spread < single
+
+
+def test_a_jump_is_found_again_in_its_own_frame(
+    registrar: Registrar, scene: Scene, here: SegmentedMesh, there: SegmentedMesh
+) -> None:
+    tracker = Tracker(registrar)
+    for number in range(2):
+        tracker.follow(seen(scene, here), number / RATE_HZ, scene_unit=1.0)
+    found = [tracker.follow(seen(scene, there), number / RATE_HZ, scene_unit=1.0) for number in (2, 3)]
+    assert [one.tracked for one in found] == [False, True]
+    assert found[0].registration is not None
+    own = registrar.fit_modes(seen(scene, there), scene_unit=1.0).registration()
+    np.testing.assert_allclose(found[0].registration.material, own.material, atol=1e-9)
+    assert apart(found[1], there) < apart(found[0], there) + 0.05
+
+
+@pytest.mark.parametrize("unit", [1.0, None])
+def test_a_slow_sequence_is_tracked_as_its_frames_are_fitted(
+    registrar: Registrar, scene: Scene, unit: float | None
+) -> None:
+    meshes, size = states(scene, SEED + 1, 8, 0.5), 1.0 if unit else 2.5
+    tracker = Tracker(registrar)
+    found = [
+        tracker.follow(size * seen(scene, mesh).points, i / RATE_HZ, scene_unit=unit) for i, mesh in enumerate(meshes)
+    ]
+    assert all(one.tracked for one in found[1:])
+    assert np.linalg.norm(vertices(meshes[-1]) - vertices(meshes[0]), axis=1).max() > 0.5
+    alone = Tracker(registrar).follow(size * seen(scene, meshes[-1]).points, 0.0, scene_unit=unit)
+    assert apart(found[-1], alone.surfaces) < 0.2 * size
+    # the unit that was found is kept
+    units = [one.registration.scene_unit for one in found if one.registration is not None]
+    assert units == pytest.approx(8 * [size], rel=0.02) and np.ptp(units) < 0.01 * size
+
+
+def test_an_object_that_goes_and_comes_again_is_found(
+    registrar: Registrar, scene: Scene, here: SegmentedMesh, there: SegmentedMesh
+) -> None:
+    tracker = Tracker(registrar)
+    tracker.follow(seen(scene, here), 0.0, scene_unit=1.0)
+    with pytest.raises(ValueError, match="points"):
+        tracker.follow(PointCloud(seen(scene, here).points[:3]), 0.1, scene_unit=1.0)
+    assert tracker.follow(seen(scene, here), 0.2, scene_unit=1.0).tracked
+    # elsewhere, and after more time than any expectation lasts
+    found = tracker.follow(seen(scene, there), 5.0, scene_unit=1.0)
+    assert not found.tracked and apart(found, there) < 1.0
+    assert tracker.follow(seen(scene, there), 5.1, scene_unit=1.0).tracked
+    tracker.forget()
+    assert not tracker.follow(seen(scene, there), 5.2, scene_unit=1.0).tracked
+
+
+def test_points_away_from_the_expected_surface_are_strays(
+    registrar: Registrar, scene: Scene, here: SegmentedMesh
+) -> None:
+    cloud, tracker = seen(scene, here), Tracker(registrar)
+    tracker.follow(cloud, 0.0, scene_unit=1.0)
+    behind = cloud.points[:12] * 1.5
+    found = tracker.follow(np.concatenate([cloud.points, behind]), 0.03, scene_unit=1.0)
+    assert found.tracked and found.reading.dropped == 12 and not found.reading.keep[-12:].any()
+    assert "tracked" in repr(found) and apart(found, here) < 0.2
+    assert tracker.follow(np.concatenate([cloud.points, behind]), 0.06, keep_all=True).reading.dropped == 0
+
+
+@pytest.mark.slow
+def test_a_scanners_frames_are_answered_in_its_frame(registrar: Registrar, scene: Scene, here: SegmentedMesh) -> None:
+    cloud, tracker = PointCloud(seen(scene, here).points @ SCANNER_TO_CAMERA.T), Tracker(registrar)
+    for number in range(2):
+        found = tracker.follow(cloud, number / RATE_HZ, "scanner", scene_unit=1.0)
+    assert found.tracked
+    assert np.median(Solids(found.surfaces).nearest(cloud.points).distance) < 0.2
+
+
+class Unbelieving(Registrar):
+    """Registrar for which no registration explains its frame."""
+
+    def takes(self, registration: Registration) -> bool:
+        return False
+
+
+def test_a_frame_that_nothing_explains_is_the_networks(
+    network: Model, registrar: Registrar, scene: Scene, here: SegmentedMesh
+) -> None:
+    tracker = Tracker(Unbelieving(network, registrar.model, "auto"))
+    found = tracker.follow(seen(scene, here), 0.0, scene_unit=1.0)
+    assert not found.taken and found.asked is not None and "network asked" in repr(found)
+    with pytest.raises(ValueError, match="no registration that explains it: ask the network, mereo.reconstruct"):
+        found.surfaces  # noqa: B018
+
+
+def some_state(count: int, seed: int) -> Posed:
+    rng = np.random.default_rng(seed)
+    turn = Posed(np.eye(3), np.zeros(3), np.zeros(count)).moved(np.r_[rng.normal(size=3), np.zeros(4 + count)])
+    return Posed(turn.rotation, 50 * rng.normal(size=3), rng.normal(size=count), 0.1)
+
+
+def test_the_step_between_states_leads_from_one_to_the_other() -> None:
+    first, second = some_state(5, 0), some_state(5, 1)
+    led = first.moved(between(first, second))
+    np.testing.assert_allclose(led.rotation, second.rotation, atol=1e-12)
+    np.testing.assert_allclose(led.translation, second.translation)
+    np.testing.assert_allclose(led.z, second.z)
+    assert led.log_scale == pytest.approx(second.log_scale)
+
+
+def test_without_evidence_the_expected_state_is_the_answer(
+    registrar: Registrar, scene: Scene, here: SegmentedMesh
+) -> None:
+    config = TrackConfig()
+    track = Track.of(registrar.fit_modes(seen(scene, here), scene_unit=1.0), 0.0, config)
+    count = POSE + track.problem.model.count
+    velocity = 0.1 * np.random.default_rng(0).normal(size=count)
+    moving = replace(track, velocity=velocity)
+    state = moving.expected(0.5, config)
+    np.testing.assert_allclose(between(track.posed, state), 0.5 * velocity, atol=1e-9)
+    assert replace(track, velocity=velocity).expected(0.5, replace(config, motion="pose")) is track.posed
+    expectation = Expectation.of(moving, state, 0.5, config)
+    nothing = NormalEquations(np.zeros((count, count)), np.zeros(count))
+    off = state.moved(0.01 * np.random.default_rng(1).normal(size=count))
+    back = off.moved(expectation.add_to(nothing, off).step(0.0))
+    np.testing.assert_allclose(back.place(np.eye(3)), state.place(np.eye(3)), atol=1e-2)
+    # what moves is less certain than what is still
+    still = Expectation.of(replace(moving, velocity=np.zeros(count), unsure=0.0), state, 0.5, config)
+    assert np.trace(still.precision) > 10 * np.trace(expectation.precision)
+
+
+def test_no_correspondences_add_nothing(registrar: Registrar) -> None:
+    model = registrar.model
+    none, state = NetworkTerm.none(model), some_state(model.count, 0)
+    normal = NormalEquations(np.eye(3), np.ones(3))
+    assert none.add_to(normal, state, 1.0, 10.0, robust=True) is normal and none.energy(state, 1.0) == 0.0
