@@ -65,6 +65,7 @@ def observe(
     noise_std: float,
     sensor: SensorConfig,
     rng: np.random.Generator,
+    *,
     occluders: tuple[Capsule, ...] = (),
     around: Surroundings | None = None,
 ) -> SimulatedView:

@@ -93,7 +93,8 @@ def sequence(scene: Scene, settings: SequenceConfig, sensor: SensorConfig, seed:
         solids = Solids(mesh)
         if around is None:
             around = _Around.of(solids, camera, T_world_camera, settings, sensor, example_rng(seed, 4))
-        seen = observe(solids, camera, settings.noise_std, clear, rng, around.at(time_s, solids, T_world_camera))
+        there = around.at(time_s, solids, T_world_camera)
+        seen = observe(solids, camera, settings.noise_std, clear, rng, around=there)
         yield Moment(float(time_s), played, mesh, T_world_camera, seen)
 
 

@@ -65,7 +65,7 @@ def see(solids: Solids, camera: Camera, sensing: Sensing) -> tuple[SimulatedView
     """
     capsules, hidden = in_front(solids, camera, sensing)
     rng = np.random.default_rng(0)
-    return observe(solids, camera, sensing.noise_std, SENSORS[sensing.sensor], rng, capsules), hidden
+    return observe(solids, camera, sensing.noise_std, SENSORS[sensing.sensor], rng, occluders=capsules), hidden
 
 
 def in_front(solids: Solids, camera: Camera, sensing: Sensing) -> tuple[tuple[Capsule, ...], float]:
