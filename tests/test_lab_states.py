@@ -69,7 +69,7 @@ def test_a_walk_is_smooth_and_comes_back() -> None:
 def test_a_walk_leaves_out_what_the_scene_refuses_and_keeps_choices() -> None:
     def fussy(rng: np.random.Generator) -> Any:
         kind, bend = int(rng.integers(0, 5)), float(rng.uniform(0, 1))
-        if bend > 0.8:
+        if bend > 0.5:
             raise ValueError("too far")
         seen.append(kind)
         return SCENE.sample_deformations(np.random.default_rng(kind))
@@ -78,7 +78,8 @@ def test_a_walk_leaves_out_what_the_scene_refuses_and_keeps_choices() -> None:
     scene = Scene("fussy", SCENE.rest, fussy)
     start = next(random_state(scene, seed) for seed in range(20) if _plays(scene, seed))
     seen.clear()
-    assert 5 < len(list(smooth_round(scene, start, 1, 40))) < 40
+    rounds = [list(smooth_round(scene, start, seed, 40)) for seed in range(4)]
+    assert all(len(states) > 5 for states in rounds) and any(len(states) < 40 for states in rounds)
     assert len(set(seen)) == 1
 
 

@@ -260,7 +260,7 @@ def set_value(scene: Scene, played: Played, parameter: Parameter, value: float) 
     return result
 
 
-def turned(shares: Shares, turn: float, seed: int) -> Shares:
+def turned(shares: Shares, turn: float, seed: int | tuple[int, int]) -> Shares:
     """Shares of many numbers moved at once, so that they stay as random as they were.
 
     As normal numbers z they go round a circle through other ones w: z cos + w sin has the same distribution everywhere

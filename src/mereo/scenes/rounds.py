@@ -1,7 +1,6 @@
 """Ways from a played state: a smooth round of all its draws that comes back to where it began, and rest."""
 
 from collections.abc import Iterator
-from zlib import crc32
 
 import numpy as np
 
@@ -20,13 +19,14 @@ def smooth_round(scene: Scene, start: Played, seed: int, count: int) -> Iterator
     """
     for step in range(1, count + 1):
         try:
-            yield played_back(scene, start.seed, [_share(call, step / count, seed) for call in start.calls])
+            shares = [_share(call, step / count, (seed, number)) for number, call in enumerate(start.calls)]
+            yield played_back(scene, start.seed, shares)
         except Refused:
             continue
 
 
-def _share(call: Call, turn: float, seed: int) -> Shares:
-    return turned(call.shares, turn, crc32(repr(call.key).encode()) + seed) if call.kind in SMOOTH else call.shares
+def _share(call: Call, turn: float, seed: tuple[int, int]) -> Shares:
+    return turned(call.shares, turn, seed) if call.kind in SMOOTH else call.shares
 
 
 def at_rest(scene: Scene, before: Played) -> Played:
