@@ -23,9 +23,7 @@ from mereo.__main__ import main
 
 BEFORE = Path(__file__).parent / "before"
 SHARD = "shard-00000.safetensors"
-GENERATE = (
-    "--examples 12 --seed 7 --workers 1 --points 96 --per-segment 12 --uniform-fraction 0.15"  # the default then
-)
+GENERATE = "--examples 12 --seed 7 --workers 1 --points 96 --per-segment 12 --uniform-fraction 0.15"  # the default then
 TRAIN = (
     "--preset tiny --precision float32 --compile off --batch 4 --queries 96 --epochs 4 --network.points 64 "
     "--network.neighbors 8 --network.mlp1 8 8 --network.mlp2 8 16 --network.mlp-global 16 16 --network.width 16 "

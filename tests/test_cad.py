@@ -22,6 +22,7 @@ from mereo.geometry.overlap import overlaps
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.learning.object_files import told_of
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.files.defaults import MOTION, UNPLACED, default_deformations, random_motion
 from mereo.scenes.files.refinement import TOLERANCE, refined
@@ -259,6 +260,7 @@ def test_the_pliers_hinge_is_proposed_and_valid(written: Path, capsys: pytest.Ca
     assert (
         "#  - type: joint  # turns on the round contact, radius 4.98, of pin and lower\n#    segments: [lower]" in text
     )
+    assert "Its parts touch like 2 joints, which that file proposes in comments" in told_of(written)
     head, tail = text.split("deformations:", 1)
     path = written.with_name("hinges.yaml")
     path.write_text(head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: bend")[0], flags=re.MULTILINE))

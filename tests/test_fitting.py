@@ -111,6 +111,10 @@ def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, r
     few = replace(registration, explained=0.9)
     assert few.doubt is not None and few.doubt.startswith("doubtful: 10% of the points are not the model's")
     assert replace(few, explained=0.93, ruled_out=None).doubt is None
+    other = replace(registration, explained=0.2, accepted=False).doubt
+    assert other is not None and "only 20% of the points can be the model's: this is probably another object" in other
+    far = replace(registration, z=registration.z + 10.0, method="modes")
+    assert far.beyond_states > 1.0 and far.doubt is not None and "outside those that were learned" in far.doubt
 
 
 def test_to_rest_undoes_to_camera(registration: Registration) -> None:

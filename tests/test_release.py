@@ -140,6 +140,8 @@ def test_a_shipped_name_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(FileNotFoundError, match="there are no weights 'runs'"):
         Path("runs").mkdir()
         find_weights("runs")
+    Path("runs/weights.safetensors").write_bytes(b"")
+    assert find_weights("runs") == Path("runs/weights.safetensors")
 
 
 def test_what_cannot_be_released_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -47,14 +47,11 @@ OWN_OBJECT = """[bold]On your own data[/bold]
   mereo reconstruct cloud.ply --weights bunny --output result
   mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --weights bunny --output result
 
-[bold]On your own object[/bold], from its meshes; docs/own-object.md explains each step
-  mereo scene new PART.stl PART.stl --output NAME.yaml
-  mereo scene check NAME.yaml
-  mereo scene preview NAME.yaml --output states.png
-  mereo generate NAME.yaml --examples 12000 --seed 1 --sampler nested-sort-sample --uniform-fraction 0.5 --output data
-  mereo train data --output run --preset base --init bunny
-  mereo evaluate run/weights.safetensors --scene NAME.yaml --output test
-  mereo reconstruct frame.ply --weights run/weights.safetensors --output result"""
+[bold]On your own object[/bold], from its meshes; docs/own-object.md has joints, and each step by itself
+  mereo learn PART.stl PART.stl --output learned --minutes 10
+  mereo reconstruct frame.ply --weights learned/weights.safetensors --scene learned/scene.yaml --output result
+
+In another shell, first: source .venv/bin/activate"""
 
 
 @dataclass(frozen=True, eq=False)

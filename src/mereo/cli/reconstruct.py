@@ -174,7 +174,7 @@ def print_source(found: Answer) -> None:
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
         print("that is too little to believe it: --fit auto keeps the network's answer")
-    elif found.taken and registration.doubt is not None:
+    if registration.doubt is not None:
         print(registration.doubt)
 
 

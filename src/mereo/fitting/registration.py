@@ -31,6 +31,13 @@ Of 95 believed fits to training views of eight objects, 15 were worse than the n
 the other rule finds 12 of these, all that are worse by more than .1 among them, and 7 of the other 80, none clean."""
 
 
+HARDLY = 0.5
+"""Share of the observed points below which it is probably another object, or no camera frame."""
+
+BEYOND = 1.0
+"""Scene units outside all that the model has seen (``Registration.beyond_states``), from which on it is doubtful."""
+
+
 @dataclass(frozen=True, eq=False)
 class Located:
     """Answer of a registration about points of the frame.
@@ -109,7 +116,13 @@ class Registration:
 
     @property
     def doubt(self) -> str | None:
-        """Sentence on why a registration may be wrong although it explains most of the frame; None without a reason."""
+        """Sentence on why a registration may be wrong; None without a reason."""
+        if self.explained < HARDLY:
+            return (
+                f"doubtful: only {self.explained:.0%} of the points can be the model's: this is probably another "
+                "object, not the object alone, or no camera frame: leave out what is not the object, turn the cloud "
+                "(--frame), or name the object's own weights"
+            )
         if self.ruled_out is not None and self.ruled_out > RULED_OUT:
             return (
                 f"doubtful: {self.ruled_out:.0%} of the model's surface lies where the frame shows none of it, beside "
@@ -119,6 +132,12 @@ class Registration:
             return (
                 f"doubtful: {1 - self.explained:.0%} of the points are not the model's: look at the result before you "
                 "rely on it, or leave out of the cloud what is not the object"
+            )
+        if self.beyond_states > BEYOND:
+            return (
+                f"doubtful: the state lies {self.beyond_states:.1f} scene units outside those that were learned, and "
+                "rigid parts may be bent: look at the result before you rely on it, or widen the scene's ranges and "
+                "learn it anew"
             )
         return None
 

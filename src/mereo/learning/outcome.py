@@ -7,8 +7,8 @@ from typing import Any
 
 from mereo.evaluation.metrics import format_score
 from mereo.learning.example_frame import FRAME
+from mereo.models.weights import WEIGHTS
 from mereo.scenes.scene import SCENES
-from mereo.training.trainer import WEIGHTS
 
 GOOD = 0.7
 """mIoU (IoU of an object in one piece) below which an answer is not to be relied upon."""

@@ -24,7 +24,7 @@ from mereo.learning.object_files import scene_for
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
-from mereo.models.weights import load_for
+from mereo.models.weights import WEIGHTS, load_for
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
@@ -227,7 +227,7 @@ def learn(
     processes = workers or os.cpu_count() or 1
     metrics = learning.learn(files, folder, minutes=minutes, init=init, units=units, workers=processes)
     return Learned(
-        weights=folder / trainer.WEIGHTS,
+        weights=folder / WEIGHTS,
         scene=scene_for(files, folder, units),
         frame=folder / FRAME,
         report=folder / learning.TEST / "report.html",

@@ -99,12 +99,18 @@ def shipped_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
 
+WEIGHTS = "weights.safetensors"
+"""File of weights in a folder of `mereo train` or `mereo learn`."""
+
+
 def find_weights(name: str | Path) -> Path:
-    """Path of weights that are given by a shipped name or as an existing file."""
+    """Path of weights that are given by a shipped name, as an existing file, or as the folder that holds them."""
     path = Path(name)
     shipped = SHIPPED / f"{name}.safetensors"
     if path.suffix == "" and not path.is_file() and shipped.is_file():
         return shipped
+    if (path / WEIGHTS).is_file():
+        return path / WEIGHTS
     if not path.is_file():
         raise FileNotFoundError(
             f"there are no weights {str(name)!r}; give a .safetensors file from mereo train or one of the shipped "

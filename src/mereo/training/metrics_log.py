@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +31,7 @@ class MetricsLog:
         self.board = _tensorboard(run_dir)
         self.draws = has_plots()
         if not self.draws:
-            print(f"{CURVES} is left out, for matplotlib, which draws it, {CURE}", flush=True)
+            _say_left_out()
 
     def add_step(self, step: int, rate: float, losses: dict[str, float]) -> None:
         """Add the row of a step; ``losses`` are the total under "loss" and its terms."""
@@ -88,6 +89,12 @@ class MetricsLog:
             self.rows = [row for row in rows if row["step"] <= step]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is not the table of a run ({error}); delete it to go on without it") from None
+
+
+@cache
+def _say_left_out() -> None:
+    """Once for a process, which may train many networks."""
+    print(f"{CURVES} is left out, for matplotlib, which draws it, {CURE}", flush=True)
 
 
 def _exact(name: str, value: float) -> str:

@@ -22,7 +22,7 @@ from mereo.models.config import Device
 from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
-from mereo.models.weights import save_model, trained_steps
+from mereo.models.weights import WEIGHTS, save_model, trained_steps
 from mereo.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mereo.training.config import TrainConfig
 from mereo.training.dataset import Batch, Dataset
@@ -35,8 +35,6 @@ from mereo.training.processes import Process, join_processes, meeting
 from mereo.training.run_directory import claim_run, fit_config, start_network, trained_model
 from mereo.training.steps_shown import StepsShown, steps_between
 from mereo.training.validation import choose_offsets, held_out, validate
-
-WEIGHTS = "weights.safetensors"
 
 
 def train(

@@ -180,7 +180,7 @@ class Result(Answer):
         to_camera = camera_axes(self.seen.frame.axes)
         points = transform_points(to_camera, self.seen.cloud.points)
         surfaces = self.reconstruction.surfaces.transformed(to_camera)
-        doubt = self.registration.doubt if self.taken and self.registration is not None else None
+        doubt = None if self.registration is None else self.registration.doubt
         lines = [self.source, *([] if doubt is None else [doubt])]
         return result_html(self.seen.frame.source, lines, points, surfaces, self.reconstruction.segments, self.unit)
 

@@ -31,6 +31,9 @@ PARALLEL = float(np.cos(np.deg2rad(3.0)))
 ROUND_TEST_RAD = 0.7
 """A part that such a turn brings onto itself does not show that it turns."""
 
+TURNS_ON, SLIDES_ALONG = "#  - type: joint  # turns on", "#  - type: joint  # slides along"
+"""Beginnings of the joints that a scene file proposes in comments."""
+
 
 @dataclass(frozen=True, eq=False)
 class Joint:

@@ -18,7 +18,7 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.files.build import placed
 from mereo.scenes.files.defaults import default_deformations, default_view, random_motion, rounded
 from mereo.scenes.files.deformation_blocks import BendBlock, LatticeBlock
-from mereo.scenes.files.joints import proposed_joints
+from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, proposed_joints
 from mereo.scenes.scene import SCENES, Workspace
 
 SIZE = 20.0
@@ -206,7 +206,7 @@ def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
             *(mesh.names[index] for index in (contact.first, contact.second))
         )
         lines += [
-            f"#  - type: joint  # {'turns on' if joint.hinge else 'slides along'} {found}",
+            f"{TURNS_ON if joint.hinge else SLIDES_ALONG} {found}",
             f"#    segments: [{', '.join(quoted(mesh.names[index]) for index in joint.moved)}]",
             f"#    pivot: {_numbers(contact.point)}",
             f"#    axis: {_numbers(joint.axis)}",
