@@ -98,7 +98,7 @@ def test_the_command_says_which_answer_it_is(model: Model, view: SampleView, tmp
     arguments += ["--output", str(tmp_path / "out"), "--resolution", "32", "--fit", "auto"]
     assert command_line.main(arguments) == 0
     facts = json.loads((tmp_path / "out/summary.json").read_text())["registration"]
-    assert facts["answer"] == "registration" and facts["method"] == "modes" and facts["explained"] > 0.95
+    assert facts["answer"] == "registration" and facts["method"] in ("modes", "draws") and facts["explained"] > 0.95
 
 
 def test_full_needs_a_scene(model: Model) -> None:
