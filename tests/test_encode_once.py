@@ -41,7 +41,8 @@ def test_a_trial_of_the_laboratory(encoded: list[np.ndarray]) -> None:
     laboratory = Laboratory(load_scene("rope"), load_model("rope"))
     view = laboratory.look(random_state(laboratory.scene, 3), laboratory.first_place())
     laboratory.rebuild(view, 16, 12)
-    assert len(encoded) == 1
+    assert 1 <= len(encoded) <= 2, "a frame that counts as noisy is smoothed, which is another cloud"
+    assert len({cloud.tobytes() for cloud in encoded}) == len(encoded)
 
 
 def test_a_result_that_is_written(encoded: list[np.ndarray], tmp_path: Path) -> None:

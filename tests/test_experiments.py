@@ -201,7 +201,7 @@ def test_a_store_makes_each_thing_once(tmp_path: Path, capsys: pytest.CaptureFix
         other = store.run(dataset, replace(recipe, loss="l1"))
     assert weights != other
     assert [len(list((tmp_path / kind).iterdir())) for kind in ("datasets", "runs", "scores")] == [1, 2, 1]
-    assert capsys.readouterr().out.count("64 examples made") == 1
+    assert capsys.readouterr().err.count("generate: 64 examples in") == 1
 
 
 @pytest.mark.slow
