@@ -59,8 +59,13 @@ class Evidence:
     around: Int[np.ndarray, "n k"]
 
     @classmethod
-    def of(cls, points: Float[np.ndarray, "n 3"], doubtful: Float[np.ndarray, "d 3"] | None = None) -> "Evidence":
-        """Prepare a cloud; its lines of sight start at the origin.
+    def of(
+        cls,
+        points: Float[np.ndarray, "n 3"],
+        doubtful: Float[np.ndarray, "d 3"] | None = None,
+        partners: int = PARTNERS,
+    ) -> "Evidence":
+        """Prepare a cloud, with so many ``partners`` at most; its lines of sight start at the origin.
 
         Along those of ``doubtful`` points, which a front end has taken for strays, anything may be: they are within
         the silhouette, and rule nothing out.
@@ -76,7 +81,7 @@ class Evidence:
             toward = doubtful / np.linalg.norm(doubtful, axis=1, keepdims=True)
             sight = cKDTree(np.concatenate([sight.data, toward]))
             front = np.concatenate([front, np.zeros(len(doubtful))])
-        return cls(points, points[spread(points, PARTNERS)], sight, ranges, front, pitch, near[:, 1:])
+        return cls(points, points[spread(points, partners)], sight, ranges, front, pitch, near[:, 1:])
 
     @property
     def with_more_partners(self) -> "Evidence":

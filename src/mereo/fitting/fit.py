@@ -101,14 +101,14 @@ class ModesFit:
             evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit)
             problem = Problem.of(model, found, evidence, scale_std, config)
             modes = fit_modes(problem)
-            noisy = problem.as_noisy_as(modes.posed)
+            noisy = problem.as_noisy_as(modes.surface)
         if noisy is not None:
             others = [] if ask_again is None else [ask_again().scaled(1 / unit)]
             with one_thread():
                 candidates = [(found, noisy), *((other, noisy.with_network(other)) for other in others)]
                 fits = [(*candidate, fit_modes(candidate[1])) for candidate in candidates]
                 other, noisy, again = min(fits, key=lambda fit: fit[2].misfit.without_network)
-                if noisy.leaves_noise(again.posed):
+                if noisy.leaves_noise(again.surface):
                     problem, found, modes = noisy, other, again
         with one_thread():
             rest = fit_rest(problem, found, modes.posed)

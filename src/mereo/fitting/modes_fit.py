@@ -26,7 +26,7 @@ def fit_modes(problem: Problem) -> "Judged":
     first = fit_whole(problem)
     best = Judged.of(problem, first).better(problem, refine(problem, first))
     for number in range(config.rounds if len(problem.model.pairs) >= config.curved else 0):
-        if problem.explained(best.misfit.cloud, Surface.of(problem.model, best.posed), config.explained):
+        if problem.explained(best.misfit.cloud, best.surface, config.explained):
             break
         before = best
         for other in likely(problem, best.posed, number):
@@ -38,15 +38,17 @@ def fit_modes(problem: Problem) -> "Judged":
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A state and its misfit."""
+    """A state, its misfit, and the surface that was judged."""
 
     posed: Posed
     misfit: Misfit
+    surface: Surface
 
     @classmethod
     def of(cls, problem: Problem, posed: Posed) -> "Judged":
         """Judge a state."""
-        return cls(posed, problem.misfit(posed))
+        surface = Surface.of(problem.model, posed)
+        return cls(posed, problem.misfit(posed, surface), surface)
 
     def better(self, problem: Problem, other: Posed) -> "Judged":
         """This, or the other where its misfit is lower."""

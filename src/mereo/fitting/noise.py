@@ -43,6 +43,13 @@ ACCEPTED = 0.75
 Of 13 noisy training views that explain .76 to .95, the network was better in one, that with .76."""
 
 
+def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+    """What each point's offset does not share with those around it, as large as its noise alone would be."""
+    own = offset - np.median(offset[around], axis=1)
+    # the median of k neighbours is itself off by pi / 2k of their variance
+    return own / np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
+
+
 def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> float:
     """Standard deviation of what each point's offset does not share with those around it; robust.
 
@@ -50,9 +57,7 @@ def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) ->
         offset: signed distance of each observed point from a fitted surface.
         around: indices of each point's neighbours.
     """
-    own = offset - np.median(offset[around], axis=1)
-    # the median of k neighbours is itself off by pi / 2k of their variance
-    return TO_STD * float(np.median(np.abs(own))) / float(np.sqrt(1.0 + np.pi / (2 * around.shape[1])))
+    return TO_STD * float(np.median(np.abs(unshared(offset, around))))
 
 
 def is_noise(offset: Float[np.ndarray, " n"], noise: float) -> bool:
@@ -62,8 +67,7 @@ def is_noise(offset: Float[np.ndarray, " n"], noise: float) -> bool:
 
 def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float) -> float:
     """Misfit of a cloud, in misfits of what its points' offsets do not share with those around them."""
-    own = offset - np.median(offset[around], axis=1)
-    own /= np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
+    own = unshared(offset, around)
     return float(robust_square(offset, sigma).mean() / max(robust_square(own, sigma).mean(), 1e-12))
 
 

@@ -108,13 +108,10 @@ class Problem:
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
         return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
 
-    def offsets(self, posed: Posed) -> Float[np.ndarray, " n"]:
-        """Signed distance of each observed point from the facing surface of a state, negative behind it."""
-        return Surface.of(self.model, posed).offsets(self.evidence.points)
-
-    def as_noisy_as(self, posed: Posed) -> "Problem | None":
+    def as_noisy_as(self, surface: Surface) -> "Problem | None":
         """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that."""
-        config = constants_for(noise_of(self.offsets(posed), self.evidence.around), self.config)
+        offset = surface.offsets(self.evidence.points)
+        config = constants_for(noise_of(offset, self.evidence.around), self.config)
         if config is self.config:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_partners, noisy=True)
@@ -123,18 +120,16 @@ class Problem:
         """The problem with other correspondences."""
         return replace(self, network=NetworkTerm.of(self.model, found))
 
-    def leaves_noise(self, posed: Posed) -> bool:
+    def leaves_noise(self, surface: Surface) -> bool:
         """Whether what a fit leaves over is noise, and not its own error."""
-        offset = self.offsets(posed)
+        offset = surface.offsets(self.evidence.points)
         return is_noise(offset, noise_of(offset, self.evidence.around))
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
         """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise."""
         if cloud < most or not self.noisy:
             return cloud < most
-        points = self.evidence.points
-        distance, face, place = surface.along_sight(points, self.far)
-        offset = np.copysign(distance, np.einsum("pi,pi->p", points - place, surface.normals[face]))
+        offset = surface.offsets(self.evidence.points, self.far)
         return shared(offset, self.evidence.around, self.config.cloud_sigma) < SHARED
 
     @property
@@ -195,10 +190,9 @@ class Problem:
         normal = add_cloud(normal, posed, partners, planes, sigma, self.config.cloud_worth)
         return add_witnesses(normal, posed, samples.few(self.config.witnesses), self.evidence, sigma)
 
-    def misfit(self, posed: Posed, sigma: float | None = None) -> Misfit:
-        """Misfit of a state; ``sigma`` of the cloud is its last one where not given."""
-        sigma = self.config.cloud_sigma if sigma is None else sigma
-        surface = Surface.of(self.model, posed)
+    def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
+        """Misfit of a state, whose ``surface`` may be there already."""
+        sigma, surface = self.config.cloud_sigma, surface or Surface.of(self.model, posed)
         cloud = float(robust_square(self.met(surface)[0], sigma).mean())
         amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * sigma)[1]
         outside = float(robust_square(amount, sigma, 4 * ROBUST).mean())

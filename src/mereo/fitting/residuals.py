@@ -111,9 +111,9 @@ class Surface:
     def _rays(self) -> EmbreeScene:
         return ray_scene(self.material - self._center, self.model.faces[self.facing])
 
-    def offsets(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
-        """Signed distance of each point from the facing surface, negative behind it."""
-        distance, face, place = self.nearest(points)
+    def offsets(self, points: Float[np.ndarray, "p 3"], far: float | None = None) -> Float[np.ndarray, " p"]:
+        """Signed distance of each point from the facing surface, negative behind it; with ``far``, ``along_sight``."""
+        distance, face, place = self.nearest(points) if far is None else self.along_sight(points, far)
         return np.copysign(distance, np.einsum("pi,pi->p", points - place, self.normals[face]))
 
     def planes(self, points: Float[np.ndarray, "p 3"], far: float) -> Planes:

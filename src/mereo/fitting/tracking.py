@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mereo.deformation.moving_least_squares import spread
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.fit import KNOWN_SCALE_STD, ModesFit, one_thread
@@ -50,8 +49,7 @@ class Track:
     @classmethod
     def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig) -> "Track":
         """Track that begins with a frame's own fit."""
-        scale = float(np.exp(fitted.posed.log_scale))
-        posed = replace(fitted.posed, translation=fitted.posed.translation / scale, log_scale=0.0)
+        posed, scale = without_scale(fitted.posed)
         base, model = fitted.problem, fitted.problem.model
         scale_std = KNOWN_SCALE_STD if base.scale_std == KNOWN_SCALE_STD else config.scale_std
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
@@ -63,6 +61,12 @@ class Track:
         if config.motion == "pose":
             return self.posed
         return self.posed.moved(self.velocity * (time_s - self.time_s))
+
+
+def without_scale(posed: Posed) -> tuple[Posed, float]:
+    """A state in the unit that its own scale makes of the scene's, and that scale."""
+    scale = float(np.exp(posed.log_scale))
+    return replace(posed, translation=posed.translation / scale, log_scale=0.0), scale
 
 
 def share_surfaces(base: Problem, other: Problem) -> None:
@@ -98,9 +102,7 @@ def next_fit(
     started = time.perf_counter()
     with one_thread():
         few = means_along_sight(points / track.unit, config.points)
-        evidence = Evidence.of(few, doubtful / track.unit)
-        evidence = replace(evidence, partners=evidence.points[spread(evidence.points, config.partners)])
-        problem = replace(track.problem, evidence=evidence)
+        problem = replace(track.problem, evidence=Evidence.of(few, doubtful / track.unit, config.partners))
         share_surfaces(track.problem, problem)
         start = track.expected(time_s, config)
         passed = max(time_s - track.time_s, 0.0)
@@ -111,8 +113,7 @@ def next_fit(
 
 def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig) -> Track:
     """Track with a further frame."""
-    scale = float(np.exp(fitted.posed.log_scale))
-    posed = replace(fitted.posed, translation=fitted.posed.translation / scale, log_scale=0.0)
+    posed, scale = without_scale(fitted.posed)
     passed = max(time_s - track.time_s, 1e-3)
     velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
     unsure = track.unsure * (1 - config.smoothing)

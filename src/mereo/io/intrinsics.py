@@ -62,6 +62,14 @@ def read_camera(path: str | Path, size: tuple[int, int] | None = None) -> Camera
     return read_intrinsics(path, size).camera
 
 
+def written_intrinsics(camera: Camera) -> dict[str, float]:
+    """Content of a JSON file of intrinsics, as ``read_intrinsics`` reads them."""
+    size, focal = (camera.width, camera.height), (camera.focal_x_px, camera.focal_y_px)
+    center = (camera.center_x_px, camera.center_y_px)
+    names = ("width", "height", "fx", "fy", "cx", "cy", "pixel_center")
+    return dict(zip(names, (*size, *focal, *center, 0.5), strict=True))
+
+
 def read_intrinsics(
     path: str | Path, size: tuple[int, int] | None = None, image: str | Path | None = None, index: int | None = None
 ) -> Intrinsics:

@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import write_json
 from mereo.io.config import InputConfig
 from mereo.io.errors import quiet, reason
+from mereo.io.intrinsics import written_intrinsics
 from mereo.io.sensor_frame import read_frame
 from mereo.io.size_limits import read_arrays
 from mereo.scenes.draw_recorder import Call
@@ -143,7 +144,7 @@ def write_recording(
         frames.append(RecordedFrame(file=file, time_s=moment.time_s, points=moment.seen.object_points))
         truth.add(moment)
     assert camera is not None
-    write_json(folder / CAMERA, _camera(camera, scale))
+    write_json(folder / CAMERA, {**written_intrinsics(camera), "depth_scale": scale})
     truth.write(folder / TRUTH, scene.rest)
     rest = scene.rest
     index = RecordingIndex(
@@ -160,14 +161,6 @@ def write_recording(
     )
     write_json(folder / INDEX, index.model_dump())
     return index
-
-
-def _camera(camera: Camera, scale: float) -> dict[str, float]:
-    """Intrinsics as ``read_intrinsics`` reads them."""
-    size, focal = (camera.width, camera.height), (camera.focal_x_px, camera.focal_y_px)
-    center = (camera.center_x_px, camera.center_y_px)
-    names = ("width", "height", "fx", "fy", "cx", "cy", "pixel_center", "depth_scale")
-    return dict(zip(names, (*size, *focal, *center, 0.5, scale), strict=True))
 
 
 class _Truth:

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mereo.evaluation.sample_views import GUESSED_UNIT_M
-from mereo.geometry.camera import Camera
+from mereo.io.intrinsics import written_intrinsics
 from mereo.io.writers.ply import write_positions_ply
 from mereo.scenes.scene import Scene
 from mereo.synthesis.examples import View
@@ -34,7 +34,7 @@ def frame_archive(scene: Scene, view: View) -> bytes:
         folder = Path(place) / file_name(scene, "frame")
         folder.mkdir()
         np.save(folder / "depth.npy", (view.depth.depth * unit_m).astype(np.float32))
-        (folder / "camera.json").write_text(json.dumps(_intrinsics(view.depth.camera), indent=2) + "\n", "utf-8")
+        (folder / "camera.json").write_text(json.dumps(written_intrinsics(view.depth.camera), indent=2) + "\n", "utf-8")
         write_positions_ply(folder / "cloud.ply", view.depth.to_points().points * unit_m, comment="unit: metres")
         (folder / "README.txt").write_text(
             f"A depth image of the scene {scene.name!r}, in metres, 0 where nothing was measured; cloud.ply has "
@@ -43,18 +43,6 @@ def frame_archive(scene: Scene, view: View) -> bytes:
             "utf-8",
         )
         return zipped(folder)
-
-
-def _intrinsics(camera: Camera) -> dict[str, float]:
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.focal_x_px,
-        "fy": camera.focal_y_px,
-        "cx": camera.center_x_px,
-        "cy": camera.center_y_px,
-        "pixel_center": 0.5,
-    }
 
 
 def result_archive(scene: Scene, result: Result) -> bytes:
