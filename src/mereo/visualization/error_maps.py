@@ -78,9 +78,8 @@ def error_picture(
         images += [name_plate(case.name, size // 2, size), *_error_row(case, direction, up, size)]
         captions += ["", *COLUMNS]
     sheet = contact_sheet(images, captions, 1 + len(COLUMNS))
-    scale = offset_colors(np.linspace(-FULL_CELLS, FULL_CELLS, 181))
     strips = [
-        scale_bar(scale, SCALE_TITLE, SCALE_WORDS, sheet.shape[1]),
+        _offset_scale(sheet.shape[1]),
         legend(SEGMENTATION_WORDS, (PALE, WRONG, ONE_SIDED), sheet.shape[1]),
     ]
     save_png(path, np.concatenate([sheet, *strips]))
@@ -126,9 +125,13 @@ def comparison_picture(path: str | Path, comparison: Comparison, size: int = 320
         captions += [f"{views[0].name}, reference", *words]
     sheet = contact_sheet(images, captions, 1 + len(comparison.rows[0]))
     if comparison.shown == "reconstruction error":
-        scale = offset_colors(np.linspace(-FULL_CELLS, FULL_CELLS, 181))
-        sheet = np.concatenate([sheet, scale_bar(scale, SCALE_TITLE, SCALE_WORDS, sheet.shape[1])])
+        sheet = np.concatenate([sheet, _offset_scale(sheet.shape[1])])
     save_png(path, sheet)
+
+
+def _offset_scale(width: int) -> Picture:
+    """Scale of ``offset_colors``, for the foot of a picture."""
+    return scale_bar(offset_colors(np.linspace(-FULL_CELLS, FULL_CELLS, 181)), SCALE_TITLE, SCALE_WORDS, width)
 
 
 def _error_row(case: EvaluatedView, direction: Vector, up: Vector, size: int) -> list[Picture]:

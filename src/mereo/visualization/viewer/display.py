@@ -152,6 +152,18 @@ class Display:
         """Points of the stage in the input's frame."""
         return points / self.scale + self.center
 
+    def show_points(self, name: str, points: Float[np.ndarray, "n 3"], visible: bool) -> None:
+        """Show observed points, at places of the stage."""
+        self.server.scene.add_point_cloud(
+            name,
+            points,
+            CLOUD_COLOR,
+            point_size=point_size(points),
+            point_shape="circle",
+            precision="float32",
+            visible=visible,
+        )
+
     def look_from(
         self,
         direction: Float[np.ndarray, "3"],

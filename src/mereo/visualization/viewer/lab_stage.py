@@ -21,7 +21,7 @@ from mereo.visualization.vertex_colors import (
     observed_distance,
     surface_error,
 )
-from mereo.visualization.viewer.display import CLOUD_COLOR, Display, SegmentLayer, Shown, point_size
+from mereo.visualization.viewer.display import Display, SegmentLayer, Shown
 from mereo.visualization.viewer.laboratory import Laboratory, Trial, depth_picture
 from mereo.visualization.viewer.sight import Sight
 
@@ -90,8 +90,13 @@ class LabStage:
         found = None if moment.trial is None or mode == "truth" else moment.trial.reconstruction.surfaces
         meshes = [(found, -aside)] if found is not None else []
         meshes += [(moment.view.mesh, aside)] if found is None or mode != "reconstruction" else []
-        points = self.stage.place(transform_points(T_world_camera, moment.view.depth.to_points().points)) - aside
-        return [self._staged(mesh, T_world_camera, shift, shown) for mesh, shift in meshes], points
+        return [self._staged(mesh, T_world_camera, shift, shown) for mesh, shift in meshes], self._seen(
+            moment.view
+        ) - aside
+
+    def _seen(self, view: View) -> Float[np.ndarray, "n 3"]:
+        """The observed points, on the stage."""
+        return self.stage.place(transform_points(view.T_world_camera, view.depth.to_points().points))
 
     def _staged(
         self, mesh: SegmentedMesh, T: Float[np.ndarray, "4 4"], shift: Float[np.ndarray, "3"], shown: Shown
@@ -121,16 +126,7 @@ class LabStage:
     def _draw_camera(self, view: View, shift: Float[np.ndarray, "3"], points_on: bool) -> None:
         """The observed points, and the camera with its image at its place."""
         scene, T_world_camera = self.server.scene, view.T_world_camera
-        points = self.stage.place(transform_points(T_world_camera, view.depth.to_points().points))
-        scene.add_point_cloud(
-            "/points",
-            points + shift,
-            CLOUD_COLOR,
-            point_size=point_size(points),
-            point_shape="circle",
-            precision="float32",
-            visible=points_on,
-        )
+        self.stage.show_points("/points", self._seen(view) + shift, points_on)
         x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
         scene.add_camera_frustum(
             "/camera",

@@ -20,12 +20,10 @@ from mereo.models.weights import load_for, shipped_names
 from mereo.synthesis.recording import Recording
 from mereo.visualization.viewer import html
 from mereo.visualization.viewer.display import (
-    CLOUD_COLOR,
     Display,
     SegmentControls,
     SegmentLayer,
     import_viser,
-    point_size,
     start_server,
 )
 from mereo.visualization.viewer.guard import Entry
@@ -183,12 +181,4 @@ class SequencePage:
             points = self.stage.place(self.recording.cloud(number).points)
         except (ValueError, OSError):  # a frame without a point, or a damaged one
             points = np.zeros((1, 3))
-        self.server.scene.add_point_cloud(
-            "/cloud",
-            points + shift,
-            CLOUD_COLOR,
-            point_size=point_size(points),
-            point_shape="circle",
-            precision="float32",
-            visible=self.points.value,
-        )
+        self.stage.show_points("/cloud", points + shift, self.points.value)
