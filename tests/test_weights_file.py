@@ -12,9 +12,10 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from mereo import __main__ as command_line
+from mereo.models.calibration import Calibration
 from mereo.models.model import Model
 from mereo.models.network import Network
-from mereo.models.weights import SHIPPED, load_model, trained_steps, weights_bytes
+from mereo.models.weights import SHIPPED, load_model, save_model, trained_steps, weights_bytes
 from mereo.training.config import PRESETS
 
 WITH_STATES = SHIPPED / "rope.safetensors"
@@ -111,3 +112,13 @@ def test_names_that_look_like_markup_are_printed_as_they_are(
     assert command_line.main(["reconstruct", str(cloud), *arguments]) == 0
     printed = capsys.readouterr().out
     assert all(text in printed for text in ("[red] [y].npy", "[/x]", ":heart:[red]"))
+
+
+def test_a_calibration_comes_back_from_the_file_and_damage_to_it_is_one_sentence(tmp_path: Path) -> None:
+    network = Network(PRESETS["tiny"].network, 1).eval()
+    model = Model(network, ("a",), ((1, 2, 3),), calibration=Calibration(seed=3, views=8, radius_scale=1.5))
+    save_model(model, tmp_path / "weights.safetensors")
+    assert load_model(tmp_path / "weights.safetensors").calibration == model.calibration
+    path = changed(tmp_path, lambda h, t: h.update(calibration={"seed": 3, "views": 8, "radius_scale": -1.0}))
+    with pytest.raises(ValueError, match="header with a wrong 'calibration.radius_scale'"):
+        load_model(path)

@@ -22,6 +22,7 @@ from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.geometry.mesh import Color
 from mereo.geometry.normalizer import Normalizer
 from mereo.models.batch_norm_fusion import fold_batch_norm
+from mereo.models.calibration import Calibration
 from mereo.models.config import Precision, Supervision
 from mereo.models.decoder import Code, Prediction
 from mereo.models.device import pick_precision
@@ -95,6 +96,7 @@ class Model:
         precision: of the products; float32 is exact, bfloat16 faster on GPUs and some CPUs (`mereo bench` says what it
             costs), auto takes bfloat16 there.
         statistical_model: of the object's states, which a registration fits; older weights have none.
+        calibration: how far the answers can be trusted, as training seeds showed; None where that was not measured.
         name: how the weights were named when they were loaded, a shipped name or a file; "" for others.
     """
 
@@ -107,6 +109,7 @@ class Model:
     nested: tuple[tuple[str, str], ...] = ()
     precision: Precision = "float32"
     statistical_model: StatisticalModel | None = None
+    calibration: Calibration | None = None
     name: str = ""
 
     def __repr__(self) -> str:

@@ -59,6 +59,7 @@ def weights_bytes(model: Model, dtype: torch.dtype = torch.float32) -> bytes:
         "nested": model.nested,
         "provenance": model.provenance,
         **({} if facts is None else {"states": facts}),
+        **({} if model.calibration is None else {"calibration": model.calibration.model_dump(exclude_none=True)}),
     }
     tensors = {
         name: _stored(name, value, dtype).contiguous()
@@ -164,6 +165,7 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
         domain=header.domain,
         nested=header.nested,
         statistical_model=_unpacked(path, states, header) if states else None,
+        calibration=header.calibration,
         name=str(name),
     )
 

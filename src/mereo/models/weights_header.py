@@ -9,6 +9,7 @@ import torch
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 from torch import Tensor
 
+from mereo.models.calibration import Calibration
 from mereo.models.config import Loss, NetworkConfig
 from mereo.models.network import Network
 
@@ -52,6 +53,7 @@ class Header(BaseModel):
     domain: tuple[Corner, Corner] | None
     nested: tuple[tuple[Name, Name], ...] = ()
     states: dict[str, Any] | None = None
+    calibration: Calibration | None = None
 
 
 def read_header(path: Path, metadata: Mapping[str, str]) -> Header:
