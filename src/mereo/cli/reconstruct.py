@@ -14,7 +14,6 @@ from mereo.fitting.carry import Carried, Placed, place
 from mereo.fitting.carry import carry as carry_one
 from mereo.fitting.config import FitChoice
 from mereo.fitting.register import Registrar, registrar_for
-from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
@@ -153,10 +152,9 @@ def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...
             "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
             "cloud what is not the object, or take the registered model in any case with --fit modes"
         )
-    if found.registration is None:
+    if found.registered is None:
         return ()
-    here = found.registration.moved(inverse_rigid(found.reconstruction.T_camera_input))
-    carried = tuple(carry_one(one, here) for one in placed)
+    carried = tuple(carry_one(one, found.registered) for one in placed)
     for one in carried:
         outside = len(one.content.points) - one.inside
         away = f"{outside} of them outside, up to {one.farthest:.4g} away" if outside else "all inside"

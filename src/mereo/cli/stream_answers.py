@@ -8,7 +8,8 @@ from jaxtyping import Float
 
 from mereo.fitting.register import Registrar
 from mereo.fitting.tracker import Followed, Tracker
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.moments import owned_centroids
 from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import Reconstruction, extract, reconstruct
@@ -74,24 +75,6 @@ class FrameAnswer:
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
     return {"centroid": [round(float(value), DIGITS) for value in centroid], "volume": volume}
-
-
-def owned_centroids(mesh: SegmentedMesh) -> Float[np.ndarray, "s 3"]:
-    """Centre of the volume that belongs to each segment: its mesh's without that of the segments nested in it."""
-    volumes, moments = mesh.owned_volumes, np.stack([first_moment(segment) for segment in mesh.segments])
-    for outer in range(len(moments)):  # the inner ones come first and are done
-        moments[outer] -= sum((moments[inner] for inner, other in mesh.nesting if other == outer), np.zeros(3))
-    centroids: Float[np.ndarray, "s 3"] = moments / volumes[:, None]
-    return centroids
-
-
-def first_moment(segment: Segment) -> Float[np.ndarray, "3"]:
-    """Volume times centroid of a closed mesh (divergence theorem), by tetrahedra with one corner at its middle."""
-    middle = segment.vertices.mean(axis=0)
-    a, b, c = (segment.vertices[segment.faces[:, i]] - middle for i in range(3))
-    volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
-    moment: Float[np.ndarray, "3"] = (volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle
-    return moment
 
 
 class Answering:

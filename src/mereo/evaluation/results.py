@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mereo.evaluation.candidates import AnswerName, Candidate, RegistrationErrors
+from mereo.evaluation.coverage import RadiusRatios
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.geometry.brief import counted, listed
@@ -66,6 +67,8 @@ class Evaluation:
         sources: where that answer came from, in each example: network, modes or draws.
         errors: distances of registered points from their true places, where a registration was taken.
         unit_mm: millimetres per scene unit, where they are known.
+        coverage: distances of the same points over the radii that their posteriors give.
+        radius_scale: factor of the radii by the weights' calibration, where they have one.
     """
 
     names: tuple[str, ...]
@@ -77,6 +80,8 @@ class Evaluation:
     sources: tuple[str, ...] = ()
     errors: RegistrationErrors | None = None
     unit_mm: float | None = None
+    coverage: RadiusRatios | None = None
+    radius_scale: float | None = None
 
     def __repr__(self) -> str:
         scores, count = self.scores, counted(len(self.examples), "example")

@@ -21,11 +21,13 @@ from mereo.fitting.draws_problem import narrowing as draws_narrowing
 from mereo.fitting.evidence import MOST_POINTS, Evidence
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.modes_fit import Judged, fit_modes
+from mereo.fitting.optimum import DrawsOptimum, ModesOptimum
 from mereo.fitting.playback import DrawnStates
+from mereo.fitting.posterior import Optimum
 from mereo.fitting.problem import Problem
 from mereo.fitting.registration import Method, Registration
 from mereo.fitting.residuals import Surface
-from mereo.fitting.rest_fit import fit_rest, is_at_rest
+from mereo.fitting.rest_fit import fit_rest, is_at_rest, of_rest
 from mereo.fitting.rest_fit import narrowing as modes_narrowing
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import means_along_sight
@@ -59,6 +61,7 @@ class ModesFit:
         posed: coefficients and pose.
         seconds: that it took.
         rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
+        radius_scale: factor of the radii of uncertainty by the network's calibration.
     """
 
     problem: Problem
@@ -67,6 +70,7 @@ class ModesFit:
     posed: Posed
     seconds: float
     rest: Judged | None = None
+    radius_scale: float | None = None
 
     @classmethod
     def of(
@@ -135,8 +139,10 @@ class ModesFit:
     def registration(self) -> Registration:
         """The answer of the modes, or the rest model where the frame speaks for that."""
         if self.rest is not None:
-            return self._registration("rest", self.problem.model.rest_z, self.rest.posed, self.surface, self.seconds)
-        return self._registration("modes", self.posed.z, self.posed, self.surface, self.seconds)
+            end = ModesOptimum(of_rest(self.problem, self.found), self.rest.posed, self.unit)
+            return self._registration("rest", self.problem.model.rest_z, end, self.rest.posed, self.surface)
+        end = ModesOptimum(self.problem, self.posed, self.unit)
+        return self._registration("modes", self.posed.z, end, self.posed, self.surface)
 
     def with_draws(self, states: DrawnStates) -> Registration:
         """The answer of the scene's own draws where their misfit is lower or their evidence greater, else the modes'.
@@ -154,16 +160,17 @@ class ModesFit:
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
             return replace(self.registration(), seconds=seconds)
-        found = self._registration("draws", drawn.z, drawn.posed, drawn.surface, seconds)
-        return replace(found, drawn=replace(drawn.drawn, z=drawn.z))
+        end = DrawsOptimum(problem, drawn, self.unit)
+        found = self._registration("draws", drawn.z, end, drawn.posed, drawn.surface)
+        return replace(found, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
 
     def _registration(
         self,
         method: Method,
         z: Float[np.ndarray, " k"],
+        optimum: Optimum,
         posed: Posed,
         surface: Surface,
-        seconds: float,
     ) -> Registration:
         distance = surface.nearest(self.problem.evidence.partners)[0]
         explained = float((distance <= self.problem.config.tolerance).mean())
@@ -176,9 +183,11 @@ class ModesFit:
             unit_known=self.problem.scale_std == KNOWN_SCALE_STD,
             explained=explained,
             accepted=explained >= self.problem.config.accepted,
-            seconds=seconds,
+            seconds=self.seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
             ruled_out=self.problem.ruled_out(surface),
+            optimum=optimum,
+            radius_scale=self.radius_scale,
         )
 
 
@@ -229,7 +238,8 @@ def fit_frame(
         return _asked(network, model, network.encode(PointCloud(calm)))
 
     fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask_again)
-    return replace(fitted, seconds=fitted.seconds + asked)
+    scale = None if network.calibration is None else network.calibration.radius_scale
+    return replace(fitted, seconds=fitted.seconds + asked, radius_scale=scale)
 
 
 def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
