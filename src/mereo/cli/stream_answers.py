@@ -37,6 +37,8 @@ class FrameAnswer:
         method: "modes" of the registered model, or "network".
         tracked: whether the last frame's state led to it, so that the network was not asked.
         explained: share of the observed points that the registered model explains; None without one.
+        radius95: median and greatest radius of 95 % of the surface, input unit, and whether they are calibrated; None
+            where it was not asked for, or not known.
     """
 
     surfaces: SegmentedMesh
@@ -45,6 +47,7 @@ class FrameAnswer:
     method: str
     tracked: bool
     explained: float | None
+    radius95: dict[str, float | bool] | None = None
 
     @classmethod
     def of_network(cls, found: Reconstruction, explained: float | None = None) -> "FrameAnswer":
@@ -60,8 +63,8 @@ class FrameAnswer:
         return cls(found.surfaces, segments, found.reading.dropped, "network", False, explained)
 
     @classmethod
-    def of_registration(cls, found: Followed) -> "FrameAnswer":
-        """Answer that is the registered model."""
+    def of_registration(cls, found: Followed, uncertainty: bool = False) -> "FrameAnswer":
+        """Answer that is the registered model; with ``uncertainty`` it says how sure that is."""
         assert found.registration is not None
         mesh, registration = found.surfaces, found.registration
         centroids, volumes = owned_centroids(mesh), mesh.owned_volumes
@@ -69,8 +72,11 @@ class FrameAnswer:
             name: _facts(centroid, float(volume))
             for name, centroid, volume in zip(mesh.names, centroids, volumes, strict=True)
         }
-        explained = round(registration.explained, 4)
-        return cls(mesh, segments, found.reading.dropped, registration.method, found.tracked, explained)
+        explained, sure = round(registration.explained, 4), registration.uncertainty if uncertainty else None
+        for one in () if sure is None else sure.segments:
+            segments[one.name] |= {"centroid_radius95": round(one.centroid_radius95, DIGITS), "volume95": one.volume95}
+        radius95 = None if sure is None else sure.summary(sure.outline)
+        return cls(mesh, segments, found.reading.dropped, registration.method, found.tracked, explained, radius95)
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
@@ -80,9 +86,16 @@ def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
 class Answering:
     """Answers frames one after the other, following the object where there is a registrar."""
 
-    def __init__(self, model: Model, registrar: Registrar | None, resolution: int, keep_all: bool = False) -> None:
+    def __init__(
+        self,
+        model: Model,
+        registrar: Registrar | None,
+        resolution: int,
+        keep_all: bool = False,
+        uncertainty: bool = False,
+    ) -> None:
         """Answering with a model; without a registrar the network alone answers each frame."""
-        self.model, self.resolution, self.keep_all = model, resolution, keep_all
+        self.model, self.resolution, self.keep_all, self.uncertainty = model, resolution, keep_all, uncertainty
         self.tracker = None if registrar is None else Tracker(registrar)
 
     def __call__(self, seen: Seen) -> FrameAnswer:
@@ -94,7 +107,7 @@ class Answering:
         stated = self.tracker.registrar.stated_unit(frame.unit_m)
         followed = self.tracker.follow(cloud, seen.time_s, frame.axes, stated_unit=stated, keep_all=self.keep_all)
         if followed.taken:
-            return FrameAnswer.of_registration(followed)
+            return FrameAnswer.of_registration(followed, self.uncertainty)
         assert followed.asked is not None
         explained = None if followed.registration is None else round(followed.registration.explained, 4)
         return FrameAnswer.of_network(extract(followed.asked.unaided, self.model, self.resolution), explained)

@@ -102,6 +102,6 @@ class Weighing:
         shares: dict[Evidence, float] = {"points": float((self.weight[:, None] * leverage**2).sum()) / whole}
         for name, part in self.parts.items():
             shares[name] = float(((motion @ part) * motion).sum()) / whole
-        influence = -self.weight[:, None] * leverage
+        influence = self.weight[:, None] * leverage
         length = np.linalg.norm(influence, axis=1)
         return shares, length / max(float(length.sum()), np.finfo(np.float64).tiny), influence

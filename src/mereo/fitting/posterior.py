@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 from scipy.linalg import cholesky, solve_triangular
 from scipy.special import chdtri
 from scipy.stats import norm
@@ -115,40 +115,65 @@ class Posterior:
         return turned[:POSE].astype(np.float32), turned[POSE:].astype(np.float32)
 
     @cached_property
+    def _arm(self) -> Float32[np.ndarray, "m 3"]:
+        """Material points from the pose's centre, in axes that turn with the object."""
+        return ((self.material - self.posed.translation) @ self.posed.rotation).astype(np.float32)
+
+    @cached_property
     def motion(self) -> Float32[np.ndarray, "m 3 p"]:
         """Motion of each material point with each of p independent standard normal numbers, in the object's axes."""
+        return self._motion(slice(None))
+
+    def _motion(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 p"]:
         pose, state = self._local
-        arm = ((self.material - self.posed.translation) @ self.posed.rotation).astype(np.float32)
-        rigid = np.zeros((len(arm), 3, POSE), dtype=np.float32)
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            rigid[:, i, j], rigid[:, i, k] = arm[:, k], -arm[:, j]
-            rigid[:, i, 3 + i] = 1.0
-        rigid[:, :, 6] = arm
-        moved = rigid.reshape(-1, POSE) @ pose
+        moved = rigid_motion(self._arm[rows]).reshape(-1, POSE) @ pose
         if len(state):
-            moved += self.modes.reshape(-1, len(state)) @ state
-        return moved.reshape(len(arm), 3, -1)
+            moved += self.modes[rows].reshape(-1, len(state)) @ state
+        return moved.reshape(-1, 3, moved.shape[1])
 
     def radii(self, follow: PointWeights | None = None) -> Float[np.ndarray, " n"]:
         """Radius of 95 % of all material points, or of points that follow them; scene units."""
-        motion = self.motion if follow is None else follow(self.motion)
+        return self._radii(self.motion if follow is None else follow(self.motion))
+
+    def radii_of(self, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Radius of 95 % of some material points alone, which costs as little as they are few."""
+        return self._radii(self._motion(rows))
+
+    def _radii(self, motion: Float32[np.ndarray, "n 3 p"]) -> Float[np.ndarray, " n"]:
         spread = np.matmul(motion, motion.transpose(0, 2, 1)).astype(np.float64)
         spread[:, range(3), range(3)] += self.residue**2 / 3
         return radius95(spread)
 
-    def motion_of(self, gradient: Float[np.ndarray, "c v 3"], rows: slice) -> Float[np.ndarray, "c p"]:
-        """Change of c numbers with each of p independent standard normal ones; by their gradients, camera's axes.
+    def motion_of(self, gradient: Float[np.ndarray, "c v 3"]) -> Float[np.ndarray, "c p"]:
+        """Change of c numbers with each of p independent standard normal ones.
 
         What the coefficients cannot express (``residue``) is left out: over a segment it averages out.
+
+        Args:
+            gradient: of the numbers by the first v material points, in the camera's axes.
         """
-        turned = (gradient @ self.posed.rotation).astype(np.float32)
-        each: np.ndarray = turned.reshape(len(turned), -1) @ self.motion[rows].reshape(-1, self.factor.shape[1])
+        pose, state = self._local
+        turned, count = (gradient @ self.posed.rotation).astype(np.float32), gradient.shape[1]
+        flat = turned.reshape(len(turned), -1)
+        each: np.ndarray = flat @ rigid_motion(self._arm[:count]).reshape(-1, POSE) @ pose
+        if len(state):
+            each = each + flat @ self.modes[:count].reshape(-1, len(state)) @ state
         return each.astype(np.float64)
 
     def motion_at(self, follow: PointWeights) -> Float[np.ndarray, "n 3 p"]:
         """Motion of points that follow the material points, in the camera's axes."""
         moved: np.ndarray = np.matmul(self.posed.rotation, follow(self.motion).astype(np.float64))
         return moved
+
+
+def rigid_motion(arm: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3 7"]:
+    """Motion of points with a turn, a shift and the scale, from their places relative to the pose's centre."""
+    rigid = np.zeros((len(arm), 3, POSE), dtype=np.float32)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rigid[:, i, j], rigid[:, i, k] = arm[:, k], -arm[:, j]
+        rigid[:, i, 3 + i] = 1.0
+    rigid[:, :, 6] = arm
+    return rigid
 
 
 def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from mereo.fitting.explanation import Explanation
 from mereo.fitting.registration import Registration
-from mereo.geometry.mesh import Segment
+from mereo.geometry.mesh import Color, Segment
 from mereo.geometry.radii import STOPS, Radii
 from mereo.visualization.units import Unit, rounded
 
@@ -22,6 +22,12 @@ UNEXPLAINED = 255
 
 MOST = 254
 """Byte of the point that decides a centroid most."""
+
+WEIGHTS: tuple[Color, ...] = ((70, 82, 104), (86, 180, 233), (255, 244, 150))
+"""Colours of observed points that decide nothing of a place, and most of it."""
+
+RED: Color = (229, 40, 50)
+"""Colour of unexplained points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,23 +54,8 @@ class SureColors:
         return _base64(np.rint(255 * np.clip(share, 0.0, 1.0)))
 
     def of_points(self, points: Float[np.ndarray, "n 3"]) -> list[UInt8[np.ndarray, " n"]]:
-        """For each segment a byte for each observed point: how much it decides the centroid, or that it is unexplained.
-
-        The weights are those of the fit's partners, which stand for the points around them.
-        """
-        first = self.centroids[0]
-        nearest = cKDTree(first.points).query(points)[1]
-        lost = np.zeros(len(points), dtype=bool)
-        if len(first.unexplained):
-            explained = cKDTree(first.points).query(points)[0]
-            lost = cKDTree(first.unexplained).query(points)[0] < np.minimum(explained, _spacing(first.points))
-        result = []
-        for one in self.centroids:
-            share = np.sqrt(one.weights / max(float(one.weights.max()), 1e-30))
-            marks = np.rint(MOST * share[nearest]).astype(np.uint8)
-            marks[lost] = UNEXPLAINED
-            result.append(marks)
-        return result
+        """For each segment ``point_marks`` of its centroid."""
+        return [point_marks(one, points) for one in self.centroids]
 
     def page_data(self, marks: list[UInt8[np.ndarray, " n"]] | None) -> dict[str, Any]:
         """What the page needs beside the bytes of the surfaces."""
@@ -72,6 +63,8 @@ class SureColors:
         calibrated = "" if self.radii.calibrated else ", not calibrated"
         return {
             "stops": [list(color) for color in STOPS],
+            "weights": [list(color) for color in WEIGHTS],
+            "unexplained": list(RED),
             "ends": ["0", f"{high} {self.unit.length_name}"],
             "title": f"the true place is so far away at most (95 %{calibrated})",
             "centroids": [
@@ -79,6 +72,29 @@ class SureColors:
                 for name, one, told in zip(self.names, marks or (), self.centroids, strict=True)
             ],
         }
+
+
+def point_marks(one: Explanation, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    """A byte for each observed point: how much it decides a place, 0 to ``MOST``, or that it is ``UNEXPLAINED``.
+
+    The weights are those of the fit's partners, which stand for the points around them.
+    """
+    away, nearest = cKDTree(one.points).query(points)
+    marks: UInt8[np.ndarray, " n"] = np.rint(MOST * one.weights[nearest] / max(float(one.weights.max()), 1e-30)).astype(
+        np.uint8
+    )
+    if len(one.unexplained):
+        lost = cKDTree(one.unexplained).query(points)[0]
+        marks[(lost <= away) & (lost < _spacing(one.points))] = UNEXPLAINED
+    return marks
+
+
+def mark_colors(marks: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    """Colours (red, green, blue) of ``point_marks``."""
+    places = np.minimum(marks / MOST, 1.0) * (len(WEIGHTS) - 1)
+    stops = np.array(WEIGHTS, dtype=float)
+    mixed = np.stack([np.interp(places, np.arange(len(stops)), stops[:, k]) for k in range(3)], axis=1)
+    return np.where((marks == UNEXPLAINED)[:, None], RED, mixed).round().astype(np.uint8)
 
 
 def sure_colors(registered: Registration, unit: Unit) -> SureColors | None:
