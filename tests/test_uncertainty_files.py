@@ -15,6 +15,8 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from mereo.cli.explain import explain, wish_of
+from mereo.cli.reconstruct import FrameJob
 from mereo.cli.stream import line
 from mereo.cli.stream_answers import FrameAnswer
 from mereo.evaluation.sample_views import load_view
@@ -22,8 +24,6 @@ from mereo.fitting.answer import Answer, answer
 from mereo.fitting.register import Registrar
 from mereo.fitting.tracker import Tracker
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.labels import LabelGrid
-from mereo.geometry.radii import Radii, rounded_to
 from mereo.io.config import FilesConfig
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model
@@ -32,7 +32,6 @@ from mereo.reconstruction.stream import Outcome
 from mereo.visualization.result_files import write_files, write_one
 from mereo.visualization.sure_colors import MOST, UNEXPLAINED, point_marks, sure_colors
 from mereo.visualization.units import Unit
-from mereo.visualization.vertex_colors import radius_scale
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 
@@ -227,38 +226,6 @@ def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -
     assert all(one is not None and one.radius_scale == 2.5 for one in followed)
 
 
-def some_radii() -> Radii:
-    points = np.random.default_rng(0).random((30, 3))
-    labels = np.repeat(np.array([1, 2, 1], dtype=np.uint8), 10)
-    return Radii(points, labels, np.linspace(1, 2, 30), (10, 10), False)
-
-
-def test_radii_between_points_are_between_theirs() -> None:
-    """And at a point they are its own; other segments' points do not count."""
-    radii = some_radii()
-    np.testing.assert_allclose(radii.at(radii.points[:10], 1), radii.values[:10])
-    between = radii.at(np.full((1, 3), 0.5), 2)
-    assert radii.values[10:20].min() <= between[0] <= radii.values[10:20].max()
-    assert [len(part) for part in radii.vertices] == [10, 10]
-    grid = LabelGrid(np.array([[[0, 1, 2]]], dtype=np.uint8), np.zeros(3), np.full(3, 0.4), ("a", "b"))
-    on_grid = radii.on_grid(grid)[0, 0]
-    assert np.isnan(on_grid[0]) and 1 <= on_grid[1] <= 2 and 1.3 < on_grid[2] < 1.7
-    scaled = radii.scaled(1000.0)
-    np.testing.assert_allclose(scaled.at(1000.0 * radii.points[:3], 1), 1000.0 * radii.values[:3])
-
-
-def test_three_digits_are_kept() -> None:
-    np.testing.assert_allclose(rounded_to(np.array([0.0123456, 98765.0, 1.0]), 3), [0.0123, 98800.0, 1.0], rtol=1e-9)
-
-
-def test_the_scale_of_radii_ends_at_all_but_a_twentieth() -> None:
-    radii = some_radii()
-    scale = radius_scale(radii, " mm")
-    assert scale.high == pytest.approx(np.quantile(radii.values[:20], 0.95)) and "not calibrated" in scale.title
-    np.testing.assert_array_equal(scale.colors(radii.values), radii.colors(radii.values))
-    assert scale.words[1].endswith(" mm")
-
-
 @pytest.fixture
 def server() -> Iterator[object]:
     from mereo.visualization.viewer import display
@@ -297,3 +264,33 @@ def test_a_state_without_its_frame_has_no_such_colours(found: Answer, model: Mod
     read = replace(found.registration, optimum=None)
     inspection = Inspection.of_registration(read, model, np.eye(4))
     assert inspection.here is None and inspection.ask(read.material[:1]).radius95 is None
+
+
+def test_the_command_explains_segments_and_places(
+    found: Answer, cloud: PointCloud, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert found.registered is not None
+    place = found.registered.material[7]
+    wishes = [wish_of(text, ("liver", "gallbladder")) for text in ("gallbladder", ",".join(map(str, place)))]
+    explain(found.registered, wishes, tmp_path, cloud.points, 10.0, Unit(1.0))
+    lines = capsys.readouterr().out.splitlines()
+    assert re.match(r"the centre of gallbladder is at .* ± [\d.,]+ mm \(95 %, not calibrated\); what leaves", lines[0])
+    assert re.match(r"the object's point is at .* ± [\d.,]+ mm \(95 %, not calibrated\); what leaves", lines[1])
+    head, body = (tmp_path / "explained" / "2.ply").read_bytes().split(b"end_header\n", 1)
+    kinds = [*((axis, "<f4") for axis in "xyz"), ("color", "u1", 3), ("unexplained", "u1")]
+    points = np.frombuffer(body, np.dtype(kinds))
+    np.testing.assert_allclose(points["x"], 10.0 * cloud.points[:, 0], rtol=1e-5)
+    assert points["unexplained"].max() == 0 and b"property uchar unexplained\n" in head
+    brightest = cloud.points[points["color"].sum(axis=1).argmax()]
+    assert np.linalg.norm(brightest - place) < np.median(np.linalg.norm(cloud.points - place, axis=1))
+
+
+def test_what_cannot_be_explained_is_said_in_one_sentence(cloud: PointCloud, tmp_path: Path) -> None:
+    for text in ("nose", "1,2", "1,2,nan", "1,2,x"):
+        with pytest.raises(ValueError, match=r"it must be a segment \(liver, gallbladder\) or a place x,y,z"):
+            wish_of(text, ("liver", "gallbladder"))
+    with pytest.raises(ValueError, match="--explain needs a registration, whose fit is explained"):
+        explain(None, ["liver"], tmp_path, cloud.points, 1.0, Unit(1.0))
+    with pytest.raises(ValueError, match="--fit is off, but --explain needs a registration"):
+        FrameJob("liver", choice="off", explain=("liver",)).check()
+    assert not any(tmp_path.iterdir())

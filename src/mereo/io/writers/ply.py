@@ -6,7 +6,7 @@ PLY has no unit. Labels are a property called ``label``; their names are in the 
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Integer, UInt8
+from jaxtyping import Bool, Float, Integer, UInt8
 
 from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
@@ -48,6 +48,19 @@ def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
     sure = {"confidence": ("f4", cloud.confidence), "occupancy": ("f4", cloud.occupancy)}
     vertices = _records(_positions(cloud.points) | _colors(colors) | _label(cloud.labels) | sure)
     _write(path, comment_lines(cloud.names, cloud.colors), {"vertex": vertices})
+
+
+def write_explained_ply(
+    path: str | Path,
+    points: Float[np.ndarray, "n 3"],
+    colors: UInt8[np.ndarray, "n 3"],
+    unexplained: Bool[np.ndarray, " n"],
+    comment: str,
+) -> None:
+    """Write observed points coloured by how much they decide a place, with ``unexplained`` (uchar, 1 or 0)."""
+    lost: Columns = {"unexplained": ("u1", unexplained)}
+    plain = comment.encode("ascii", "replace").decode("ascii")
+    _write(path, [plain], {"vertex": _records(_positions(points) | _colors(colors) | lost)})
 
 
 def write_positions_ply(path: str | Path, points: Float[np.ndarray, "n 3"], comment: str = "") -> None:
