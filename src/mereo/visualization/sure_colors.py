@@ -23,8 +23,9 @@ UNEXPLAINED = 255
 MOST = 254
 """Byte of the point that decides a centroid most."""
 
-WEIGHTS: tuple[Color, ...] = ((70, 82, 104), (86, 180, 233), (255, 244, 150))
-"""Colours of observed points that decide nothing of a place, and most of it."""
+WEIGHTS: tuple[Color, ...] = ((150, 156, 168), (40, 120, 255), (255, 176, 0))
+"""Colours of observed points from those that decide nothing of a place to those that decide most of it; seen on dark
+and on light."""
 
 RED: Color = (229, 40, 50)
 """Colour of unexplained points."""
@@ -80,9 +81,8 @@ def point_marks(one: Explanation, points: Float[np.ndarray, "n 3"]) -> UInt8[np.
     The weights are those of the fit's partners, which stand for the points around them.
     """
     away, nearest = cKDTree(one.points).query(points)
-    marks: UInt8[np.ndarray, " n"] = np.rint(MOST * one.weights[nearest] / max(float(one.weights.max()), 1e-30)).astype(
-        np.uint8
-    )
+    share = one.weights[nearest] / max(float(one.weights.max()), np.finfo(np.float64).tiny)
+    marks: UInt8[np.ndarray, " n"] = np.rint(MOST * share).astype(np.uint8)
     if len(one.unexplained):
         lost = cKDTree(one.unexplained).query(points)[0]
         marks[(lost <= away) & (lost < _spacing(one.points))] = UNEXPLAINED

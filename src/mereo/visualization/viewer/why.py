@@ -47,8 +47,8 @@ class WhyLayer:
         found = here.explain(self._place)
         assert found is not None
         lost = f"; {len(found.unexplained)} points in red are not the model's" if len(found.unexplained) else ""
-        said = f"bright points decide its place most{lost}; what leaves it unsure: {shares_told(found)}"
-        self.told.content = html.message(said)
+        said = f"yellow points decide its place most, grey ones not at all{lost}"
+        self.told.content = html.message(f"{said}; what leaves it unsure: {shares_told(found)}")
         points = self.stage.place(cloud.points)
         self._points = self.stage.server.scene.add_point_cloud(
             POINTS,
