@@ -9,7 +9,7 @@ from toy_scene import toy_scene
 
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
-from mereo.fitting.fit import estimate_unit, fit_correspondences
+from mereo.fitting.fit import fit_correspondences
 from mereo.fitting.gauss_newton import POSE, Posed, along
 from mereo.fitting.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.registration import Registration

@@ -24,7 +24,7 @@ ROLL = np.pi / 4
 TILTS = np.deg2rad([0.0, 15.0, 15.0, 25.0])
 """Of the camera away from the object, one after the other for all rolls, rad."""
 
-TILTED = 2.4
+TILTED = 2.0
 """Angle between the directions of one tilt and the next."""
 
 ROUND = 8
