@@ -179,7 +179,16 @@ class ModesFit:
             seconds=seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
             ruled_out=self.problem.ruled_out(surface),
+            needed=self.problem.config.accepted,
         )
+
+    def displaced(self, registration: Registration) -> float | None:
+        """``Signs.displaced`` of a registration of this frame; None where the network was not asked."""
+        if len(self.found.points) == 0:
+            return None
+        model = self.problem.model
+        place = model.weights(self.found.rest, self.found.labels)(registration.material) / self.unit
+        return float(np.median(np.linalg.norm(place - self.found.points, axis=1))) / model.half
 
 
 def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:

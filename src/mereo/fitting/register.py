@@ -199,7 +199,6 @@ def describe(registration: Registration) -> dict[str, object]:
         "accepted": registration.accepted,
         "residual": registration.residual,
         "ruled_out": registration.ruled_out,
-        "doubt": registration.doubt,
         "beyond_states": registration.beyond_states,
         "scene_unit": registration.scene_unit,
         "unit": "known" if registration.unit_known else "found",
