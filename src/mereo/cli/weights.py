@@ -167,9 +167,9 @@ def calibration_rows(found: Calibration | None) -> list[tuple[str, str]]:
         kind = "a temperature" if found.biases is None else "a temperature and a bias for each class"
         error = "" if found.ece is None else f"; calibration error {found.ece[0]:.3f}, with it {found.ece[1]:.3f}"
         rows.append(("probabilities", f"{kind} ({found.temperature:.2f}){error}"))
-    if found.limits is not None:
-        each = (f"{name.replace('_', ' ')} {one.unsure:.2g} / {one.refused:.2g}" for name, one in found.limits.items())
-        rows.append(("recognition", f"unsure / refused from: {', '.join(each)}"))
+    if found.recognizing is not None:
+        limits = found.recognizing
+        rows.append(("recognition", f"unsure above a strangeness of {limits.unsure:.2g}, no from {limits.refused:.2g}"))
     return rows
 
 

@@ -39,7 +39,7 @@ class Gauge(Protocol):
         """Take in a view of the object; ``registration`` is of its modes, None where none was found."""
 
     def add_strange(self, frame: FittedFrame, registration: Registration | None) -> None:
-        """Take in a frame that does not show the object in a state that was learned."""
+        """Take in a frame that shows another thing than the object."""
 
     def fields(self) -> dict[str, Any]:
         """Fields of the ``Calibration`` that were measured."""
@@ -51,6 +51,7 @@ def calibrate(
     *,
     views: int = VIEWS,
     seed: int = SEED,
+    strangers: bool = True,
     quiet: bool = True,
 ) -> Calibration:
     """Calibration of a model by views of its scene: clean ones, noisy ones, and frames of what is not its object.
@@ -60,6 +61,7 @@ def calibrate(
         scene: their scene, its name or its file; by default the built-in one that they were trained on.
         views: of the object, half of them clean; at least ``LEAST_VIEWS``. About as many strange frames come on top.
         seed: a training seed other than that of the weights' examples.
+        strangers: take in frames of other things too, which place the second limit of recognition.
         quiet: show no progress.
 
     Raises ``ValueError`` for a test seed, too few views, and another object than the model's.
@@ -74,7 +76,7 @@ def calibrate(
     bare = replace(model, calibration=None)
     registrar = None if model.statistical_model is None else registrar_for(bare, "modes", scene)
     gauges: tuple[Gauge, ...] = (ProbabilityGauge(bare), *(() if registrar is None else (RecognitionGauge(),)))
-    each = 0 if registrar is None else max(1, round(views / 24))
+    each = max(1, round(views / 24)) if strangers and registrar is not None else 0
     others = len(other_objects(scene)) if each else 0
     with progress("calibrate", views + each * (others + 12), "views", quiet=quiet) as shown:
         for view in own_views(scene, views, seed):

@@ -1,4 +1,4 @@
-"""Gauge of recognition: limits of the signs that tell other things and states from the object in a learned state."""
+"""Gauge of recognition: what is usual of the object's views, and how strange a frame may be."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,72 +7,79 @@ import numpy as np
 
 from mereo.evaluation.calibration_views import CalibrationView
 from mereo.fitting.readings import FittedFrame
-from mereo.fitting.recognition import LIMITS, Signs
+from mereo.fitting.recognition import CLIPPED, CONSERVATIVE, LEAST, Signs, is_noisy, strangeness
 from mereo.fitting.registration import Registration
-from mereo.models.calibration import SignLimits, SignName
+from mereo.models.calibration import Recognizing, SignName, Usual
 
-MEASURED: tuple[SignName, ...] = ("unexplained", "ruled_out", "beyond", "unusual", "displaced")
-"""Signs whose limits are measured; those of the size follow from how far units are apart."""
+MEASURED: tuple[SignName, ...] = tuple(name for name in LEAST if name != "size")
+"""Signs that are measured; what is usual of the size follows from how far units are apart."""
 
-ABOVE = 1.2
-"""The first limit, in the largest value of clean views of the object: there are few of these."""
+SMALLEST_STD = 0.15
+"""Least standard deviation of a sign's logarithm: a few views may be more alike than others will be."""
 
-LEAST: dict[SignName, float] = {
-    "unexplained": 0.6,
-    "ruled_out": 0.01,
-    "beyond": 0.1,
-    "unusual": 1.5,
-    "displaced": 0.08,
-}
-"""Smallest first limits: below these a sign means nothing, whatever a few views have shown."""
+TRUSTED = 4
+"""Views from which on their mean and standard deviation are taken; from fewer, the conservative ones."""
 
-APART = 2.0
+MOSTLY, ABOVE = 0.95, 1.25
+"""The first limit: that quantile of the strangeness of the object's views, times this: there are few of these.
+
+Not their largest: a camera's view that was not understood may well be called strange."""
+
+LEAST_UNSURE = 3.0
+"""Smallest first limit, standard deviations."""
+
+APART = 1.6
 """The second limit at least, in the first."""
 
-STRANGE = 0.5
-"""Quantile of a sign among strange frames: the second limit lies in the middle between it and the object's views."""
+STRANGE = 0.1
+"""Quantile of the strangeness of other things: the second limit is in the middle between it and the first, by ratio."""
 
 
 class RecognitionGauge:
-    """Measurement of the limits of signs. Satisfies ``Gauge``."""
+    """Measurement of what is usual and of both limits. Satisfies ``Gauge``."""
 
     def __init__(self) -> None:
         self.clean: list[Signs] = []
         self.noisy: list[Signs] = []
-        self.strange: list[Signs] = []
+        self.strange: list[tuple[Signs, bool]] = []
 
     def add(self, view: CalibrationView, frame: FittedFrame, registration: Registration | None) -> None:
         """Take in the signs of a view of the object; one that was not registered has none."""
         if registration is not None:
-            (self.clean if view.clean else self.noisy).append(signs_of(frame, registration))
+            (self.noisy if is_noisy(registration) else self.clean).append(signs_of(frame, registration))
 
     def add_strange(self, frame: FittedFrame, registration: Registration | None) -> None:
         """Take in the signs of a frame that shows something else."""
         if registration is not None:
-            self.strange.append(signs_of(frame, registration))
+            self.strange.append((signs_of(frame, registration), is_noisy(registration)))
 
     def fields(self) -> dict[str, Any]:
-        """Limits of all signs, where the object was registered at all."""
-        if not self.clean:
+        """What is usual, and both limits; nothing where too few views were registered."""
+        if len(self.clean) < TRUSTED:
             return {}
-        return {"limits": {name: self._limits(name) for name in MEASURED}}
-
-    def _limits(self, name: SignName) -> SignLimits:
-        clean, noisy, strange = (_values(each, name) for each in (self.clean, self.noisy, self.strange))
-        unsure = max(ABOVE * max(clean, default=0.0), LEAST[name])
-        highest = max([unsure, *noisy])
-        lowest = float(np.quantile(strange, STRANGE)) if strange else LIMITS[name].refused
-        # in the middle of the gap, on a scale of ratios; where there is none, beyond all views of the object
-        refused = float(np.sqrt(highest * lowest)) if lowest > highest else ABOVE * highest
-        return SignLimits(unsure=unsure, refused=max(refused, APART * unsure))
+        clean = usual_of(self.clean)
+        noisy = usual_of(self.noisy) if len(self.noisy) >= TRUSTED else dict(CONSERVATIVE.noisy)
+        own = [strangeness(one.strange(clean)) for one in self.clean]
+        own += [strangeness(one.strange(noisy)) for one in self.noisy]
+        unsure = max(ABOVE * float(np.quantile(own, MOSTLY)), LEAST_UNSURE)
+        others = [strangeness(one.strange(noisy if is_noise else clean)) for one, is_noise in self.strange]
+        lowest = float(np.quantile(others, STRANGE)) if others else unsure * APART**2
+        refused = max(float(np.sqrt(unsure * lowest)), APART * unsure)
+        return {"recognizing": Recognizing(clean=clean, noisy=noisy, unsure=unsure, refused=refused)}
 
 
 def signs_of(frame: FittedFrame, registration: Registration) -> Signs:
     """Signs of a registration of a frame whose unit says nothing."""
     assert frame.modes is not None
-    return Signs.of(registration, frame.modes.displaced(registration))
+    return Signs.of(registration, frame.modes.displaced(registration, CLIPPED))
 
 
-def _values(signs: Sequence[Signs], name: SignName) -> list[float]:
-    found = (getattr(one, name) for one in signs)
-    return [abs(value) for value in found if value is not None]
+def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:
+    """What is usual of each sign, from views of the object; robust against a view that was not understood."""
+    result: dict[SignName, Usual] = {}
+    for name in MEASURED:
+        values = [one.logarithms[name] for one in signs if name in one.logarithms]
+        if values:
+            low, middle, high = np.quantile(values, [0.16, 0.5, 0.84])
+            result[name] = Usual(mean=float(middle), std=max(float(high - low) / 2, SMALLEST_STD))
+    return result

@@ -182,13 +182,14 @@ class ModesFit:
             needed=self.problem.config.accepted,
         )
 
-    def displaced(self, registration: Registration) -> float | None:
+    def displaced(self, registration: Registration, most: float) -> float | None:
         """``Signs.displaced`` of a registration of this frame; None where the network was not asked."""
         if len(self.found.points) == 0:
             return None
         model = self.problem.model
         place = model.weights(self.found.rest, self.found.labels)(registration.material) / self.unit
-        return float(np.median(np.linalg.norm(place - self.found.points, axis=1))) / model.half
+        apart = np.linalg.norm(place - self.found.points, axis=1) / model.half
+        return float(np.sqrt((np.minimum(apart, most) ** 2).mean()))
 
 
 def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:

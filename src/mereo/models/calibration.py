@@ -12,23 +12,34 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
-SignName = Literal["unexplained", "ruled_out", "beyond", "unusual", "displaced", "size"]
+SignName = Literal["size", "unexplained", "ruled_out", "beyond", "unusual", "displaced"]
 """Signs that a frame does not show the object in a state that was learned; ``mereo.fitting.recognition`` tells them."""
 
 
-class SignLimits(BaseModel, frozen=True):
-    """Limits of a sign.
+class Usual(BaseModel, frozen=True):
+    """Usual logarithm of a sign in views of the object: its mean and its standard deviation."""
+
+    mean: FiniteFloat
+    std: Positive
+
+
+class Recognizing(BaseModel, frozen=True):
+    """What tells the object in learned states from other things and states (``mereo.fitting.recognition``).
 
     Attributes:
-        unsure: up to which it says nothing.
-        refused: from which on the frame does not show the object in a state that was learned.
+        clean: usual signs of views without noise beyond the paper's.
+        noisy: the same of simulated depth cameras' views.
+        unsure: strangeness up to which the object is known.
+        refused: strangeness from which on it is not.
     """
 
+    clean: dict[SignName, Usual]
+    noisy: dict[SignName, Usual]
     unsure: Positive
     refused: Positive
 
     @model_validator(mode="after")
-    def _ordered(self) -> "SignLimits":
+    def _ordered(self) -> "Recognizing":
         if self.unsure >= self.refused:
             raise ValueError(f"the limits are {self.unsure:g} and {self.refused:g}; the first must be the smaller")
         return self
@@ -47,7 +58,7 @@ class Calibration(BaseModel, frozen=True):
         biases: added to the divided logits of empty space and each segment (with the temperature: vector scaling, but
             for one temperature of all classes); None where the temperature does alone. Labels do not depend on either.
         ece: expected calibration error of the probabilities as the network gives them, and as they are calibrated.
-        limits: of each sign that tells other things and states from the object's (``mereo.fitting.recognition``).
+        recognizing: what tells the object in learned states from other things and states.
     """
 
     seed: Annotated[int, Field(ge=0)]
@@ -56,7 +67,7 @@ class Calibration(BaseModel, frozen=True):
     temperature: Positive | None = None
     biases: tuple[FiniteFloat, ...] | None = None
     ece: tuple[Share, Share] | None = None
-    limits: dict[SignName, SignLimits] | None = None
+    recognizing: Recognizing | None = None
 
     def scaled(self, logits: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
         """Logits divided by the temperature, plus the biases; as they are where there is no temperature.
