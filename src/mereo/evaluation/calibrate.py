@@ -78,7 +78,7 @@ def calibrate(
     gauges: tuple[Gauge, ...] = (ProbabilityGauge(bare), *(() if registrar is None else (RecognitionGauge(),)))
     each = max(1, round(views / 24)) if strangers and registrar is not None else 0
     others = len(other_objects(scene)) if each else 0
-    with progress("calibrate", views + each * (others + 12), "views", quiet=quiet) as shown:
+    with progress("calibrate", views + each * (others + 8), "views", quiet=quiet) as shown:
         for view in own_views(scene, views, seed):
             frame, registration = _fitted(bare, registrar, view.seen, view.scene_unit)
             for gauge in gauges:

@@ -1,7 +1,7 @@
 """Views that weights are calibrated with: the object as cameras see it, and what is not it.
 
 scene -own_views-> CalibrationView (the object in states that were learned, clean and noisy)
-      -strange_frames-> StrangeFrame (other objects, planes and heaps, states beyond the scene's)
+      -strange_frames-> StrangeFrame (other objects, planes and heaps; frames_beyond: states beyond the scene's)
 """
 
 from collections.abc import Callable, Iterator
@@ -68,7 +68,7 @@ class StrangeFrame:
     """A frame that does not show the object in a state that was learned.
 
     Attributes:
-        kind: "other object", "plane", "clutter" or "state beyond".
+        kind: "other object", "plane or clutter", or "state beyond".
         cloud: what is seen, about as large as the object.
         name: of what is seen.
     """
@@ -88,7 +88,7 @@ def own_views(scene: Scene, count: int, seed: int) -> Iterator[CalibrationView]:
 
 
 def strange_frames(scene: Scene, each: int, seed: int) -> Iterator[StrangeFrame]:
-    """Frames of every other built-in object that can be had, and ``4 * each`` of every other kind."""
+    """Frames of every other built-in object that can be had, and ``4 * each`` of planes and of heaps."""
     for name in other_objects(scene):
         other = load_scene(name)
         for index in range(each):
@@ -96,12 +96,18 @@ def strange_frames(scene: Scene, each: int, seed: int) -> Iterator[StrangeFrame]
     settings = GenerateConfig()
     for index in range(4 * each):
         plane, heap = (example_rng(seed + offset, index) for offset in (OF_PLANES, OF_HEAPS))
-        yield StrangeFrame("plane", stranger_cloud(scene, "plane", settings, plane))
-        yield StrangeFrame("clutter", stranger_cloud(scene, "clutter", settings, heap))
-        try:
-            yield StrangeFrame("state beyond", _seen(with_farther_states(scene, FARTHER), seed + OF_FARTHER, index))
-        except ValueError:  # the scene allows nothing beyond its bounds
-            continue
+        yield StrangeFrame("plane or clutter", stranger_cloud(scene, "plane", settings, plane))
+        yield StrangeFrame("plane or clutter", stranger_cloud(scene, "clutter", settings, heap))
+
+
+def frames_beyond(scene: Scene, count: int, seed: int, factor: float = FARTHER) -> Iterator[StrangeFrame]:
+    """Frames of the object in states whose draws are all ``factor`` times as far from their middle as a scene's.
+
+    None of a scene that refuses such states. States of which few draws count may still be within the bounds.
+    """
+    with suppress(ValueError):
+        for index in range(count):
+            yield StrangeFrame("state beyond", _seen(with_farther_states(scene, factor), seed + OF_FARTHER, index))
 
 
 def other_objects(scene: Scene) -> list[str]:

@@ -216,6 +216,9 @@ def recognized(
 HARDLY = 0.5
 """Share of the observed points below which it is probably another object, or no camera frame."""
 
+BEYOND = 0.5
+"""Scene units outside all states that were learned from which on they are worth telling."""
+
 LOOK = "look at the result before you rely on it"
 
 WIDEN = f"{LOOK}, or widen the scene's ranges and learn it anew"
@@ -256,6 +259,8 @@ def _beyond(registration: Registration, signs: Signs) -> str:
 
 
 def _unusual(registration: Registration, signs: Signs) -> str:
+    if registration.beyond_states > BEYOND:
+        return _beyond(registration, signs)
     return f"the object would be bent farther than in the states that were learned: {WIDEN}"
 
 
