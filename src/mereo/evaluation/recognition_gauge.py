@@ -14,8 +14,16 @@ from mereo.models.calibration import Recognizing, SignName, Usual
 MEASURED: tuple[SignName, ...] = tuple(name for name in LEAST if name != "size")
 """Signs that are measured; what is usual of the size follows from how far units are apart."""
 
-SMALLEST_STD = 0.15
-"""Least standard deviation of a sign's logarithm: a few views may be more alike than others will be."""
+SMALLEST_STD: dict[SignName, float] = {
+    "unexplained": 0.5,
+    "ruled_out": 0.5,
+    "beyond": 0.5,
+    "unusual": 0.2,
+    "displaced": 0.1,
+}
+"""Least standard deviations of the signs' logarithms: a few views may be more alike than others will be.
+
+The first three are 0 in most views, where what is added to them alone is left."""
 
 TRUSTED = 4
 """Views from which on their mean and standard deviation are taken; from fewer, the conservative ones."""
@@ -81,5 +89,5 @@ def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:
         values = [one.logarithms[name] for one in signs if name in one.logarithms]
         if values:
             low, middle, high = np.quantile(values, [0.16, 0.5, 0.84])
-            result[name] = Usual(mean=float(middle), std=max(float(high - low) / 2, SMALLEST_STD))
+            result[name] = Usual(mean=float(middle), std=max(float(high - low) / 2, SMALLEST_STD[name]))
     return result
