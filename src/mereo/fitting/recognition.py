@@ -61,6 +61,9 @@ CONSERVATIVE = Recognizing(
 )
 """For weights that were not calibrated."""
 
+LEAST_LEFT = 0.01
+"""Smallest share of the points that a believed fit may leave unexplained, whatever a caller has set."""
+
 CLIPPED = 0.25
 """Largest distance of one place that counts in ``Signs.displaced``."""
 
@@ -96,7 +99,7 @@ class Signs:
         z = registration.modes_z
         return cls(
             size=None if stated_unit is None else abs(float(np.log(registration.scene_unit / stated_unit))),
-            unexplained=(1.0 - registration.explained) / (1.0 - registration.needed),
+            unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, LEAST_LEFT),
             ruled_out=registration.ruled_out,
             beyond=registration.beyond_states,
             unusual=float((z**2).mean()) if len(z) else None,

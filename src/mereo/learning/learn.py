@@ -6,7 +6,6 @@ The plan is written down once it is made, so the same command continues where it
 """
 
 import json
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -120,11 +119,13 @@ def learn(
         4, f"train from the weights of {plan.init}, {plan.epochs:.1f} passes, about {_duration(plan.training_s)}"
     )
     weights = train(output / DATA, output / RUN, trained(recipe, plan), checkpoint_every_s=CHECKPOINT_S)
-    with atomic_file(output / WEIGHTS) as partial:
-        shutil.copyfile(weights, partial)
     clock.stage(5, "calibrate, and evaluate on views that training has not seen")
-    if not (output / TEST / MARKER).is_file():
-        _evaluate(output, scene, max(clock.left_s, plan.evaluation_s))
+    evaluated = (output / TEST / MARKER).is_file()
+    if not evaluated or not (output / WEIGHTS).is_file():
+        left_s = max(clock.left_s, plan.evaluation_s)
+        each_s = _calibrated(weights, output, scene, left_s)
+        if not evaluated:
+            _evaluate(output, scene, max(clock.left_s, (1 - CALIBRATION_SHARE) * plan.evaluation_s), each_s)
     text = write_example_frame(loaded, output / FRAME)
     metrics = read_metrics(output / TEST / "metrics.json")
     show_outcome(metrics, output, scene, text, minutes, (time.monotonic() - clock.started) / 60)
@@ -199,19 +200,22 @@ def _revised(output: Path, plan: Plan, clock: Clock, batch: int) -> Plan:
     return plan
 
 
-def _evaluate(output: Path, scene: str, left_s: float) -> None:
-    """Calibrate the weights, and score them, each on as many views as there is time for."""
-    started, weights = time.monotonic(), output / WEIGHTS
+def _calibrated(weights: Path, output: Path, scene: str, left_s: float) -> float:
+    """Put the weights of the run, calibrated, into the folder; returns the seconds that a test view takes."""
+    started = time.monotonic()
     evaluate(load_model(weights), scene, examples=TIMED, seed=TEST_SEED_START)
     each_s = (time.monotonic() - started) / TIMED
     views = min(max(views_for(CALIBRATION_SHARE * left_s, each_s), LEAST_VIEWS), VIEWS)
-    # other things than the object would take as long again: its own views are what limits follow from
-    found = calibrate(load_model(weights), scene, views=views, strangers=False)
-    calibrated = with_calibration(weights, found)
-    with atomic_file(weights) as partial:
-        partial.write_bytes(calibrated)
-    tests = views_for(left_s - (time.monotonic() - started), each_s)
-    evaluate_weights(output / WEIGHTS, output / TEST, examples=tests, scene=scene)
+    # other things than the object would take as long again, and only place the second limit of recognition
+    found = calibrate(load_model(weights), scene, views=views, strangers=False, quiet=False)
+    with atomic_file(output / WEIGHTS) as partial:
+        partial.write_bytes(with_calibration(weights, found))
+    return each_s
+
+
+def _evaluate(output: Path, scene: str, left_s: float, each_s: float) -> None:
+    """Score the weights on as many views as there is time for."""
+    evaluate_weights(output / WEIGHTS, output / TEST, examples=views_for(left_s, each_s), scene=scene)
 
 
 def _duration(seconds: float) -> str:
