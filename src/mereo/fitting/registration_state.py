@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo.fitting.answer import Answer
+from mereo.fitting.noise import ACCEPTED
 from mereo.fitting.playback import Drawn, material_moved, shares_of
 from mereo.fitting.register import CURE, Registrar, other_mesh
-from mereo.fitting.noise import ACCEPTED
 from mereo.fitting.registration import BELIEVED, Registration
 from mereo.fitting.state_file import FORMAT, STATE, WITNESSES, RegistrationState, StateDraws, read_state, save_state
 from mereo.geometry.conventions import CloudAxes
