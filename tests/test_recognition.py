@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy_scene import toy_scene
+from toy_scene import Shear, toy_scene
 
 from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
 from mereo.evaluation.recognition_gauge import RecognitionGauge, usual_of
@@ -13,7 +13,6 @@ from mereo.fitting.recognition import CONSERVATIVE, MOST, NOT_ASKED, Recognition
 from mereo.fitting.registration import Registration
 from mereo.models.calibration import Calibration, Recognizing, Usual
 from mereo.scenes.farther_states import FartherDraws, with_farther_states
-from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
@@ -160,24 +159,16 @@ def test_without_views_nothing_is_measured() -> None:
 # --- what is seen -----------------------------------------------------------------------------------------------------
 
 
-def test_states_beyond_are_the_scenes_own_draws_farther_from_their_middle() -> None:
-    """Draw by draw: an interval of any end, a normal, a triangular; choices stay what there is."""
-    near, far = (FartherDraws(3, factor) for factor in (1.0, 1.5))
-    first = [near.uniform(2.0, 6.0), near.normal(1.0, 2.0), near.triangular(0.0, 1.0, 3.0), near.integers(5)]
-    second = [far.uniform(2.0, 6.0), far.normal(1.0, 2.0), far.triangular(0.0, 1.0, 3.0), far.integers(5)]
-    middles = [4.0, 1.0, 1.0]
-    for a, b, middle in zip(first, second, middles, strict=False):
-        assert b - middle == pytest.approx(1.5 * (a - middle))
-    assert first[3] == second[3]
-    assert near.standard_normal(3) * 1.5 == pytest.approx(far.standard_normal(3))
-
-
-def test_the_seeds_own_state_is_met_at_factor_one() -> None:
-    rng = np.random.default_rng(5)
-    seed = int(np.random.default_rng(5).integers(2**31))
-    own = random_state(SCENE, seed).deformations
-    state = SCENE.deform(with_farther_states(SCENE, 1.0).sample_deformations(rng))
-    np.testing.assert_allclose(state.mesh.merged()[0], SCENE.deform(own).mesh.merged()[0])
+def test_states_beyond_have_their_draws_beyond_their_bounds() -> None:
+    """Two-sided intervals on the drawn side, one-sided ones away from zero; choices and full turns stay."""
+    far = FartherDraws(3, 1.5)
+    assert set(np.round(far.uniform(-2.0, 2.0, 50), 9)) == {-3.0, 3.0}
+    assert far.uniform(2.0, 6.0) == 7.0 and far.uniform(-6.0, -2.0) == -7.0 and far.triangular(0.0, 1.0, 3.0) == 4.0
+    assert 0 <= far.uniform(0.0, 2 * np.pi) <= 2 * np.pi and far.integers(5) in range(5)
+    assert far.normal(10.0, 2.0, 4000).std() == pytest.approx(3.0, rel=0.05)
+    assert far.standard_normal(4000).std() == pytest.approx(1.5, rel=0.05)
+    shear = with_farther_states(SCENE, 1.5).sample_deformations(np.random.default_rng(0))[0]
+    assert isinstance(shear, Shear) and np.abs([shear.a, shear.b, shear.c]) == pytest.approx([4.5, 0.45, 0.3])
 
 
 def test_a_scene_that_refuses_has_no_frames_beyond() -> None:

@@ -29,7 +29,7 @@ CAMERAS: tuple[Sensor, ...] = ("paper", "structured-light", "paper", "time-of-fl
 """Cameras of the views, in turn: half of them clean."""
 
 FARTHER = 1.5
-"""Factor of the draws of states that were not learned."""
+"""Factor of the draws of states that were not learned, in their bounds."""
 
 LIVERS = ("liver", "tumor", "liver-simulated")
 """Scenes of one liver, of which one is as good as another to be told from other objects."""
@@ -101,9 +101,9 @@ def strange_frames(scene: Scene, each: int, seed: int) -> Iterator[StrangeFrame]
 
 
 def frames_beyond(scene: Scene, count: int, seed: int, factor: float = FARTHER) -> Iterator[StrangeFrame]:
-    """Frames of the object in states whose draws are all ``factor`` times as far from their middle as a scene's.
+    """Frames of the object in states whose draws are all ``factor`` times as far from their middle as their bounds.
 
-    None of a scene that refuses such states. States of which few draws count may still be within the bounds.
+    None of a scene that refuses such states.
     """
     with suppress(ValueError):
         for index in range(count):
