@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from test_fitting_theorems import IN_FRONT, SCENE, said, shown
 
+from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.fit import ModesFit
 from mereo.fitting.turned_camera import turns
@@ -81,3 +82,11 @@ def test_no_better_answer_leaves_the_fit_as_it_is(model: StatisticalModel) -> No
     alone = ModesFit.of(points, found, model, 1.0)
     asked = ModesFit.of(points, found, model, 1.0, ask=lambda seen: found.rows(np.arange(20)))
     assert asked.problem.misfit(asked.posed).without_network <= alone.problem.misfit(alone.posed).without_network
+
+
+def test_where_frames_do_not_wait_none_is_asked_about_again(model: StatisticalModel) -> None:
+    points, material = shown(model, 0.8)
+    network = Network(points, said(model, material), None)
+    found = confused(said(model, material))
+    ModesFit.of(points, found, model, 1.0, FitConfig(turned=False), ask=network)
+    assert network.asked == 0

@@ -145,6 +145,7 @@ def line(outcome: Outcome[FrameAnswer]) -> dict[str, Any]:
         return {**facts, "error": outcome.error}
     found = outcome.result
     where = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
+    where |= {"known": found.recognition.known, "reason": found.recognition.reason}
     return {**facts, **where, "strays": found.strays, "segments": found.segments}
 
 

@@ -170,6 +170,7 @@ class ModesFit:
             seconds=seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
             ruled_out=self.problem.ruled_out(surface),
+            needed=self.problem.config.accepted,
         )
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
@@ -187,6 +188,15 @@ class ModesFit:
         face = surface.nearest(seen.points)[1]
         model = self.problem.model
         return float((model.labels[model.faces[surface.facing[face], 0]] == seen.labels).mean())
+
+    def displaced(self, registration: Registration, most: float) -> float | None:
+        """``Signs.displaced`` of a registration of this frame; None where the network was not asked."""
+        if len(self.found.points) == 0:
+            return None
+        model = self.problem.model
+        place = model.weights(self.found.rest, self.found.labels)(registration.material) / self.unit
+        apart = np.linalg.norm(place - self.found.points, axis=1) / model.half
+        return float(np.sqrt((np.minimum(apart, most) ** 2).mean()))
 
 
 def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:

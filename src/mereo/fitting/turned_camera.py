@@ -53,7 +53,7 @@ def with_turns(start: Understood, ask: Ask | None) -> Understood:
         ask: the network, in scene units.
     """
     problem, _, modes = start
-    if ask is None or not problem.wants_turns(modes.misfit.cloud, modes.surface):
+    if ask is None or not problem.config.turned or not problem.wants_turns(modes.misfit.cloud, modes.surface):
         return start
     points = problem.evidence.points
     best, waiting = start, turns(points.mean(axis=0))
