@@ -147,6 +147,7 @@ def line(outcome: Outcome[FrameAnswer]) -> dict[str, Any]:
         return {**facts, "error": outcome.error}
     found = outcome.result
     where: dict[str, Any] = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
+    where |= {"known": found.recognition.known, "reason": found.recognition.reason}
     if found.radius95 is not None:
         where["radius95"] = found.radius95
     return {**facts, **where, "strays": found.strays, "segments": found.segments}

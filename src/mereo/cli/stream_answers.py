@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mereo.fitting.recognition import NOT_ASKED, Recognition
 from mereo.fitting.register import Registrar
 from mereo.fitting.tracker import Followed, Tracker
 from mereo.geometry.mesh import SegmentedMesh
@@ -37,6 +38,7 @@ class FrameAnswer:
         method: "modes" of the registered model, or "network".
         tracked: whether the last frame's state led to it, so that the network was not asked.
         explained: share of the observed points that the registered model explains; None without one.
+        recognition: whether the frame shows the object, in a state that was learned.
         radius95: median and greatest radius of 95 % of the surface, input unit, and whether they are calibrated; None
             where it was not asked for, or not known.
     """
@@ -47,10 +49,13 @@ class FrameAnswer:
     method: str
     tracked: bool
     explained: float | None
+    recognition: Recognition = NOT_ASKED
     radius95: dict[str, float | bool] | None = None
 
     @classmethod
-    def of_network(cls, found: Reconstruction, explained: float | None = None) -> "FrameAnswer":
+    def of_network(
+        cls, found: Reconstruction, explained: float | None = None, recognition: Recognition = NOT_ASKED
+    ) -> "FrameAnswer":
         """Answer that is the network's; ``explained`` is of a registration that was not taken."""
         segments = {
             segment.name: {
@@ -60,7 +65,7 @@ class FrameAnswer:
             for segment in found.segments
             if segment.voxels
         }
-        return cls(found.surfaces, segments, found.reading.dropped, "network", False, explained)
+        return cls(found.surfaces, segments, found.reading.dropped, "network", False, explained, recognition)
 
     @classmethod
     def of_registration(cls, found: Followed, uncertainty: bool = False) -> "FrameAnswer":
@@ -76,7 +81,8 @@ class FrameAnswer:
         for one in () if sure is None else sure.segments:
             segments[one.name] |= {"centroid_radius95": round(one.centroid_radius95, DIGITS), "volume95": one.volume95}
         radius95 = None if sure is None else sure.summary(sure.outline)
-        return cls(mesh, segments, found.reading.dropped, registration.method, found.tracked, explained, radius95)
+        method, known = registration.method, found.recognition
+        return cls(mesh, segments, found.reading.dropped, method, found.tracked, explained, known, radius95)
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
@@ -105,9 +111,17 @@ class Answering:
             found = reconstruct(cloud, self.model, self.resolution, frame.axes, keep_all=self.keep_all)
             return FrameAnswer.of_network(found)
         stated = self.tracker.registrar.stated_unit(frame.unit_m)
-        followed = self.tracker.follow(cloud, seen.time_s, frame.axes, stated_unit=stated, keep_all=self.keep_all)
+        followed = self.tracker.follow(
+            cloud,
+            seen.time_s,
+            frame.axes,
+            stated_unit=stated,
+            keep_all=self.keep_all,
+            unit_assumed=not frame.unit_stated,
+        )
         if followed.taken:
             return FrameAnswer.of_registration(followed, self.uncertainty)
         assert followed.asked is not None
         explained = None if followed.registration is None else round(followed.registration.explained, 4)
-        return FrameAnswer.of_network(extract(followed.asked.unaided, self.model, self.resolution), explained)
+        found = extract(followed.asked.unaided, self.model, self.resolution)
+        return FrameAnswer.of_network(found, explained, followed.recognition)

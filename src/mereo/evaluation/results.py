@@ -10,6 +10,7 @@ from mereo.evaluation.candidates import AnswerName, Candidate, RegistrationError
 from mereo.evaluation.coverage import RadiusRatios
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.evaluation.reliability import Reliability
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color
@@ -69,6 +70,8 @@ class Evaluation:
         unit_mm: millimetres per scene unit, where they are known.
         coverage: distances of the same points over the radii that their posteriors give.
         radius_scale: factor of the radii by the weights' calibration, where they have one.
+        reliability: of the network's probabilities.
+        calibrated: whether these are.
     """
 
     names: tuple[str, ...]
@@ -82,6 +85,8 @@ class Evaluation:
     unit_mm: float | None = None
     coverage: RadiusRatios | None = None
     radius_scale: float | None = None
+    reliability: Reliability = field(default_factory=Reliability)
+    calibrated: bool = False
 
     def __repr__(self) -> str:
         scores, count = self.scores, counted(len(self.examples), "example")

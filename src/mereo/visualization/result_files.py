@@ -165,6 +165,7 @@ def summarize(result: Reconstruction, sure: Uncertainty | None = None, **facts: 
         "spacing": float(result.labels.spacing[0]),
         "evaluated_points": result.evaluated,
         "clipped": result.clipped,
+        "calibrated": result.calibrated,
         "segments": segments,
         "timings_s": result.timings_s,
     }
