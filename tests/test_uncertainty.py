@@ -223,10 +223,11 @@ def test_the_scale_is_that_which_holds_95_percent(found: Registration, material:
     np.testing.assert_allclose(calibrated.all, one.all)
     both = RadiusRatios.together([one, calibrated])
     scale = both.scale()
-    said = both.summary(scale)
-    assert said["all"] == pytest.approx(0.95, abs=1e-3) and said["calibrated"]
-    assert both.summary(None)["all"] == pytest.approx((one.all <= 1).mean())
+    said = both.by(scale).summary(unit_mm=2.0)
+    assert said["all"] == pytest.approx(0.95, abs=1e-3)
+    assert both.by(None).summary()["all"] == pytest.approx((one.all <= 1).mean())
     assert said["radius_seen"] == pytest.approx(scale * np.median(one.radii_seen))
+    assert said["radius_hidden_mm"] == pytest.approx(2.0 * scale * np.median(one.radii_hidden))
 
 
 def test_a_registration_from_a_file_has_no_radii(found: Registration, material: np.ndarray) -> None:

@@ -26,11 +26,11 @@ def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: 
 
 @dataclass(frozen=True, eq=False)
 class RadiusRatios:
-    """Distances of registered material points from their true places, over the radii that the posterior alone gives.
+    """Distances of registered material points from their true places, over the radii that they have.
 
     Attributes:
         seen, hidden: of the points that the cloud shows, and of all others.
-        radii_seen, radii_hidden: the radii, scene units, not calibrated.
+        radii_seen, radii_hidden: the radii, scene units.
     """
 
     seen: Float[np.ndarray, " n"]
@@ -42,7 +42,7 @@ class RadiusRatios:
     def of(
         cls, registration: Registration, truth: Float[np.ndarray, "m 3"], seen: Bool[np.ndarray, " m"]
     ) -> "RadiusRatios":
-        """Ratios of one view.
+        """Ratios of one view, to the radii that the posterior alone gives.
 
         Args:
             registration: fitted, not read from a file; a calibration that its weights have is left out.
@@ -75,19 +75,22 @@ class RadiusRatios:
         """Factor of the radii with which 95 % of the true places lie within them: ``Calibration.radius_scale``."""
         return float(np.quantile(self.all, LEVEL))
 
-    def summary(self, scale: float | None, unit_mm: float | None = None) -> dict[str, float | bool | None]:
-        """Share of the true places within the radii, which are calibrated by ``scale`` where there is one.
+    def by(self, scale: float | None) -> "RadiusRatios":
+        """The same with radii times a scale, where there is one."""
+        if scale is None:
+            return self
+        return RadiusRatios(self.seen / scale, self.hidden / scale, self.radii_seen * scale, self.radii_hidden * scale)
+
+    def summary(self, unit_mm: float | None = None) -> dict[str, float | None]:
+        """Share of the true places within the radii, and how large these are.
 
         Of ``all``, ``seen`` and ``hidden`` points (None where there are none), with the medians of the radii in scene
         units, and in mm where ``unit_mm``, millimetres per scene unit, is known.
         """
-        factor = 1.0 if scale is None else scale
         named = {"all": self.all, "seen": self.seen, "hidden": self.hidden}
-        result: dict[str, float | bool | None] = {
-            name: float((ratios <= factor).mean()) if len(ratios) else None for name, ratios in named.items()
-        }
+        result = {name: float((ratios <= 1.0).mean()) if len(ratios) else None for name, ratios in named.items()}
         for name, radii in (("seen", self.radii_seen), ("hidden", self.radii_hidden)):
-            median = factor * float(np.median(radii)) if len(radii) else None
+            median = float(np.median(radii)) if len(radii) else None
             result[f"radius_{name}"] = median
             result[f"radius_{name}_mm"] = None if median is None or unit_mm is None else median * unit_mm
-        return {**result, "calibrated": scale is not None}
+        return result

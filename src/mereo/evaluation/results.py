@@ -68,8 +68,8 @@ class Evaluation:
         sources: where that answer came from, in each example: network, modes or draws.
         errors: distances of registered points from their true places, where a registration was taken.
         unit_mm: millimetres per scene unit, where they are known.
-        coverage: distances of the same points over the radii that their posteriors give.
-        radius_scale: factor of the radii by the weights' calibration, where they have one.
+        coverage: distances of the same points over the radii that are told of them.
+        radii_calibrated: whether all of these are.
         reliability: of the network's probabilities.
         calibrated: whether these are.
     """
@@ -84,7 +84,7 @@ class Evaluation:
     errors: RegistrationErrors | None = None
     unit_mm: float | None = None
     coverage: RadiusRatios | None = None
-    radius_scale: float | None = None
+    radii_calibrated: bool = False
     reliability: Reliability = field(default_factory=Reliability)
     calibrated: bool = False
 

@@ -187,7 +187,8 @@ def score_cases(
     examples: dict[str, Scores] = {}
     views: list[EvaluatedView] = []
     tallies = {name: Tally() for name in names_for(registrar)}
-    answer, sources, errors, ratios, reliability = Tally(), [], [], [], Reliability()
+    answer, sources, errors, reliability = Tally(), [], [], Reliability()
+    ratios, calibrated = list[RadiusRatios](), list[bool]()
     for index in tracked("evaluate", count, "views", quiet=not progress):
         one = case(index)
         found = find_candidates(model, one.cloud, one.truth.grid, registrar, one.scene_unit)
@@ -201,7 +202,9 @@ def score_cases(
         if registration is not None and one.material is not None and one.scene_unit is not None:
             truth = one.material(registration.model)
             errors.append(RegistrationErrors.of(registration, truth, one.cloud, one.scene_unit))
-            ratios.append(RadiusRatios.of(registration, truth, seen_points(truth, one.cloud, one.scene_unit)))
+            ratio = RadiusRatios.of(registration, truth, seen_points(truth, one.cloud, one.scene_unit))
+            ratios.append(ratio.by(registration.radius_scale))
+            calibrated.append(registration.radius_scale is not None)
         if len(views) < kept:
             views.append(_evaluated_view(one, model, found, colors))
     return Evaluation(
@@ -214,7 +217,7 @@ def score_cases(
         sources=tuple(sources),
         errors=RegistrationErrors.together(errors) if errors else None,
         coverage=RadiusRatios.together(ratios) if ratios else None,
-        radius_scale=None if model.calibration is None else model.calibration.radius_scale,
+        radii_calibrated=bool(calibrated) and all(calibrated),
         reliability=reliability,
         calibrated=model.calibrates,
     )

@@ -70,7 +70,7 @@ def coverage(evaluation: Evaluation) -> dict[str, float | bool | None] | None:
     """Share of the true places within the radii of 95 %, and medians of these; None where none was registered."""
     if evaluation.coverage is None:
         return None
-    return evaluation.coverage.summary(evaluation.radius_scale, evaluation.unit_mm)
+    return {**evaluation.coverage.summary(evaluation.unit_mm), "calibrated": evaluation.radii_calibrated}
 
 
 def coverage_line(found: Mapping[str, Any]) -> str:

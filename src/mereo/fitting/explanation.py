@@ -15,7 +15,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.posterior import Optimum, Posterior, Terms
+from mereo.fitting.optimum import Optimum
+from mereo.fitting.posterior import Posterior, Terms
 from mereo.geometry.brief import counted
 from mereo.geometry.transforms import transform_points
 

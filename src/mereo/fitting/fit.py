@@ -20,9 +20,8 @@ from mereo.fitting.draws_problem import narrowing as draws_narrowing
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.modes_fit import Judged, fit_modes
-from mereo.fitting.optimum import DrawsOptimum, ModesOptimum
+from mereo.fitting.optimum import DrawsOptimum, ModesOptimum, Optimum
 from mereo.fitting.playback import DrawnStates
-from mereo.fitting.posterior import Optimum
 from mereo.fitting.problem import Problem
 from mereo.fitting.registration import Method, Registration
 from mereo.fitting.residuals import Surface
@@ -54,7 +53,7 @@ class ModesFit:
         posed: coefficients and pose.
         seconds: that it took.
         rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
-        radius_scale: factor of the radii of uncertainty by the network's calibration.
+        radius_scale: factor of the radii of the modes' uncertainty by the network's calibration.
     """
 
     problem: Problem
@@ -179,7 +178,7 @@ class ModesFit:
             ruled_out=self.problem.ruled_out(surface),
             needed=self.problem.config.accepted,
             optimum=optimum,
-            radius_scale=self.radius_scale,
+            radius_scale=None if method == "draws" else self.radius_scale,  # it was measured on fits of the modes
         )
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:

@@ -114,3 +114,7 @@ class DrawsOptimum:
         )
         material: Float[np.ndarray, "m 3"] = self.fit.placed()
         return Posterior.of(self.terms.total, self.fit.posed, material, modes)
+
+
+Optimum = ModesOptimum | DrawsOptimum
+"""Where a fit has ended, with all that it worked on."""

@@ -11,7 +11,6 @@ Notation: m material points, n queried ones, k coefficients, p = 7 + k parameter
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -186,28 +185,3 @@ def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, 
 
 Observed = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]
 """Observed points in the fit's camera frame, and the distance of each from the facing surface; scene units."""
-
-
-@runtime_checkable
-class Optimum(Protocol):
-    """Where a fit has ended, with all that it worked on: what a posterior and an explanation are made of when asked."""
-
-    @property
-    def unit(self) -> float:
-        """Length of a scene unit of the fit in the input's unit, without the scale that the fit has found."""
-
-    @property
-    def tolerance(self) -> float:
-        """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
-
-    @property
-    def observed(self) -> Observed:
-        """Observed points beside the surface."""
-
-    @property
-    def terms(self) -> Terms:
-        """Terms of the normal equations there."""
-
-    @property
-    def posterior(self) -> Posterior:
-        """Posterior there."""

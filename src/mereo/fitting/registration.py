@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
 from mereo.fitting.explanation import Explanation
+from mereo.fitting.optimum import Optimum
 from mereo.fitting.playback import Drawn
-from mereo.fitting.posterior import Optimum
 from mereo.fitting.uncertainty import Uncertainty
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
@@ -84,7 +84,7 @@ class Registration:
         needed: least ``explained`` of a frame of this noise to be believed.
         optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
             where the registration was read from a file.
-        radius_scale: factor of the radii by the weights' calibration; None where they have none.
+        radius_scale: factor of the radii by the weights' calibration, which is of fits of the modes; None without one.
     """
 
     model: StatisticalModel

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.fitting.explanation import Decided, Weighing
-from mereo.fitting.posterior import WITHIN, Optimum, Posterior, radius95
+from mereo.fitting.optimum import Optimum
+from mereo.fitting.posterior import WITHIN, Posterior, radius95
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.moments import owned_gradients
 from mereo.geometry.radii import Radii
