@@ -9,11 +9,12 @@ from toy_scene import toy_scene
 
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
-from mereo.fitting.fit import estimate_unit, fit_correspondences
+from mereo.fitting.fit import fit_correspondences
 from mereo.fitting.gauss_newton import POSE, Posed, along
 from mereo.fitting.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.recognition import recognize
 from mereo.fitting.registration import Registration
+from mereo.fitting.scene_unit import estimate_unit
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.scene import State

@@ -81,7 +81,9 @@ class Tracker:
     """
 
     def __init__(self, registrar: Registrar, config: TrackConfig = TrackConfig()) -> None:  # noqa: B008 (frozen)
-        self.registrar, self.config = registrar, config
+        # a frame that nobody understands comes 30 times a second while the object is away
+        self.registrar = replace(registrar, config=replace(registrar.config, turned=False))
+        self.config = config
         self.forget()
 
     @classmethod
