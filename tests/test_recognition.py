@@ -92,6 +92,11 @@ def test_a_noisy_frame_may_leave_more_unexplained(registration: Registration) ->
     assert recognize(noisy).known is True
 
 
+def test_the_object_at_rest_is_known_whatever_was_learned(registration: Registration) -> None:
+    odd = replace(registration, z=registration.z + 10.0)
+    assert recognize(odd).known is False and recognize(replace(odd, method="rest")).known is True
+
+
 def test_what_was_not_found_is_not_the_object_and_what_was_not_asked_is_unsure() -> None:
     assert recognize(None) is NOT_ASKED and NOT_ASKED.known == "unsure"
     said = recognize(None, refusal="the network finds only 3 points of the object")
