@@ -193,6 +193,8 @@ class ModesFit:
     def _agreement(self, surface: Surface) -> float:
         """Share of the correspondences on the object whose segment is that of the nearest place of the surface."""
         seen = self.found.rows(self.found.observed)
+        if len(seen.points) == 0:  # a tracked frame, of which the network was not asked
+            return 0.0
         face = surface.nearest(seen.points)[1]
         model = self.problem.model
         return float((model.labels[model.faces[surface.facing[face], 0]] == seen.labels).mean())
