@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from mereo.evaluation.coverage import RadiusRatios
+from mereo.evaluation.radius_gauge import LEAST, RadiusGauge
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.radii import Radii, rounded_to
 from mereo.visualization.vertex_colors import radius_scale
@@ -38,3 +40,16 @@ def test_the_scale_of_radii_ends_at_all_but_a_twentieth() -> None:
     assert scale.high == pytest.approx(np.quantile(radii.values[:20], 0.95)) and "not calibrated" in scale.title
     np.testing.assert_array_equal(scale.colors(radii.values), radii.colors(radii.values))
     assert scale.words[1].endswith(" mm")
+
+
+def test_a_scale_is_measured_on_views_whose_fit_is_in_the_right_state() -> None:
+    """One that is elsewhere would decide it alone; of too few views nothing is said."""
+    rng = np.random.default_rng(0)
+    right = [RadiusRatios(*np.abs(rng.normal(size=(2, 100))), *np.ones((2, 100))) for _ in range(LEAST)]
+    elsewhere = RadiusRatios(*(30.0 + rng.random((2, 100))), *np.ones((2, 100)))
+    gauge = RadiusGauge()
+    gauge.each = [*right[1:], elsewhere]
+    assert gauge.fields() == {}
+    gauge.each.append(right[0])
+    assert gauge.fields() == {"radius_scale": pytest.approx(RadiusRatios.together(right).scale())}
+    assert gauge.fields()["radius_scale"] == pytest.approx(1.96, abs=0.25)

@@ -11,8 +11,9 @@ from mereo.io.bounds import Count, CountOrNone, Threads
 class CalibrateCommand:
     """Measure how far the answers of weights can be trusted, on views of training seeds, and write it into them.
 
-    Probabilities are scaled so that they are as often right as they say, and the limits are set from which on a frame
-    is said to show something else than the object, or a state that was not learned.
+    Probabilities are scaled so that they are as often right as they say, so are the radii within which the registered
+    model says that true places lie, and the limits are set from which on a frame is said to show something else than
+    the object, or a state that was not learned.
 
     Attributes:
         weights: a shipped name or a file.

@@ -167,6 +167,8 @@ def calibration_rows(found: Calibration | None) -> list[tuple[str, str]]:
         kind = "a temperature" if found.biases is None else "a temperature and a bias for each class"
         error = "" if found.ece is None else f"; calibration error {found.ece[0]:.3f}, with it {found.ece[1]:.3f}"
         rows.append(("probabilities", f"{kind} ({found.temperature:.2f}){error}"))
+    if found.radius_scale is not None:
+        rows.append(("radii", f"the posterior's times {found.radius_scale:.2f}, of fits of the modes"))
     if found.recognizing is not None:
         limits = found.recognizing
         rows.append(("recognition", f"unsure above a strangeness of {limits.unsure:.2g}, no from {limits.refused:.2g}"))

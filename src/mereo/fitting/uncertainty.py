@@ -45,7 +45,7 @@ class Uncertainty:
 
     A ``radius95`` is that of the ball around a point that holds its true place with probability 0.95: by the posterior
     of the fit, times ``scale`` where the weights were calibrated. It says nothing of an object that is not the model's,
-    nor of a fit that ended in a wrong state (``Registration.doubt``).
+    nor of a fit that ended in a wrong state (``fitting.recognition`` is to tell both).
 
     Attributes:
         optimum: where the fit has ended.
