@@ -4,14 +4,16 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from mereo.cli import doctor
-from mereo.io import busy_machine
+from mereo import __main__ as command_line
+from mereo.cli import commands, doctor
+from mereo.io import busy_machine, cores
 from mereo.io.busy_machine import BusyWatch, describe_waiting
-from mereo.io.cores import THREAD_VARIABLES, workers_for
+from mereo.io.cores import THREAD_VARIABLES, FreeCores, threads_for, use_free_cores, workers_for
 
 ROOT = Path(__file__).parents[1]
 VARIABLE = "OMP_WAIT_POLICY"
@@ -107,9 +109,8 @@ def test_doctor_shows_policy_and_load(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert "wait policy    passive" in report
     (load,) = (line for line in report if line.startswith("load "))
     assert load.endswith(
-        " 3.2 on 4 cores, which is busy: "
-        + "OMP_NUM_THREADS=1 would help, "
-        + "as all threads wait for the one that shares a core"
+        " 3.2 on 4 cores, which is busy: commands that answer take 2 threads while it is so; "
+        + "OMP_NUM_THREADS=2 would help others, as all threads wait for the one that shares a core"
     )
 
 
@@ -125,25 +126,100 @@ def test_doctor_knows_no_load_where_the_system_has_none(
 
 
 @pytest.mark.parametrize(
-    "load, cores, threads, advised",
+    "load, there, threads, advised",
     [
         (0.9, 2, 2, None),  # more than half of the machine is free
         (1.0, 2, 2, 1),
         (2.9, 2, 2, 1),
         (2.9, 2, 1, None),  # that many already
-        (3.0, 2, 2, None),  # so crowded that fewer threads gain nothing
+        (3.0, 2, 2, 1),
+        (9.0, 2, 1, None),
         (7.9, 16, 16, None),
-        (12.0, 16, 16, 4),
+        (12.0, 16, 16, 8),  # fewer would give away more than the waiting costs
         (12.0, 16, 4, None),
     ],
 )
-def test_advice_is_as_many_threads_as_cores_are_free(
-    load: float, cores: int, threads: int, advised: int | None
+def test_advice_is_as_many_threads_as_cores_are_free_but_half_of_them_at_least(
+    load: float, there: int, threads: int, advised: int | None
 ) -> None:
-    said = doctor.describe_load(load, cores, threads)
-    assert said.startswith(f"{load:.1f} on {cores} cores")
+    said = doctor.describe_load(load, there, threads)
+    assert said.startswith(f"{load:.1f} on {there} cores")
     assert ("OMP_NUM_THREADS" in said) == (advised is not None)
     assert advised is None or f"OMP_NUM_THREADS={advised} would help" in said
+    assert ("crowded" in said) == (load == 9.0)
+
+
+# --- how many threads -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("free", "there", "threads"),
+    [(2.0, 2, 2), (1.6, 2, 2), (1.4, 2, 1), (-3.0, 2, 1), (12.2, 16, 12), (3.0, 16, 8), (9.0, 4, 4), (0.0, 1, 1)],
+)
+def test_threads_are_as_many_as_cores_are_free_and_half_of_them_at_least(free: float, there: int, threads: int) -> None:
+    assert threads_for(free, there) == threads
+
+
+def test_free_cores_are_idle_ones_and_those_that_this_process_uses(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Of the cores that it may use: the third one here is another's."""
+    counts = "cpu  0 0 0 9 9\n" + "".join(
+        f"cpu{core} 70 80 90 {idle} 5 0\n" for core, idle in enumerate((700, 440, 99))
+    )
+    monkeypatch.setattr(cores, "STATISTICS", tmp_path / "stat")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr(os, "sysconf", lambda _: 100, raising=False)
+    (tmp_path / "stat").write_text(counts)
+    assert FreeCores().idle_s == 11.5
+    before = FreeCores(time.monotonic() - 2.0, time.process_time() - 0.5, 10.0)
+    assert before.now() == pytest.approx(1.0, abs=0.1)
+    monkeypatch.setattr(cores, "STATISTICS", tmp_path / "none")
+    monkeypatch.setattr(os, "getloadavg", lambda: (1.5, 0.0, 0.0), raising=False)
+    assert FreeCores().now() == cores.cores() - 1.5
+
+
+@pytest.mark.parametrize(
+    ("files", "count"),
+    [(["250000 100000"], 3), (["max 100000"], 8), (["50000", "100000"], 1), (["-1", "100000"], 8), ([], 8)],
+)
+def test_a_containers_quota_bounds_its_cores(
+    files: list[str], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    paths = [tmp_path / str(number) for number in range(max(1, len(files)))]
+    for path, text in zip(paths, files, strict=False):
+        path.write_text(text)
+    monkeypatch.setattr(cores, "QUOTAS", (tuple(map(str, paths)),))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    assert cores.cores() == count
+
+
+@pytest.mark.parametrize(
+    ("own", "free", "taken", "told"),
+    [(None, 0.9, 1, [1]), (None, 2.0, 2, []), ("2", 0.1, 2, []), ("", 0.1, 1, [1])],
+)
+def test_what_is_free_is_taken_unless_the_user_has_said(
+    own: str | None, free: float, taken: int, told: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[int] = []
+    monkeypatch.setattr(cores, "use_threads", said.append)
+    monkeypatch.setattr(cores, "cores", lambda: 2)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(FreeCores, "now", lambda _: free)
+    monkeypatch.delenv("OMP_NUM_THREADS") if own is None else monkeypatch.setenv("OMP_NUM_THREADS", own)
+    assert use_free_cores(FreeCores()) == taken and said == told
+
+
+def test_commands_that_answer_take_free_cores_and_those_that_train_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[object] = []
+    monkeypatch.setattr(command_line, "use_free_cores", chosen.append)
+    monkeypatch.setattr(command_line, "use_threads", chosen.append)
+    for command in (commands.Evaluate, commands.Train):
+        monkeypatch.setattr(command, "run", lambda self: None)
+    assert command_line.main(["train", "data", "--output", "out"]) == 0 and chosen == []
+    assert command_line.main(["evaluate", "rope", "--output", "out"]) == 0
+    assert command_line.main(["evaluate", "rope", "--output", "out", "--threads", "3"]) == 0
+    assert isinstance(chosen[0], FreeCores) and chosen[1:] == [3]
 
 
 # --- while it works ---------------------------------------------------------------------------------------------------
@@ -177,6 +253,7 @@ BESIDE = """
 import os, subprocess, sys, time
 os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
 from mereo.io import busy_machine
+from mereo.io.cores import FreeCores
 busy_machine.SETTLED_S = 1.0
 other = subprocess.Popen([sys.executable, "-c", "while True: pass"])
 try:
@@ -185,6 +262,7 @@ try:
     while time.monotonic() < end:
         pass
     print(watch.look())
+    print(FreeCores().now())
     print(busy_machine.BusyWatch(watch.since - 9, watch.before).look())
 finally:
     other.kill()
@@ -193,9 +271,9 @@ finally:
 
 @pytest.mark.skipif(not Path("/proc/self/schedstat").is_file(), reason="the system does not tell of it")
 def test_work_beside_other_work_on_one_core_says_so_once() -> None:
-    first, again = run([sys.executable, "-c", BESIDE], None).stdout.splitlines()
+    first, free, again = run([sys.executable, "-c", BESIDE], None).stdout.splitlines()
     share = int(first.partition("waits ")[2].partition("%")[0])
-    assert share >= 40 and again == "None"
+    assert share >= 40 and again == "None" and float(free) < 0.5
 
 
 def test_where_nothing_tells_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

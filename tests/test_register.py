@@ -21,17 +21,16 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.solids import Solids
 from mereo.models.model import Model
-from mereo.models.weights import load_model, save_model
+from mereo.models.weights import save_model
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.scenes.assets import AssetUnavailable
-from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
-    return replace(load_model("rope"), statistical_model=scene_model(load_scene("rope"), 300))
+def model(rope: Model) -> Model:
+    return rope
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +90,7 @@ def test_weights_without_states_say_what_to_do() -> None:
         statistical_model_of(other)
 
 
-def test_the_command_says_which_answer_it_is(model: Model, view: SampleView, tmp_path: Path) -> None:
+def test_the_command_says_which_answer_it_is(model: Model, view: SampleView, few_states: None, tmp_path: Path) -> None:
     save_model(model, tmp_path / "rope.safetensors")
     np.save(tmp_path / "cloud.npy", view.depth.to_points().points)
     arguments = ["reconstruct", str(tmp_path / "cloud.npy"), "--weights", str(tmp_path / "rope.safetensors")]
@@ -137,7 +136,7 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
     assert evaluate(model, changed, examples=1, cells=12, choice="off").sources == ("network",)
 
 
-def test_auto_plays_the_scene_where_it_is_at_hand(model: Model, view: SampleView) -> None:
+def test_auto_plays_the_scene_where_it_is_at_hand(model: Model, view: SampleView, few_states: None) -> None:
     registrar = Registrar.of(model)
     fitted = registrar.fit_modes(view.depth.to_points())
     assert fitted.rest is None

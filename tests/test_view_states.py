@@ -23,7 +23,6 @@ from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model
 from mereo.scenes.parameters import parameters, random_state
-from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.visualization.answering import answer
@@ -38,8 +37,8 @@ needs_browser = pytest.mark.skipif(find_spec("viser") is None or BROWSER is None
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
-    return replace(load_model("rope"), statistical_model=scene_model(load_scene("rope"), 300))
+def model(rope: Model) -> Model:
+    return rope
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ class ReconstructCommand:
             glTF), points (PLY, PCD, XYZ, NPY) or CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses).
         carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
-        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
