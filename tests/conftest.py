@@ -22,6 +22,7 @@ from mereo.scenes import assets  # noqa: E402
 if TYPE_CHECKING:
     from mereo.fitting.playback import DrawnStates
     from mereo.models.model import Model
+    from mereo.scenes.statistical_model import StatisticalModel
 
 FEW_STATES = 60
 """Random states of a scene, among which a fit of its draws starts in the tests: a tenth of what users have."""
@@ -54,6 +55,16 @@ def rope() -> "Model":
     from mereo.models.weights import load_model
 
     return load_model("rope")
+
+
+@pytest.fixture(scope="session")
+def toy_model() -> "StatisticalModel":
+    """The statistical model of the toy scene, from 200 states."""
+    from toy_scene import toy_scene
+
+    from mereo.scenes.random_states import scene_model
+
+    return scene_model(toy_scene(), count=200)
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,6 @@
 """How types are checked while tests run: as mypy does, an int is welcome where a float is expected (PEP 484).
 
-A function within another one is made anew by every call of that one, and with it jaxtyping makes the functions anew that
+A function within another one is made anew by every call of that one, and with it jaxtyping makes those anew that
 check its arguments and its result. They do nothing else, so those of the same names and annotations serve: making them
 takes two milliseconds, and some are made a thousand times in a test.
 """
