@@ -83,3 +83,11 @@ def few_states(few_rope_states: "DrawnStates", monkeypatch: pytest.MonkeyPatch) 
     from mereo.fitting.playback import DrawnStates
 
     monkeypatch.setattr(DrawnStates, "of", lambda scene, model: few_rope_states)
+
+
+@pytest.fixture
+def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let trainings leave an empty curves.png: drawing one takes as long as ten steps of a small network."""
+    from mereo.training import metrics_log
+
+    monkeypatch.setattr(metrics_log, "draw_curves", lambda rows, path: path.write_bytes(b""))

@@ -20,6 +20,8 @@ from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
 from mereo.training.examples_seen import seen_before, seen_by, seen_in_training, told
 from mereo.training.run_directory import claim_run, start_network
 
+pytestmark = pytest.mark.usefixtures("without_curves")
+
 SMALL = replace(
     PRESETS["tiny"],
     network=PRESETS["tiny"].network.changed(points=64, width=48, neighbors=8, mlp_global=(32, 48)),
