@@ -15,6 +15,8 @@ from mereo.evaluation.sample_views import SampleView, load_view
 from mereo.evaluation.scoring import evaluate
 from mereo.fitting import register
 from mereo.fitting.answer import Answer, answer
+from mereo.fitting.fit import ModesFit
+from mereo.fitting.playback import DrawnStates
 from mereo.fitting.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
 from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
