@@ -41,7 +41,7 @@ def print_sure(registered: Registration | None, unit: Unit) -> None:
     told = registered.uncertainty.summary()
     middle, most = (f"{rounded(told[key] * unit.length_factor)} {unit.length_name}" for key in ("median", "max"))
     how = "" if registered.uncertainty.calibrated else ", not calibrated"
-    print(f"the true surface is within {middle} of it in the median, within {most} everywhere (95 %{how})")
+    print(f"true places are within {middle} of its own in the median, within {most} where it is least sure (95 %{how})")
 
 
 def explain(
