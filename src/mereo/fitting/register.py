@@ -4,7 +4,7 @@ EncodedFrame -Registrar-> Registration
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -95,6 +95,11 @@ class Registrar:
     def states(self) -> DrawnStates | None:
         """Random states of the scene, among which a fit of its draws starts; they take seconds once."""
         return None if self.scene is None else DrawnStates.of(self.scene, self.model)
+
+    @property
+    def at_once(self) -> "Registrar":
+        """The same without the patience to ask about a frame again with the camera turned."""
+        return replace(self, config=replace(self.config, turned=False))
 
     def stated_unit(self, unit_m: float) -> float | None:
         """Length of a scene unit in a cloud's unit of ``unit_m`` metres; None where the object's size is not known."""

@@ -82,7 +82,7 @@ class Tracker:
 
     def __init__(self, registrar: Registrar, config: TrackConfig = TrackConfig()) -> None:  # noqa: B008 (frozen)
         # a frame that nobody understands comes 30 times a second while the object is away
-        self.registrar = replace(registrar, config=replace(registrar.config, turned=False))
+        self.registrar = registrar.at_once
         self.config = config
         self.forget()
 
