@@ -43,7 +43,7 @@ class ReconstructCommand:
             point there is and what leaves it unsure, and write the observed points coloured by how much each decides it
             (explained/1.ply, those that the model does not explain in red); once for each. The report has all segments.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
-        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 

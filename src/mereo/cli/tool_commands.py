@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
 from mereo.fitting.track_config import StreamFit
-from mereo.io.bounds import Cells, Count, Port, Positive, PositiveOrUnknown, Threads, Workers
+from mereo.io.bounds import Cells, Count, CountOrNone, Port, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
 from mereo.io.cores import workers_for
 from mereo.models.config import Device, InferenceConfig, Precision
@@ -146,7 +146,7 @@ class StreamCommand:
         reading: how a frame is read.
         isolation: what is left out of it.
         inference: where and how exactly the network computes.
-        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
     """
 
     input: InputName
@@ -198,6 +198,8 @@ class BenchCommand:
         precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
+        beside: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
         output: a JSON file for the figures.
         force: replace an existing file, unless the weights are read from it.
     """
@@ -208,6 +210,8 @@ class BenchCommand:
     precision: Precision = "float32"
     repeats: Count = 7
     rival: bool = False
+    beside: CountOrNone = 1
+    threads: Threads = 0
     output: Path | None = None
     force: bool = False
 
@@ -217,7 +221,17 @@ class BenchCommand:
         from mereo.models.device import find_device
 
         device = find_device(self.device)
-        benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.output, self.force)
+        benchmark(
+            self.weights,
+            self.preset,
+            device,
+            self.precision,
+            self.repeats,
+            self.rival,
+            self.beside,
+            self.output,
+            self.force,
+        )
 
 
 @dataclass(frozen=True)
