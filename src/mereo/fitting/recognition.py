@@ -224,7 +224,7 @@ BEYOND = 0.5
 
 LOOK = "look at the result before you rely on it"
 
-WIDEN = f"{LOOK}, or widen the scene's ranges and learn it anew"
+WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it anew"
 
 
 def _size(registration: Registration, signs: Signs) -> str:
