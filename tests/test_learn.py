@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import load_file
 from scene_files import write_bar
 
+from mereo.evaluation import calibrate as calibration
 from mereo.fitting.playback import DrawnStates
 from mereo.io.sensor_frame import read_frame
 from mereo.learning import learn as learning
@@ -21,6 +22,7 @@ from mereo.learning.example_frame import write_example_frame
 from mereo.learning.learn import learn
 from mereo.learning.object_files import check, deformation, scene_for
 from mereo.learning.schedule import Plan, Rates, epochs_for, holdout, plan_for, views_for
+from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object, size_warning
 from mereo.scenes.files import check_states
@@ -192,6 +194,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         (schedule, "LEAST_TESTS", 1),
         (schedule, "MOST_TESTS", 1),
         (learning, "TIMED", 1),
+        (calibration, "LEAST_VIEWS", 4),
+        (learning, "LEAST_VIEWS", 4),
+        (learning, "VIEWS", 4),
         (learning, "recipe_for", lambda minutes: LIGHT),
         (learning, "evaluate", partial(learning.evaluate, cells=16)),
         (learning, "evaluate_weights", partial(learning.evaluate_weights, cells=16)),
@@ -220,8 +225,12 @@ def test_one_command_and_the_same_again(
     plan = Plan(**json.loads((out / "plan.json").read_text())["plan"])
     assert plan.examples == 30 and plan.init == "rope"
     before = {path: path.stat().st_mtime_ns for path in (out / "data").glob("shard-*")}
+    calibrated = (out / "weights.safetensors").read_bytes()
+    found = load_model(out / "weights.safetensors").calibration
+    assert found is not None and found.temperature is not None and found.views == 4
     monkeypatch.setattr(learning, "evaluate_weights", None)  # all is there
     assert learn([scene], out, minutes=0.05, init="rope") == scores
+    assert (out / "weights.safetensors").read_bytes() == calibrated
     assert before == {path: path.stat().st_mtime_ns for path in (out / "data").glob("shard-*")}
     for arguments, message in (
         (

@@ -11,7 +11,7 @@ from mereo.evaluation.recognition_gauge import RecognitionGauge, usual_of
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.answer import answer
 from mereo.fitting.noise import ACCEPTED
-from mereo.fitting.recognition import CONSERVATIVE, MOST, NOT_ASKED, Recognition, Signs, recognize, strangeness
+from mereo.fitting.recognition import CLIPPED, CONSERVATIVE, MOST, NOT_ASKED, Recognition, Signs, recognize, strangeness
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
@@ -101,6 +101,11 @@ def test_what_was_not_found_is_not_the_object_and_what_was_not_asked_is_unsure()
     assert recognize(None) is NOT_ASKED and NOT_ASKED.known == "unsure"
     said = recognize(None, refusal="the network finds only 3 points of the object")
     assert said.known is False and said.strangeness == MOST and said.reason is not None and "3 points" in said.reason
+
+
+def test_a_network_that_knows_nothing_is_not_believed_even_where_the_fit_is_right(registration: Registration) -> None:
+    """Places half of half the object's length apart, as far as they count, are enough by themselves."""
+    assert recognize(registration, displaced=CLIPPED).known == "unsure"
 
 
 def test_calibrated_weights_have_their_own_limits(registration: Registration) -> None:

@@ -47,14 +47,14 @@ CONSERVATIVE = Recognizing(
         "ruled_out": Usual(mean=float(np.log(0.015)), std=WIDE),
         "beyond": Usual(mean=float(np.log(0.15)), std=WIDE),
         "unusual": Usual(mean=float(np.log(0.6)), std=WIDE),
-        "displaced": Usual(mean=float(np.log(0.08)), std=WIDE),
+        "displaced": Usual(mean=float(np.log(0.06)), std=0.4),
     },
     noisy={
         "unexplained": Usual(mean=float(np.log(0.6)), std=WIDE),
         "ruled_out": Usual(mean=float(np.log(0.03)), std=WIDE),
         "beyond": Usual(mean=float(np.log(0.2)), std=WIDE),
         "unusual": Usual(mean=float(np.log(0.6)), std=WIDE),
-        "displaced": Usual(mean=float(np.log(0.12)), std=WIDE),
+        "displaced": Usual(mean=float(np.log(0.09)), std=0.4),
     },
     unsure=4.0,
     refused=8.0,
@@ -64,7 +64,7 @@ CONSERVATIVE = Recognizing(
 LEAST_LEFT = 0.01
 """Smallest share of the points that a believed fit may leave unexplained, whatever a caller has set."""
 
-CLIPPED = 0.25
+CLIPPED = 0.5
 """Largest distance of one place that counts in ``Signs.displaced``."""
 
 
@@ -224,7 +224,7 @@ BEYOND = 0.5
 
 LOOK = "look at the result before you rely on it"
 
-WIDEN = f"{LOOK}, or widen the scene's ranges and learn it anew"
+WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it anew"
 
 
 def _size(registration: Registration, signs: Signs) -> str:
