@@ -1,6 +1,7 @@
 """What ``mereo stream`` says of a frame: of the registered model that is followed, or of the network's surfaces."""
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import Reconstruction, extract, reconstruct
+from mereo.reconstruction.strays import Reading
 
 DIGITS = 6
 """Digits of a printed coordinate."""
@@ -32,18 +34,29 @@ class FrameAnswer:
         surfaces: of all segments.
         segments: facts of each that was found, by its name: ``centroid``, ``volume``, and the network's ``confidence``
             where the answer is the network's.
-        strays: number of points that were dropped.
+        reading: the frame's points, and which of them are taken for the object's.
         method: "modes" of the registered model, or "network".
         tracked: whether the last frame's state led to it, so that the network was not asked.
         explained: share of the observed points that the registered model explains; None without one.
+        doubt: sentence on why the registered model may be wrong; None without a reason, or without one.
+        observation: what was answered.
+        seconds: of the answer alone, without decoding the frame.
     """
 
     surfaces: SegmentedMesh
     segments: dict[str, Any]
-    strays: int
+    reading: Reading
     method: str
     tracked: bool
     explained: float | None
+    doubt: str | None = None
+    observation: Observation | None = None
+    seconds: float = 0.0
+
+    @property
+    def strays(self) -> int:
+        """Number of points that were dropped."""
+        return self.reading.dropped
 
     @classmethod
     def of_network(cls, found: Reconstruction, explained: float | None = None) -> "FrameAnswer":
@@ -56,7 +69,7 @@ class FrameAnswer:
             for segment in found.segments
             if segment.voxels
         }
-        return cls(found.surfaces, segments, found.reading.dropped, "network", False, explained)
+        return cls(found.surfaces, segments, found.reading, "network", False, explained)
 
     @classmethod
     def of_registration(cls, found: Followed) -> "FrameAnswer":
@@ -69,7 +82,7 @@ class FrameAnswer:
             for name, centroid, volume in zip(mesh.names, centroids, volumes, strict=True)
         }
         explained = round(registration.explained, 4)
-        return cls(mesh, segments, found.reading.dropped, registration.method, found.tracked, explained)
+        return cls(mesh, segments, found.reading, registration.method, found.tracked, explained, registration.doubt)
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
@@ -104,6 +117,11 @@ class Answering:
 
     def __call__(self, seen: Seen) -> FrameAnswer:
         """Answer to a frame; raises ``ValueError`` for unusable clouds, and where nothing is found."""
+        started = time.perf_counter()
+        answer = self._answer(seen)
+        return replace(answer, observation=seen.observation, seconds=time.perf_counter() - started)
+
+    def _answer(self, seen: Seen) -> FrameAnswer:
         frame, cloud = seen.observation.frame, seen.observation.cloud
         if self.tracker is None:
             found = reconstruct(cloud, self.model, self.resolution, frame.axes, keep_all=self.keep_all)

@@ -31,6 +31,7 @@ class TrackConfig:
         gate: distance from the expected surface beyond which a point is left out, as a share of the same half.
         drop: share of the points by which a frame may be explained less than the best since the network was asked.
         margin: share of the points that a frame's own fit must explain more than a lost track to take its place.
+        prior: share of the prior of all states that each tracked frame counts anew: the expectation has had it already.
         scale_std: standard deviation of the scale's logarithm from frame to frame, where the unit is not known.
         longest_s: a longer time without a frame ends the track.
     """
@@ -52,5 +53,6 @@ class TrackConfig:
     gate: float = 0.25
     drop: float = 0.05
     margin: float = 0.02
+    prior: float = 1.0
     scale_std: float = 0.002
     longest_s: float = 1.0

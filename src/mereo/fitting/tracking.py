@@ -163,6 +163,7 @@ def descend(problem: Problem, start: Posed, expectation: Expectation, config: Tr
     """State that explains cloud, silhouette, prior and expectation, from nearby."""
     constants, half = problem.config, problem.model.half
     prior = Prior.whole(problem.model)
+    prior = replace(prior, precision=config.prior * prior.precision)
     posed, steps = start, config.steps + config.exact_steps
     for step in range(steps):
         sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)
