@@ -165,7 +165,7 @@ def line(outcome: Outcome[FrameAnswer]) -> dict[str, Any]:
     if outcome.result is None:
         return {**facts, "error": outcome.error}
     found = outcome.result
-    where = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
+    where = {"method": found.method, "tracked": found.tracked, "explained": found.explained, "doubt": found.doubt}
     return {**facts, **where, "strays": found.strays, "segments": found.segments}
 
 

@@ -140,8 +140,8 @@ def blueprint() -> Any:
         rrb.Tabs(*curves, active_tab=0),
         rrb.TextLogView(origin="log", name="log"),
     )
-    # the cloud is the depth image's points already
-    space = rrb.Spatial3DView(origin="/", contents=["+ /**", "- /camera/depth"], name="object")
+    # with the camera, which is far away, the view would begin with a small object
+    space = rrb.Spatial3DView(origin="/", contents=["/cloud", "/strays", "/object/**"], name="object")
     return rrb.Blueprint(rrb.Horizontal(space, beside, column_shares=[3, 2]), collapse_panels=True)
 
 
@@ -188,18 +188,18 @@ class RerunLog:
     def _add_depth(self, image: DepthImage) -> None:
         if image.camera != self._camera:
             self._camera = image.camera
-            self._log("camera", self._pinhole(image.camera, float(image.depth[image.depth > 0].min(initial=np.inf))))
-        self._log("camera/depth", self._rerun.DepthImage(image.depth.astype(np.float32), meter=1.0))
+            self._log("camera", self._pinhole(image.camera))
+        seen = image.depth[image.depth > 0]
+        span = (seen.min(), seen.max()) if len(seen) else None  # of the colours: 0 is no measurement
+        self._log("camera/depth", self._rerun.DepthImage(image.depth.astype(np.float32), meter=1.0, depth_range=span))
 
-    def _pinhole(self, camera: Camera, nearest_m: float) -> Any:
+    def _pinhole(self, camera: Camera) -> Any:
         # Rerun's pixels have their centres at +0.5 as well
         return self._rerun.Pinhole(
             focal_length=(camera.focal_x_px, camera.focal_y_px),
             principal_point=(camera.center_x_px, camera.center_y_px),
             resolution=(camera.width, camera.height),
             camera_xyz=self._rerun.ViewCoordinates.RDF,
-            # the frame of the picture stands between camera and object
-            image_plane_distance=nearest_m / 4 if np.isfinite(nearest_m) else None,
         )
 
     def _add_object(self, answer: FrameAnswer) -> None:

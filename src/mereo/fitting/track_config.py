@@ -1,7 +1,9 @@
 """Constants of following an object from frame to frame; light, so that the command line may import them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
+
+from mereo.fitting.config import FitConfig
 
 StreamFit = Literal["off", "auto", "modes"]
 """Source of the answers to a sequence, as ``FitChoice``; draws take longer than the time between two frames."""
@@ -18,7 +20,8 @@ class TrackConfig:
         motion: what is expected of the next frame.
         speed: standard deviation of a material point's way from there, scene units per second.
         gain: how many times its present speed is added to that: what is still stays still, what moves may turn.
-        dead: speed that noise alone makes a still object seem to have, which is not counted; scene units per second.
+        dead: speed that noise alone makes a still object seem to have, which is not counted, neither here nor in where
+            it is expected; scene units per second.
         first_speed: the same while nothing is known of its motion, right after the network was asked.
         least: standard deviation in however short a time, scene units.
         smoothing: share of what a frame says of the motion that is believed, the rest is what was known before.
@@ -31,9 +34,9 @@ class TrackConfig:
         gate: distance from the expected surface beyond which a point is left out, as a share of the same half.
         drop: share of the points by which a frame may be explained less than the best since the network was asked.
         margin: share of the points that a frame's own fit must explain more than a lost track to take its place.
-        prior: share of the prior of all states that each tracked frame counts anew: the expectation has had it already.
         scale_std: standard deviation of the scale's logarithm from frame to frame, where the unit is not known.
         longest_s: a longer time without a frame ends the track.
+        clean: constants of frames without noise; those of the next frame follow from the noise of the last ones.
     """
 
     motion: MotionModel = "velocity"
@@ -53,6 +56,6 @@ class TrackConfig:
     gate: float = 0.25
     drop: float = 0.05
     margin: float = 0.02
-    prior: float = 1.0
     scale_std: float = 0.002
     longest_s: float = 1.0
+    clean: FitConfig = field(default_factory=FitConfig)
