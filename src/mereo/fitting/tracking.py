@@ -174,7 +174,9 @@ class Expectation:
     def of(cls, track: Track, state: Posed, passed_s: float, config: TrackConfig) -> "Expectation":
         """Expectation after a time: each point is where ``state`` has it, up to its speeds times that."""
         speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
-        sigma = speed * passed_s + config.least
+        # noisy frames weigh less, and a moving object must not lag behind for that
+        coarser = track.problem.config.cloud_sigma / config.clean.cloud_sigma
+        sigma = coarser * (speed * passed_s + config.least)
         return cls(state, track.squared * (config.motion_worth / sigma**2))
 
     def add_to(self, normal: NormalEquations, posed: Posed) -> NormalEquations:
