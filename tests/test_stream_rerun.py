@@ -13,6 +13,7 @@ import pytest
 from mereo.cli.stream import stream_reconstructions
 from mereo.cli.stream_answers import FrameAnswer
 from mereo.cli.stream_rerun import RerunTarget, messages, series
+from mereo.fitting.recognition import Recognition
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.config import InputConfig
@@ -28,6 +29,7 @@ from mereo.synthesis.sequence_config import SequenceConfig
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
 CAMERA_3X2 = Camera(3, 2, 4.0, 5.0, 1.5, 1.0)
+KNOWN, UNSURE = Recognition(True, None, 0.0), Recognition("unsure", "the camera looked away", 4.0)
 DEPTH = np.array([[0.0, 1.0, 2.0], [1.5, 0.0, 3.0]])
 
 
@@ -39,13 +41,13 @@ def empty(name: str) -> Segment:
     return Segment(name, (1, 2, 3), np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
 
 
-def answer(*segments: Segment, tracked: bool = True, doubt: str | None = None) -> FrameAnswer:
+def answer(*segments: Segment, tracked: bool = True, recognition: Recognition = KNOWN) -> FrameAnswer:
     image = DepthImage(DEPTH, CAMERA_3X2)
     cloud = image.to_points()
     frame = SensorFrame(Path("a.png"), cloud, 1.0, "camera", image)
     reading = Reading(cloud, np.array([True, True, False, True]))
     mesh, seen = SegmentedMesh(segments), Observation(frame, cloud)
-    return FrameAnswer(mesh, {}, reading, "modes", tracked, 0.75, doubt, seen, 0.05)
+    return FrameAnswer(mesh, {}, reading, "modes", tracked, 0.75, recognition, seen, 0.05)
 
 
 def outcome(number: int, result: FrameAnswer | None, error: str = "") -> Outcome[FrameAnswer]:
@@ -79,9 +81,7 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> Rows:
     both = answer(tetrahedron("left ear"), tetrahedron("a/b", 2.0), tracked=False)
     with RerunTarget(str(path)).opened("frames", "camera") as log:
         log.add(outcome(0, both))
-        log.add(
-            outcome(1, answer(tetrahedron("left ear", 3.0), empty("a/b"), doubt="doubtful: the camera looked away"))
-        )
+        log.add(outcome(1, answer(tetrahedron("left ear", 3.0), empty("a/b"), recognition=UNSURE)))
         log.add(outcome(2, None, "2.png is damaged: record it again"))
         log.add(outcome(3, answer(tetrahedron("left ear", 4.0), tetrahedron("a/b"))))
         log.add(outcome(4, answer(tetrahedron("left ear", 5.0), tetrahedron("a/b"))))
@@ -129,6 +129,7 @@ def test_numbers_and_sentences_are_those_of_the_answers(rows: Rows) -> None:
         return [(time, value) for time, (value,) in rows[f"/{name} Scalars:scalars"]]
 
     assert curve("answer/explained") == [(time, 0.75) for time in (0.0, 0.125, 0.375, 0.5)]
+    assert curve("answer/known") == [(0.0, 1.0), (0.125, 0.5), (0.375, 1.0), (0.5, 1.0)]
     assert curve("answer/tracked") == [(0.0, 0.0), (0.125, 1.0), (0.375, 1.0), (0.5, 1.0)]
     assert [value for _, value in curve("points/dropped_frames")] == [0, 1, 2, 3, 4]
     assert {value for _, value in curve("points/strays")} == {1}
@@ -138,7 +139,7 @@ def test_numbers_and_sentences_are_those_of_the_answers(rows: Rows) -> None:
     texts = [(time, text) for time, (text,) in rows["/log TextLog:text"]]
     assert texts == [
         (0.0, "0.png: the network was asked; the answer is by modes"),
-        (0.125, "1.png: doubtful: the camera looked away"),
+        (0.125, f"1.png: {UNSURE.told}"),
         (0.25, "2.png: 2.png is damaged: record it again"),
     ]
     assert [level for _, (level,) in rows["/log TextLog:level"]] == ["INFO", "WARN", "ERROR"]
@@ -147,7 +148,7 @@ def test_numbers_and_sentences_are_those_of_the_answers(rows: Rows) -> None:
 def test_without_a_model_nothing_is_said_of_the_network() -> None:
     alone = FrameAnswer(SegmentedMesh((empty("a"),)), {}, Reading.of_all(PointCloud(CORNERS)), "network", False, None)
     assert list(messages(outcome(0, alone))) == []
-    assert "answer/explained" not in series(outcome(0, alone))
+    assert not {"answer/explained", "answer/known"} & series(outcome(0, alone)).keys()
 
 
 def test_a_scanners_frames_and_dates_are_shown_as_such(tmp_path: Path) -> None:

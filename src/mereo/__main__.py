@@ -17,6 +17,7 @@ import tyro
 from tyro.conf import subcommand
 
 from mereo.cli import commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
+from mereo.cli.calibrate import CalibrateCommand
 from mereo.cli.config_file import GivenOptions, defaults_from, read_options
 from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.learn import LearnCommand
@@ -202,6 +203,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         | starting(commands.Generate, "generate", settings=GenerateConfig(sensor=sensor))
         | starting(commands.Train, "train", config=recipe)
         | starting(commands.Evaluate, "evaluate", terms=sensor)
+        | Annotated[CalibrateCommand, subcommand("calibrate")]
         | starting(ReconstructCommand, "reconstruct")
         | Annotated[tool_commands.Align, subcommand("align")]
         | Annotated[tool_commands.ViewCommand, subcommand("view")]

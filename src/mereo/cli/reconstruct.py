@@ -29,6 +29,7 @@ from mereo.reconstruction.observation import find_object
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import files_of
 from mereo.visualization.answering import answer
+from mereo.visualization.report_words import confidence_title
 from mereo.visualization.result import Result
 
 
@@ -174,15 +175,15 @@ def print_source(found: Answer) -> None:
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
         print("that is too little to believe it: --fit auto keeps the network's answer")
-    if registration.doubt is not None:
-        print(registration.doubt)
+    if found.recognition.told is not None:
+        print(found.recognition.told)
 
 
 def print_segments(result: Reconstruction, title: str) -> None:
     """Print a table of the segments, and a line of the stages' seconds."""
     table = Table(title=title, title_justify="left")
     table.add_column("segment")
-    for column in ("volume", "confidence", "components", "centroid"):
+    for column in ("volume", confidence_title(result.calibrated), "components", "centroid"):
         table.add_column(column, justify="right")
     for found in result.segments:
         place = " ".join(f"{value:.4g}" for value in found.centroid)

@@ -165,7 +165,8 @@ def line(outcome: Outcome[FrameAnswer]) -> dict[str, Any]:
     if outcome.result is None:
         return {**facts, "error": outcome.error}
     found = outcome.result
-    where = {"method": found.method, "tracked": found.tracked, "explained": found.explained, "doubt": found.doubt}
+    where = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
+    where |= {"known": found.recognition.known, "reason": found.recognition.reason}
     return {**facts, **where, "strays": found.strays, "segments": found.segments}
 
 

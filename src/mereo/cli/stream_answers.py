@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mereo.fitting.recognition import NOT_ASKED, Recognition
 from mereo.fitting.register import Registrar
 from mereo.fitting.tracker import Followed, Tracker
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -38,7 +39,7 @@ class FrameAnswer:
         method: "modes" of the registered model, or "network".
         tracked: whether the last frame's state led to it, so that the network was not asked.
         explained: share of the observed points that the registered model explains; None without one.
-        doubt: sentence on why the registered model may be wrong; None without a reason, or without one.
+        recognition: whether the frame shows the object, in a state that was learned.
         observation: what was answered.
         seconds: of the answer alone, without decoding the frame.
     """
@@ -49,7 +50,7 @@ class FrameAnswer:
     method: str
     tracked: bool
     explained: float | None
-    doubt: str | None = None
+    recognition: Recognition = NOT_ASKED
     observation: Observation | None = None
     seconds: float = 0.0
 
@@ -59,7 +60,9 @@ class FrameAnswer:
         return self.reading.dropped
 
     @classmethod
-    def of_network(cls, found: Reconstruction, explained: float | None = None) -> "FrameAnswer":
+    def of_network(
+        cls, found: Reconstruction, explained: float | None = None, recognition: Recognition = NOT_ASKED
+    ) -> "FrameAnswer":
         """Answer that is the network's; ``explained`` is of a registration that was not taken."""
         segments = {
             segment.name: {
@@ -69,7 +72,7 @@ class FrameAnswer:
             for segment in found.segments
             if segment.voxels
         }
-        return cls(found.surfaces, segments, found.reading, "network", False, explained)
+        return cls(found.surfaces, segments, found.reading, "network", False, explained, recognition)
 
     @classmethod
     def of_registration(cls, found: Followed) -> "FrameAnswer":
@@ -82,7 +85,8 @@ class FrameAnswer:
             for name, centroid, volume in zip(mesh.names, centroids, volumes, strict=True)
         }
         explained = round(registration.explained, 4)
-        return cls(mesh, segments, found.reading, registration.method, found.tracked, explained, registration.doubt)
+        method, known = registration.method, found.recognition
+        return cls(mesh, segments, found.reading, method, found.tracked, explained, known)
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
@@ -127,9 +131,17 @@ class Answering:
             found = reconstruct(cloud, self.model, self.resolution, frame.axes, keep_all=self.keep_all)
             return FrameAnswer.of_network(found)
         stated = self.tracker.registrar.stated_unit(frame.unit_m)
-        followed = self.tracker.follow(cloud, seen.time_s, frame.axes, stated_unit=stated, keep_all=self.keep_all)
+        followed = self.tracker.follow(
+            cloud,
+            seen.time_s,
+            frame.axes,
+            stated_unit=stated,
+            keep_all=self.keep_all,
+            unit_assumed=not frame.unit_stated,
+        )
         if followed.taken:
             return FrameAnswer.of_registration(followed)
         assert followed.asked is not None
         explained = None if followed.registration is None else round(followed.registration.explained, 4)
-        return FrameAnswer.of_network(extract(followed.asked.unaided, self.model, self.resolution), explained)
+        found = extract(followed.asked.unaided, self.model, self.resolution)
+        return FrameAnswer.of_network(found, explained, followed.recognition)

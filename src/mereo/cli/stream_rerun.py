@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from mereo.cli.stream_answers import FrameAnswer
+from mereo.fitting.recognition import NOT_ASKED
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, vertex_normals
@@ -253,6 +254,8 @@ def series(outcome: Outcome[FrameAnswer]) -> dict[str, float]:
         facts["answer/tracked"] = float(found.tracked)
         if found.explained is not None:
             facts["answer/explained"] = found.explained
+        if found.recognition is not NOT_ASKED:
+            facts["answer/known"] = 0.5 if found.recognition.known == "unsure" else float(found.recognition.known)
     return facts | {f"milliseconds/{name}": 1e3 * seconds for name, seconds in parts.items()}
 
 
@@ -262,7 +265,7 @@ def messages(outcome: Outcome[FrameAnswer]) -> Iterator[tuple[str, str]]:
     if found is None:
         yield "ERROR", f"{outcome.name}: {outcome.error}"
         return
-    if found.doubt is not None:
-        yield "WARN", f"{outcome.name}: {found.doubt}"
+    if found.recognition.told is not None and found.recognition is not NOT_ASKED:
+        yield "WARN", f"{outcome.name}: {found.recognition.told}"
     if not found.tracked and found.explained is not None:  # else it is asked for every frame
         yield "INFO", f"{outcome.name}: the network was asked; the answer is by {found.method}"

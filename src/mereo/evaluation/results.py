@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from mereo.evaluation.candidates import AnswerName, Candidate, RegistrationErrors
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.evaluation.reliability import Reliability
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color
@@ -66,6 +67,8 @@ class Evaluation:
         sources: where that answer came from, in each example: network, modes or draws.
         errors: distances of registered points from their true places, where a registration was taken.
         unit_mm: millimetres per scene unit, where they are known.
+        reliability: of the network's probabilities.
+        calibrated: whether these are.
     """
 
     names: tuple[str, ...]
@@ -77,6 +80,8 @@ class Evaluation:
     sources: tuple[str, ...] = ()
     errors: RegistrationErrors | None = None
     unit_mm: float | None = None
+    reliability: Reliability = field(default_factory=Reliability)
+    calibrated: bool = False
 
     def __repr__(self) -> str:
         scores, count = self.scores, counted(len(self.examples), "example")

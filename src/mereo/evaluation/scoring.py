@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 from mereo.evaluation.candidates import Candidates, RegistrationErrors, find_candidates, names_for, network_labels
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
+from mereo.evaluation.reliability import Reliability
 from mereo.evaluation.results import EvaluatedView, Evaluation, Tally, grid_confusion
 from mereo.fitting.config import FitChoice
 from mereo.fitting.register import CURE, Registrar, other_mesh, registrar_for
@@ -154,10 +155,10 @@ def trained_scene(model: Model) -> str:
 def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, index: int) -> TestCase:
     view = sample_view(scene.for_seed(seed), settings, example_rng(seed, index))
     name = f"{scene.name} {index}"
-    return TestCase(name, view.depth.to_points(), truth_grid(view.mesh, cells), 1.0, partial(_true_material, view))
+    return TestCase(name, view.depth.to_points(), truth_grid(view.mesh, cells), 1.0, partial(true_material, view))
 
 
-def _true_material(view: View, model: StatisticalModel) -> Float[np.ndarray, "m 3"]:
+def true_material(view: View, model: StatisticalModel) -> Float[np.ndarray, "m 3"]:
     """Where a view's state has moved the material points of its object, camera frame."""
     state = State(view.mesh.transformed(view.T_world_camera), view.deformations)
     return transform_points(inverse_rigid(view.T_world_camera), state_points(state, model.nodes, model.node_labels))
@@ -185,13 +186,14 @@ def score_cases(
     examples: dict[str, Scores] = {}
     views: list[EvaluatedView] = []
     tallies = {name: Tally() for name in names_for(registrar)}
-    answer, sources, errors = Tally(), [], []
+    answer, sources, errors, reliability = Tally(), [], [], Reliability()
     for index in tracked("evaluate", count, "views", quiet=not progress):
         one = case(index)
         found = find_candidates(model, one.cloud, one.truth.grid, registrar, one.scene_unit)
         for name, tally in tallies.items():
             tally.add(one.truth, found.each[name], len(names), model.segmented)
         answer.add(one.truth, found.answer, len(names), model.segmented)
+        reliability.add_view(model, found.code, one.truth)
         examples[one.name] = answer.examples[-1]
         sources.append(found.source)
         registration = found.answer.registration
@@ -209,6 +211,8 @@ def score_cases(
         answers={name: tally.scores for name, tally in tallies.items()},
         sources=tuple(sources),
         errors=RegistrationErrors.together(errors) if errors else None,
+        reliability=reliability,
+        calibrated=model.calibrates,
     )
 
 

@@ -32,6 +32,9 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "example_mean": {"iou": iou, "miou": miou},
         "per_example": {name: {"iou": each.iou, "miou": each.miou} for name, each in evaluation.examples.items()},
         "confusion": evaluation.confusion,
+        "ece": evaluation.reliability.ece,
+        "calibrated": evaluation.calibrated,
+        "reliability": evaluation.reliability.facts(),
         **answers(evaluation),
     }
 

@@ -34,6 +34,12 @@ BESIDE = 1.0
 FAR = 1.0
 """Scene units beyond the tolerance by which a vertex is ruled out for good."""
 
+UNEXPLAINED = 0.3
+"""The cloud's misfit, in squared standard deviations of a partner, above which a fit is likely wrong."""
+
+TAILS = 1.5
+"""The same, in those of normal noise as great as what the fit leaves over."""
+
 
 @dataclass(frozen=True)
 class Misfit:
@@ -116,6 +122,13 @@ class Problem:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_partners, noisy=True)
 
+    def wants_turns(self, cloud: float, surface: Surface) -> bool:
+        """Whether a misfit of the cloud, much greater than its noise, says that the fit is likely wrong."""
+        if cloud < UNEXPLAINED:
+            return False
+        noise = noise_of(surface.offsets(self.evidence.points), self.evidence.around)
+        return cloud > TAILS * (noise / self.config.cloud_sigma) ** 2
+
     def with_network(self, found: Correspondences) -> "Problem":
         """The problem with other correspondences."""
         return replace(self, network=NetworkTerm.of(self.model, found))
@@ -164,7 +177,7 @@ class Problem:
         vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))
         return coarse
 
-    def screen(self, posed: Posed, sigma: float) -> float:
+    def screen(self, posed: Posed, sigma: float) -> Misfit:
         """Misfit by the samples alone: good enough to choose among states, and ten times as fast."""
         samples = self.samples.posed(posed)
         place, normal, _ = samples.planes(self.evidence.partners)
@@ -178,7 +191,7 @@ class Problem:
             self.network.energy(posed, self.network_sigma),
             float(robust_square(amount, sigma, 4 * ROBUST).mean()),
             posed.z,
-        ).total
+        )
 
     def seen(
         self, normal: NormalEquations, posed: Posed, sigma: float, network_worth: float, exact: bool

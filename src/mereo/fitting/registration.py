@@ -21,21 +21,8 @@ Method = Literal["rest", "modes", "draws"]
 
 AT_ONCE = 20_000
 
-RULED_OUT = 0.03
-"""Share of the surface that a frame rules out, from which on a registration is doubtful."""
-
-EXPLAINED = 0.92
-"""Share of the observed points below which it is.
-
-Of 95 believed fits to training views of eight objects, 15 were worse than the network's worst on clean views. One or
-the other rule finds 12 of these, all that are worse by more than .1 among them, and 7 of the other 80, none clean."""
-
-
-HARDLY = 0.5
-"""Share of the observed points below which it is probably another object, or no camera frame."""
-
-BEYOND = 1.0
-"""Scene units outside all that the model has seen (``Registration.beyond_states``), from which on it is doubtful."""
+BELIEVED = 0.95
+"""Share of a clean frame's points that a fit must explain to be believed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +76,7 @@ class Registration:
         drawn: the scene's draws where ``method`` is "draws", with their seed: what plays the state again.
         ruled_out: share of the surface's vertices that the frame rules out, by more than a scene unit: they lie beside
             all that was seen of the object or in front of it; None where the registration was read from a file.
+        needed: least ``explained`` of a frame of this noise to be believed.
     """
 
     model: StatisticalModel
@@ -103,9 +91,10 @@ class Registration:
     drawn: Drawn | None = None
     residual: float | None = None
     ruled_out: float | None = None
+    needed: float = BELIEVED
 
     def __repr__(self) -> str:
-        trust = "not believed, " if not self.accepted else "doubtful, " if self.doubt is not None else ""
+        trust = "" if self.accepted else "not believed, "
         unit = f"a scene unit is {self.scene_unit:.4g}"
         return f"Registration({self.told}, {trust}{unit}; {self.seconds:.1f} s)"
 
@@ -114,38 +103,15 @@ class Registration:
         """Phrase on how well the frame is explained."""
         return f"registered model ({self.method}) explains {self.explained:.1%} of the observed points"
 
-    @property
-    def doubt(self) -> str | None:
-        """Sentence on why a registration may be wrong; None without a reason."""
-        if self.explained < HARDLY:
-            return (
-                f"doubtful: only {self.explained:.0%} of the points can be the model's: this is probably another "
-                "object, not the object alone, or no camera frame: leave out what is not the object, turn the cloud "
-                "(--frame), or name the object's own weights"
-            )
-        if self.ruled_out is not None and self.ruled_out > RULED_OUT:
-            return (
-                f"doubtful: {self.ruled_out:.0%} of the model's surface lies where the frame shows none of it, beside "
-                "or in front of what was seen: look at the result before you rely on it, or take the frame from nearer"
-            )
-        if self.explained < EXPLAINED:
-            return (
-                f"doubtful: {1 - self.explained:.0%} of the points are not the model's: look at the result before you "
-                "rely on it, or leave out of the cloud what is not the object"
-            )
-        if self.beyond_states > BEYOND:
-            return (
-                f"doubtful: the state lies {self.beyond_states:.1f} scene units outside those that were learned, and "
-                "rigid parts may be bent: look at the result before you rely on it, or widen the scene's ranges and "
-                "learn it anew"
-            )
-        return None
-
     @cached_property
+    def modes_z(self) -> Float[np.ndarray, " k"]:
+        """Coefficients of the modes nearest to the state, whatever describes it."""
+        return self.z if self.method != "draws" else self.model.project(self.material / self.scene_unit)[1]
+
+    @property
     def beyond_states(self) -> float:
         """How far the state lies outside all that the model has seen (``StatisticalModel.beyond``), scene units."""
-        z = self.z if self.method != "draws" else self.model.project(self.material / self.scene_unit)[1]
-        return self.model.beyond(z)
+        return self.model.beyond(self.modes_z)
 
     @cached_property
     def mesh(self) -> SegmentedMesh:

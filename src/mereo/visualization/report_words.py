@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mereo.fitting.recognition import told_of
 from mereo.visualization.units import Unit, rounded
 
 STAGES = {
@@ -35,6 +36,11 @@ DASH, GAP = "\N{EN DASH}", 3 * "\N{NO-BREAK SPACE}"
 """For what there is no number of; between coordinates, which have commas at their thousands."""
 
 
+def confidence_title(calibrated: bool) -> str:
+    """Head of a column of confidences."""
+    return "confidence" if calibrated else "confidence, not calibrated"
+
+
 def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
     """Texts of the page.
 
@@ -46,12 +52,13 @@ def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
     volume and confidence of each segment; confidence is None where there is none), ``weights`` (their name) and
     ``timings_s``, seconds of each stage in words.
     """
+    title = confidence_title(summary.get("calibrated") is True)
     times = {name: _number(seconds) for name, seconds in dict(summary.get("timings_s") or {}).items()}
     return {
         "title": str(summary.get("title", "mereo reconstruction")),
         "facts": _facts(summary, unit),
         "warnings": _warnings(summary),
-        "heads": ["segment", f"centre x, y, z ({unit.length_name})", f"volume ({unit.volume_name})", "confidence"],
+        "heads": ["segment", f"centre x, y, z ({unit.length_name})", f"volume ({unit.volume_name})", title],
         "rows": [_row(told, unit) for told in summary.get("segments") or ()],
         "weights": str(summary.get("weights") or ""),
         "timings_s": {STAGES.get(name, _plain(name)): value for name, value in times.items() if value is not None},
@@ -68,7 +75,7 @@ def _facts(summary: Mapping[str, Any], unit: Unit) -> list[str]:
         facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
     if summary.get("device"):
         facts.append(f"computed on {DEVICES.get(str(summary['device']), str(summary['device']))}")
-    said = SAID_ELSEWHERE | FOR_PROGRAMS | {"weights", "spacing", "device", "resolution", "clipped"}
+    said = SAID_ELSEWHERE | FOR_PROGRAMS | {"weights", "spacing", "device", "resolution", "clipped", "calibrated"}
     for key, value in summary.items():
         number = None if isinstance(value, bool) else _number(value)
         if key not in said and (number is not None or isinstance(value, str)):
@@ -87,7 +94,11 @@ def _warnings(summary: Mapping[str, Any]) -> list[str]:
     """Sentences on why the result may not be what it seems."""
     registration = summary.get("registration")
     told = registration if isinstance(registration, Mapping) else {}
-    warnings = [str(told[key]) for key in ("refusal", "doubt") if told.get(key)]
+    warnings = [str(told["refusal"])] if told.get("refusal") else []
+    recognition = summary.get("recognition")
+    known = recognition if isinstance(recognition, Mapping) else {}
+    if known.get("reason") and known.get("signs"):  # without signs nobody was asked, or the refusal has said it
+        warnings.append(told_of(known["known"], str(known["reason"])))
     if summary.get("clipped"):
         warnings.append("the object reaches the border of the volume that was searched and may be cut off there")
     return [text[0].upper() + text[1:] + ("" if text.endswith(".") else ".") for text in warnings]

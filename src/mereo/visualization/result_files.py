@@ -163,6 +163,7 @@ def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:
         "spacing": float(result.labels.spacing[0]),
         "evaluated_points": result.evaluated,
         "clipped": result.clipped,
+        "calibrated": result.calibrated,
         "segments": segments,
         "timings_s": result.timings_s,
     }

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.fitting.answer import Answer as FrameAnswer
+from mereo.fitting.recognition import Recognition, recognize
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
@@ -84,7 +85,7 @@ class Inspection:
             surfaces=registration.mesh.transformed(inverse_rigid(T_camera_input)),
             T_camera_input=T_camera_input,
             model=model,
-            source=explained(registration),
+            source=explained(registration, recognize(registration, model.calibration)),
             cloud=cloud,
             code=None if seen is None else model.encode(seen),
             registration=registration,
@@ -126,13 +127,15 @@ def source_of(found: FrameAnswer, registrar: Registrar | None) -> str:
     """Where an answer comes from, in a phrase for people."""
     if registrar is None:
         return "network alone: the weights carry no statistical model"
-    return explained(found.registration) if found.registration is not None and found.taken else found.source
+    if found.registration is not None and found.taken:
+        return explained(found.registration, found.recognition)
+    told = None if found.registration is None else found.recognition.told
+    return found.source if told is None else f"{found.source}; {told}"
 
 
-def explained(registration: Registration) -> str:
-    """How well a registration explains its frame, in a phrase for people."""
-    told = registration.told
-    return told if registration.doubt is None or not registration.accepted else f"{told}; {registration.doubt}"
+def explained(registration: Registration, recognition: Recognition) -> str:
+    """How well a registration explains its frame, and whether that shows the object, in a phrase for people."""
+    return registration.told if recognition.told is None else f"{registration.told}; {recognition.told}"
 
 
 def first_hit(
