@@ -214,7 +214,7 @@ def test_without_evidence_the_expected_state_is_the_answer(
     state = moving.expected(0.5, config)
     # what noise alone may be does not count as motion
     np.testing.assert_allclose(
-        between(track.posed, state), 0.5 * velocity * (1 - config.dead / moving.speed), atol=1e-9
+        between(track.posed, state), 0.5 * velocity * (1 - (config.dead / moving.speed) ** 2), atol=1e-9
     )
     slow = replace(track, velocity=velocity * config.dead / moving.speed)
     np.testing.assert_allclose(between(track.posed, slow.expected(0.5, config)), 0.0, atol=1e-9)
@@ -249,7 +249,7 @@ def test_frames_that_become_noisier_are_met_with_their_own_constants(
         assert found.tracked or number == 1
     loud = tracker._track
     assert 0.2 < loud.noise < 0.5 and loud.problem.config.cloud_sigma > 1.5 * quiet.cloud_sigma
-    assert loud.problem.config.tolerance > quiet.tolerance and quiet == TrackConfig().clean
+    assert loud.problem.config.tolerance > quiet.tolerance and quiet == registrar.config
     for number in range(11, 21):
         tracker.follow(seen(scene, here, 0.02, number), number / RATE_HZ, scene_unit=1.0)
     assert tracker._track.problem.config == quiet

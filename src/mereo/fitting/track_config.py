@@ -1,9 +1,7 @@
 """Constants of following an object from frame to frame; light, so that the command line may import them."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
-
-from mereo.fitting.config import FitConfig
 
 StreamFit = Literal["off", "auto", "modes"]
 """Source of the answers to a sequence, as ``FitChoice``; draws take longer than the time between two frames."""
@@ -36,7 +34,6 @@ class TrackConfig:
         margin: share of the points that a frame's own fit must explain more than a lost track to take its place.
         scale_std: standard deviation of the scale's logarithm from frame to frame, where the unit is not known.
         longest_s: a longer time without a frame ends the track.
-        clean: constants of frames without noise; those of the next frame follow from the noise of the last ones.
     """
 
     motion: MotionModel = "velocity"
@@ -58,4 +55,3 @@ class TrackConfig:
     margin: float = 0.02
     scale_std: float = 0.002
     longest_s: float = 1.0
-    clean: FitConfig = field(default_factory=FitConfig)

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.fit import KNOWN_SCALE_STD, ModesFit, one_thread
@@ -40,6 +41,7 @@ class Track:
         velocity: of the parameters, in the order of ``gauss_newton``, a second.
         unsure: how far the velocity may be off because little is known yet, scene units per second.
         noise: of the frames, smoothed, scene units.
+        clean: constants of frames without noise; ``problem`` has those for ``noise``.
     """
 
     problem: Problem
@@ -49,9 +51,16 @@ class Track:
     velocity: Float[np.ndarray, " p"]
     unsure: float
     noise: float
+    clean: FitConfig
 
     @classmethod
-    def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig) -> "Track":
+    def of(
+        cls,
+        fitted: ModesFit,
+        time_s: float,
+        config: TrackConfig,
+        clean: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+    ) -> "Track":
         """Track that begins with a frame's own fit."""
         posed, scale = without_scale(fitted.posed)
         base, model = fitted.problem, fitted.problem.model
@@ -59,13 +68,14 @@ class Track:
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
         share_surfaces(base, problem)
         still, noise = np.zeros(POSE + model.count), noise_in(fitted)
-        return cls(problem, fitted.unit * scale, posed, time_s, still, config.first_speed, noise)
+        return cls(problem, fitted.unit * scale, posed, time_s, still, config.first_speed, noise, clean)
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
         if config.motion == "pose":
             return self.posed
-        counted = max(1.0 - config.dead / max(self.speed, 1e-9), 0.0)
+        # James and Stein's estimate of a mean, positive part: small motion may be noise alone, large motion is not
+        counted = max(1.0 - (config.dead / max(self.speed, 1e-9)) ** 2, 0.0)
         return self.posed.moved(counted * self.velocity * (time_s - self.time_s))
 
     @cached_property
@@ -140,9 +150,9 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
     unsure = track.unsure * (1 - config.smoothing)
     noise = track.noise + config.smoothing * (noise_in(fitted) - track.noise)
-    problem = replace(fitted.problem, config=constants_for(noise, config.clean))
+    problem = replace(fitted.problem, config=constants_for(noise, track.clean))
     share_surfaces(fitted.problem, problem)
-    return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise)
+    return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise, track.clean)
 
 
 def noise_in(fitted: ModesFit) -> float:
@@ -175,7 +185,7 @@ class Expectation:
         """Expectation after a time: each point is where ``state`` has it, up to its speeds times that."""
         speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
         # noisy frames weigh less, and a moving object must not lag behind for that
-        coarser = track.problem.config.cloud_sigma / config.clean.cloud_sigma
+        coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
         sigma = coarser * (speed * passed_s + config.least)
         return cls(state, track.squared * (config.motion_worth / sigma**2))
 
