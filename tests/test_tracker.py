@@ -249,7 +249,7 @@ def test_frames_that_become_noisier_are_met_with_their_own_constants(
         assert found.tracked or number == 1
     loud = tracker._track
     assert 0.2 < loud.noise < 0.5 and loud.problem.config.cloud_sigma > 1.5 * quiet.cloud_sigma
-    assert loud.problem.config.tolerance > quiet.tolerance and quiet == registrar.config
+    assert loud.problem.config.tolerance > quiet.tolerance and quiet == tracker.registrar.config
     for number in range(11, 21):
         tracker.follow(seen(scene, here, 0.02, number), number / RATE_HZ, scene_unit=1.0)
     assert tracker._track.problem.config == quiet
