@@ -16,7 +16,7 @@ from mereo.fitting.recognition import recognize
 from mereo.fitting.registration import Registration
 from mereo.fitting.scene_unit import estimate_unit
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
-from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
@@ -28,8 +28,8 @@ CLEAN = replace(GenerateConfig(), noise_std=0.0)
 
 
 @pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=200)
+def model(toy_model: StatisticalModel) -> StatisticalModel:
+    return toy_model
 
 
 def true_material(model: StatisticalModel, view: View) -> np.ndarray:

@@ -8,10 +8,15 @@ from toy_scene import Shear, toy_scene
 
 from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
 from mereo.evaluation.recognition_gauge import RecognitionGauge, usual_of
+from mereo.evaluation.sample_views import load_view
+from mereo.fitting.answer import answer
 from mereo.fitting.noise import ACCEPTED
 from mereo.fitting.recognition import CONSERVATIVE, MOST, NOT_ASKED, Recognition, Signs, recognize, strangeness
+from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
+from mereo.geometry.camera import PointCloud
 from mereo.models.calibration import Calibration, Recognizing, Usual
+from mereo.models.weights import load_model
 from mereo.scenes.farther_states import FartherDraws, with_farther_states
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
@@ -85,6 +90,11 @@ def test_a_noisy_frame_may_leave_more_unexplained(registration: Registration) ->
     clean, noisy = (replace(registration, explained=0.88, needed=needed) for needed in (0.95, ACCEPTED))
     assert recognize(noisy).strangeness < recognize(clean).strangeness
     assert recognize(noisy).known is True
+
+
+def test_the_object_at_rest_is_known_whatever_was_learned(registration: Registration) -> None:
+    odd = replace(registration, z=registration.z + 10.0)
+    assert recognize(odd).known is False and recognize(replace(odd, method="rest")).known is True
 
 
 def test_what_was_not_found_is_not_the_object_and_what_was_not_asked_is_unsure() -> None:
@@ -197,3 +207,20 @@ def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.Monkey
     low, high = rope.rest.bounds
     assert all(len(frame.cloud) > 10 for frame in frames)
     assert all(np.ptp(frame.cloud.points, axis=0).max() < 2 * (high - low).max() for frame in frames[1:])
+
+
+# --- the whole way ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_shipped_weights_tell_their_object_from_another_and_from_a_wrong_unit() -> None:
+    rope = load_model("rope")
+    own, other = (load_view(name).depth.to_points() for name in ("rope", "robot"))
+    registrar = Registrar.of(rope, "modes")
+    assert answer(own, rope, registrar, 24, stated_unit=1.0).recognition.known is True
+    found = answer(other, rope, "auto", 24)
+    assert found.recognition.known is False and not found.taken
+    inches = answer(PointCloud(own.points / 25.4), rope, registrar, 24, stated_unit=1.0).recognition
+    assert inches.known is False and inches.reason is not None and "a factor of" in inches.reason
+    assumed = answer(PointCloud(own.points / 25.4), rope, registrar, 24, stated_unit=1.0, unit_assumed=True)
+    assert assumed.recognition.known is True

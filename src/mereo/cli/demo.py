@@ -178,7 +178,15 @@ def _write(case: Case, found: Answer, registrar: Registrar | None, folder: Path)
         facts["recognition"] = found.recognition.facts()
     with new_directory(folder, force=True) as directory:
         write_files(
-            directory, found.reconstruction, case.cloud, case.frame, DEFAULT_FILES, 1.0, facts, unit=Unit(case.unit_m)
+            directory,
+            found.reconstruction,
+            case.cloud,
+            case.frame,
+            DEFAULT_FILES,
+            1.0,
+            facts,
+            unit=Unit(case.unit_m),
+            registered=found.registered,
         )
         write_state(directory, found, registrar, case.weights, case.frame, 1.0)
 

@@ -256,6 +256,8 @@ def series(outcome: Outcome[FrameAnswer]) -> dict[str, float]:
             facts["answer/explained"] = found.explained
         if found.recognition is not NOT_ASKED:
             facts["answer/known"] = 0.5 if found.recognition.known == "unsure" else float(found.recognition.known)
+        for name, value in (found.radius95 or {}).items():
+            facts[f"radius95/{name}"] = float(value)
     return facts | {f"milliseconds/{name}": 1e3 * seconds for name, seconds in parts.items()}
 
 

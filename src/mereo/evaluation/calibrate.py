@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 from mereo.evaluation.calibration_views import CalibrationView, other_objects, own_views, strange_frames
 from mereo.evaluation.probability_gauge import ProbabilityGauge
+from mereo.evaluation.radius_gauge import RadiusGauge
 from mereo.evaluation.recognition_gauge import RecognitionGauge
 from mereo.evaluation.scoring import check_names, trained_scene
 from mereo.fitting.readings import FittedFrame, fitted_frame
@@ -75,7 +76,8 @@ def calibrate(
     check_names(model, scene.rest.names)
     bare = replace(model, calibration=None)
     registrar = None if model.statistical_model is None else registrar_for(bare, "modes", scene)
-    gauges: tuple[Gauge, ...] = (ProbabilityGauge(bare), *(() if registrar is None else (RecognitionGauge(),)))
+    of_fits: tuple[Gauge, ...] = () if registrar is None else (RecognitionGauge(), RadiusGauge())
+    gauges: tuple[Gauge, ...] = (ProbabilityGauge(bare), *of_fits)
     each = max(1, round(views / 24)) if strangers and registrar is not None else 0
     others = len(other_objects(scene)) if each else 0
     with progress("calibrate", views + each * (others + 8), "views", quiet=quiet) as shown:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.evaluation.candidates import Candidates, RegistrationErrors, find_candidates, names_for, network_labels
+from mereo.evaluation.coverage import RadiusRatios, seen_points
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.reliability import Reliability
@@ -187,6 +188,7 @@ def score_cases(
     views: list[EvaluatedView] = []
     tallies = {name: Tally() for name in names_for(registrar)}
     answer, sources, errors, reliability = Tally(), [], [], Reliability()
+    ratios, calibrated = list[RadiusRatios](), list[bool]()
     for index in tracked("evaluate", count, "views", quiet=not progress):
         one = case(index)
         found = find_candidates(model, one.cloud, one.truth.grid, registrar, one.scene_unit)
@@ -200,6 +202,9 @@ def score_cases(
         if registration is not None and one.material is not None and one.scene_unit is not None:
             truth = one.material(registration.model)
             errors.append(RegistrationErrors.of(registration, truth, one.cloud, one.scene_unit))
+            ratio = RadiusRatios.of(registration, truth, seen_points(truth, one.cloud, one.scene_unit))
+            ratios.append(ratio.by(registration.radius_scale))
+            calibrated.append(registration.radius_scale is not None)
         if len(views) < kept:
             views.append(_evaluated_view(one, model, found, colors))
     return Evaluation(
@@ -211,6 +216,8 @@ def score_cases(
         answers={name: tally.scores for name, tally in tallies.items()},
         sources=tuple(sources),
         errors=RegistrationErrors.together(errors) if errors else None,
+        coverage=RadiusRatios.together(ratios) if ratios else None,
+        radii_calibrated=bool(calibrated) and all(calibrated),
         reliability=reliability,
         calibrated=model.calibrates,
     )

@@ -4,6 +4,7 @@ cloud -fitted_frame-> FittedFrame -finish-> Registration -segments, labels-> Rec
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -18,6 +19,7 @@ from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
+from mereo.geometry.transforms import inverse_rigid
 from mereo.models.model import Model
 from mereo.reconstruction.isosurfaces import Extraction
 from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, extract, timed, turned_back
@@ -45,6 +47,13 @@ class Answer:
 
     def __repr__(self) -> str:
         return f"Answer({self.source}; {self.reconstruction!r})"
+
+    @cached_property
+    def registered(self) -> Registration | None:
+        """Registration in the input's frame, where the reconstruction is that model; else None."""
+        if self.registration is None or not self.taken:
+            return None
+        return self.registration.moved(inverse_rigid(self.reconstruction.T_camera_input))
 
     @property
     def source(self) -> str:

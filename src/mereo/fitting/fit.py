@@ -20,11 +20,12 @@ from mereo.fitting.draws_problem import narrowing as draws_narrowing
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.gauss_newton import Posed
 from mereo.fitting.modes_fit import Judged, fit_modes
+from mereo.fitting.optimum import DrawsOptimum, ModesOptimum, Optimum
 from mereo.fitting.playback import DrawnStates
 from mereo.fitting.problem import Problem
 from mereo.fitting.registration import Method, Registration
 from mereo.fitting.residuals import Surface
-from mereo.fitting.rest_fit import fit_rest, is_at_rest
+from mereo.fitting.rest_fit import fit_rest, is_at_rest, of_rest
 from mereo.fitting.rest_fit import narrowing as modes_narrowing
 from mereo.fitting.scene_unit import agree, estimate_unit
 from mereo.fitting.turned_camera import with_turns
@@ -52,6 +53,7 @@ class ModesFit:
         posed: coefficients and pose.
         seconds: that it took.
         rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
+        radius_scale: factor of the radii of the modes' uncertainty by the network's calibration.
     """
 
     problem: Problem
@@ -60,6 +62,7 @@ class ModesFit:
     posed: Posed
     seconds: float
     rest: Judged | None = None
+    radius_scale: float | None = None
 
     @classmethod
     def of(
@@ -126,8 +129,10 @@ class ModesFit:
     def registration(self) -> Registration:
         """The answer of the modes, or the rest model where the frame speaks for that."""
         if self.rest is not None:
-            return self._registration("rest", self.problem.model.rest_z, self.rest.posed, self.surface, self.seconds)
-        return self._registration("modes", self.posed.z, self.posed, self.surface, self.seconds)
+            end = ModesOptimum(of_rest(self.problem, self.found), self.rest.posed, self.unit)
+            return self._registration("rest", self.problem.model.rest_z, end, self.rest.posed, self.surface)
+        end = ModesOptimum(self.problem, self.posed, self.unit)
+        return self._registration("modes", self.posed.z, end, self.posed, self.surface)
 
     def with_draws(self, states: DrawnStates) -> Registration:
         """The answer of the scene's own draws where their misfit is lower or their evidence greater, else the modes'.
@@ -145,16 +150,17 @@ class ModesFit:
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
             return replace(self.registration(), seconds=seconds)
-        found = self._registration("draws", drawn.z, drawn.posed, drawn.surface, seconds)
-        return replace(found, drawn=replace(drawn.drawn, z=drawn.z))
+        end = DrawsOptimum(problem, drawn, self.unit)
+        found = self._registration("draws", drawn.z, end, drawn.posed, drawn.surface)
+        return replace(found, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
 
     def _registration(
         self,
         method: Method,
         z: Float[np.ndarray, " k"],
+        optimum: Optimum,
         posed: Posed,
         surface: Surface,
-        seconds: float,
     ) -> Registration:
         distance = surface.nearest(self.problem.evidence.partners)[0]
         explained = float((distance <= self.tolerance).mean())
@@ -167,10 +173,12 @@ class ModesFit:
             unit_known=self.problem.scale_std == KNOWN_SCALE_STD,
             explained=explained,
             accepted=self._is_believed(explained, surface),
-            seconds=seconds,
+            seconds=self.seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
             ruled_out=self.problem.ruled_out(surface),
             needed=self.problem.config.accepted,
+            optimum=optimum,
+            radius_scale=None if method == "draws" else self.radius_scale,  # it was measured on fits of the modes
         )
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
@@ -185,6 +193,8 @@ class ModesFit:
     def _agreement(self, surface: Surface) -> float:
         """Share of the correspondences on the object whose segment is that of the nearest place of the surface."""
         seen = self.found.rows(self.found.observed)
+        if len(seen.points) == 0:  # a tracked frame, of which the network was not asked
+            return 0.0
         face = surface.nearest(seen.points)[1]
         model = self.problem.model
         return float((model.labels[model.faces[surface.facing[face], 0]] == seen.labels).mean())
@@ -245,7 +255,8 @@ def fit_frame(
         return _asked(network, model, network.encode(PointCloud(points)))
 
     fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask)
-    return replace(fitted, seconds=fitted.seconds + asked)
+    scale = None if network.calibration is None else network.calibration.radius_scale
+    return replace(fitted, seconds=fitted.seconds + asked, radius_scale=scale)
 
 
 def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Correspondences:

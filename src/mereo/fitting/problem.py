@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import PARTNERS, Evidence
-from mereo.fitting.gauss_newton import NormalEquations, Posed
+from mereo.fitting.gauss_newton import NormalEquations, Posed, Rows
 from mereo.fitting.joints import Joints
 from mereo.fitting.noise import SHARED, constants_for, is_noise, noise_of, shared
 from mereo.fitting.priors import PairTerm, Prior
@@ -20,6 +20,7 @@ from mereo.fitting.residuals import (
     Surface,
     add_cloud,
     add_witnesses,
+    cloud_rows,
     robust_square,
 )
 from mereo.fitting.sampled_surface import SampledSurface
@@ -202,6 +203,12 @@ class Problem:
         normal = self.network.add_to(normal, posed, self.network_sigma, network_worth, robust=True)
         normal = add_cloud(normal, posed, partners, planes, sigma, self.config.cloud_worth)
         return add_witnesses(normal, posed, samples.few(self.config.witnesses), self.evidence, sigma)
+
+    def cloud_rows(self, posed: Posed) -> Rows:
+        """Residuals of the observed partners from the faces, as the last steps of a fit have them."""
+        partners, config = self.evidence.partners, self.config
+        planes = Surface.of(self.model, posed).planes(partners, self.far)
+        return cloud_rows(posed, partners, planes, config.cloud_sigma, config.cloud_worth)
 
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""

@@ -78,8 +78,8 @@ class Signs:
         unexplained: share of the observed points that the model does not explain, in shares that a believed fit may
             leave (5 % of a clean frame, 25 % of a noisy one).
         ruled_out: share of the model's surface that the frame rules out.
-        beyond: how far the state lies outside all that were learned, scene units.
-        unusual: mean square of the state's coefficients.
+        beyond: how far the state lies outside all that were learned, scene units; None at rest.
+        unusual: mean square of the state's coefficients; None at rest.
         displaced: root mean square distance between where the network and the registered model have the same places of
             the object, each ``CLIPPED`` at most, as a share of half its length; None where the network was not asked.
     """
@@ -96,13 +96,13 @@ class Signs:
         cls, registration: Registration, displaced: float | None = None, stated_unit: float | None = None
     ) -> "Signs":
         """Signs of a registration; ``stated_unit`` is the length of a scene unit in its unit as the input says it."""
-        z = registration.modes_z
+        at_rest, z = registration.method == "rest", registration.modes_z  # at rest it is known, whatever was learned
         return cls(
             size=None if stated_unit is None else abs(float(np.log(registration.scene_unit / stated_unit))),
             unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, LEAST_LEFT),
             ruled_out=registration.ruled_out,
-            beyond=registration.beyond_states,
-            unusual=float((z**2).mean()) if len(z) else None,
+            beyond=None if at_rest else registration.beyond_states,
+            unusual=None if at_rest or not len(z) else float((z**2).mean()),
             displaced=displaced,
         )
 

@@ -10,10 +10,15 @@ from numpy.typing import ArrayLike
 
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
+from mereo.fitting.explanation import Explanation
+from mereo.fitting.optimum import Optimum
 from mereo.fitting.playback import Drawn
+from mereo.fitting.uncertainty import Uncertainty
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.moments import owned_centroids
 from mereo.geometry.solids import Solids, signed_distance_and_direction
+from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.statistical_model import StatisticalModel, following
 
 Method = Literal["rest", "modes", "draws"]
@@ -77,6 +82,9 @@ class Registration:
         ruled_out: share of the surface's vertices that the frame rules out, by more than a scene unit: they lie beside
             all that was seen of the object or in front of it; None where the registration was read from a file.
         needed: least ``explained`` of a frame of this noise to be believed.
+        optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
+            where the registration was read from a file.
+        radius_scale: factor of the radii by the weights' calibration, which is of fits of the modes; None without one.
     """
 
     model: StatisticalModel
@@ -92,6 +100,8 @@ class Registration:
     residual: float | None = None
     ruled_out: float | None = None
     needed: float = BELIEVED
+    optimum: Optimum | None = None
+    radius_scale: float | None = None
 
     def __repr__(self) -> str:
         trust = "" if self.accepted else "not believed, "
@@ -164,6 +174,65 @@ class Registration:
         distance, direction = signed_distance_and_direction(self.solids, points, labels)
         nearest = np.where(labels > 0, labels, nearest_labels(self.solids, points)).astype(np.uint8)
         return Located(labels, distance, direction, self.to_rest(points, nearest))
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty | None:
+        """How far the true places may be from the registered ones; None where the registration was read from a file."""
+        return None if self.optimum is None else Uncertainty(self.optimum, self.model, self.radius_scale)
+
+    def radius95(
+        self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Literal["camera", "rest"]
+    ) -> Float[np.ndarray, " n"] | None:
+        """Radius around each point that holds its true place with probability 0.95, in the input's unit.
+
+        The point is one of the object: that which the registration has at the given place of the camera frame, or
+        that which was at the given place of the rest model. ``uncertainty`` has the radii of all vertices, and says
+        whether they are calibrated. None where the registration was read from a file.
+
+        Args:
+            points: n x 3.
+            labels: of the segments that they move along with, 1 or more; by default those that hold them or come
+                nearest.
+            at: "camera" for points of the camera frame in the input's unit, "rest" for scene units of the rest model.
+        """
+        if self.uncertainty is None:
+            return None
+        points = rows_of_three(points)
+        if labels is None:
+            labels = nearest_labels(self.solids if at == "camera" else self.rest_solids, points)
+        return self.uncertainty.of_rest(self.to_rest(points, labels) if at == "camera" else points, labels)
+
+    def explain(self, what: ArrayLike | str, *, at: Literal["camera", "rest"] = "camera") -> Explanation | None:
+        """What decides where a point of the object is: observed points, the network, or what was known of its states.
+
+        Args:
+            what: x, y, z of a point; or the name of a segment, for its centroid.
+            at: "camera" for a point of the camera frame in the input's unit, "rest" for scene units of the rest model.
+
+        Returns None where the registration was read from a file. Raises ``ValueError`` for a name of no segment and
+        for other than three coordinates.
+        """
+        if self.uncertainty is None:
+            return None
+        if isinstance(what, str):
+            names = self.model.rest.names
+            if what not in names:
+                raise ValueError(f"there is no segment {what!r}; the segments are {', '.join(names)}: name one of them")
+            place = owned_centroids(self.mesh)[names.index(what)]
+            decided = self.uncertainty.decided_centroid(names.index(what))
+        else:
+            point = rows_of_three(np.asarray(what, dtype=np.float64)[None])
+            label = nearest_labels(self.solids if at == "camera" else self.rest_solids, point)
+            rest = self.to_rest(point, label) if at == "camera" else point
+            place = self.to_camera(rest, label)[0]
+            decided = self.uncertainty.decided_point(rest, label)
+        return Explanation.of(place, decided, self.uncertainty.optimum, self._T_here_fit)
+
+    @cached_property
+    def _T_here_fit(self) -> Float[np.ndarray, "4 4"]:
+        """From the camera frame of the fit, in the input's unit, to that in which this registration is."""
+        assert self.optimum is not None
+        return fit_rigid(self.optimum.unit * self.optimum.posterior.material, self.material)
 
     def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
         """Registration in another frame."""

@@ -162,7 +162,7 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
         accepted=state.accepted,
         seconds=state.seconds,
         drawn=drawn,
-        # the file does not say it, but only a noisy frame is believed with less than a clean one needs
+        # the file does not say it; what is believed with less than a clean frame needs is noisy, or agrees otherwise
         needed=ACCEPTED if state.accepted and state.explained < BELIEVED else BELIEVED,
     )
 

@@ -42,6 +42,7 @@ class Track:
         unsure: how far the velocity may be off because little is known yet, scene units per second.
         noise: of the frames, smoothed, scene units.
         clean: constants of frames without noise; ``problem`` has those for ``noise``.
+        radius_scale: as ``ModesFit`` has it.
     """
 
     problem: Problem
@@ -52,6 +53,7 @@ class Track:
     unsure: float
     noise: float
     clean: FitConfig
+    radius_scale: float | None = None
 
     @classmethod
     def of(
@@ -68,7 +70,8 @@ class Track:
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
         share_surfaces(base, problem)
         still, noise = np.zeros(POSE + model.count), noise_in(fitted)
-        return cls(problem, fitted.unit * scale, posed, time_s, still, config.first_speed, noise, clean)
+        unit, unsure = fitted.unit * scale, config.first_speed
+        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, fitted.radius_scale)
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
@@ -139,7 +142,8 @@ def next_fit(
         start = track.expected(time_s, config)
         passed = max(time_s - track.time_s, 0.0)
         posed = descend(problem, start, Expectation.of(track, start, passed, config), config)
-    fitted = ModesFit(problem, nothing(), track.unit, posed, time.perf_counter() - started)
+    seconds = time.perf_counter() - started
+    fitted = ModesFit(problem, nothing(), track.unit, posed, seconds, radius_scale=track.radius_scale)
     return fitted, followed(track, fitted, time_s, config)
 
 
@@ -152,7 +156,7 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     noise = track.noise + config.smoothing * (noise_in(fitted) - track.noise)
     problem = replace(fitted.problem, config=constants_for(noise, track.clean))
     share_surfaces(fitted.problem, problem)
-    return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise, track.clean)
+    return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise, track.clean, track.radius_scale)
 
 
 def noise_in(fitted: ModesFit) -> float:

@@ -3,6 +3,7 @@
 from functools import lru_cache
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from pydantic import BaseModel, Field, FiniteFloat, model_validator
@@ -79,6 +80,10 @@ class Calibration(BaseModel, frozen=True):
             return logits
         divided = logits.float() / self.temperature
         return divided if self.biases is None else divided + _on_device(self.biases, logits.device)
+
+    def scaled_array(self, logits: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
+        """``scaled`` of logits that have left their device."""
+        return self.scaled(torch.from_numpy(logits)).numpy()
 
 
 @lru_cache(maxsize=16)

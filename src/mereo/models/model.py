@@ -35,7 +35,7 @@ SURE_LOGIT = 20.0
 DENSE_FACTOR = 8
 """Density, relative to the network's input, above which clouds are thinned at random: ordering all is quadratic."""
 
-CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 4096, 65536
+CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 2048, 65536
 """Numbers of queries at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
 
 Vector = tuple[float, float, float]

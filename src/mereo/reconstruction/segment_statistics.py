@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from scipy import ndimage
 from scipy.special import expit, logsumexp, softmax
@@ -66,7 +65,7 @@ def segment_points(
         labels: of the points, 1 or more, where another than the network says them.
     """
     labels = (logits[:, 1:].argmax(axis=1) + 1).astype(np.uint8) if labels is None else labels
-    scaled = logits if calibration is None else calibration.scaled(torch.from_numpy(logits)).numpy()
+    scaled = logits if calibration is None else calibration.scaled_array(logits)
     parts = scaled[:, 1:].astype(np.float64)
     return SegmentedCloud(
         points=points,

@@ -15,6 +15,7 @@ from jaxtyping import Int
 from PIL import Image
 
 from mereo.evaluation.metrics import format_score
+from mereo.evaluation.tables import coverage_line
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
 from mereo.visualization.reconstruction_report import BUDGET_BYTES
@@ -72,6 +73,7 @@ def write_evaluation_report(
             f"<h1>{escape(title)}</h1>",
             f"<p>{escape('  ·  '.join(shown))}</p>",
             _overall(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]),
+            _coverage(metrics.get("coverage95")),
             f'<div class="pair">{_segments(metrics["per_segment"], colors)}{_examples(metrics["per_example"])}</div>',
             _confusion(("empty", *names), metrics["confusion"]),
             _reliability(metrics.get("reliability") or [], metrics.get("ece"), metrics.get("calibrated") is True),
@@ -99,6 +101,11 @@ def _overall(*figures: float) -> str:
     each = zip(titles, figures, strict=True)
     shown = "".join(f"<div><b>{format_score(value, DASH)}</b><span>{title}</span></div>" for title, value in each)
     return f'<section><div class="big">{shown}</div></section>'
+
+
+def _coverage(found: Mapping[str, Any] | None) -> str:
+    """How often true places lie within the radii that a registration gives."""
+    return "" if found is None else f"<section><h2>How sure</h2>{escape(coverage_line(found))}</section>"
 
 
 def _segments(per_segment: Mapping[str, float], colors: Sequence[Color]) -> str:

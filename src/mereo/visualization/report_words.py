@@ -24,7 +24,19 @@ STAGES = {
 """What each stage of ``timings_s`` does; another one keeps its name."""
 
 SAID_ELSEWHERE = frozenset(
-    {"title", "unit", "unit_m", "source", "frame", "points", "segments", "nested", "timings_s", "registration"}
+    {
+        "title",
+        "radius95",
+        "unit",
+        "unit_m",
+        "source",
+        "frame",
+        "points",
+        "segments",
+        "nested",
+        "timings_s",
+        "registration",
+    }
 )
 """Keys of a summary that the page shows in another place, or that its units say."""
 
@@ -58,11 +70,19 @@ def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
         "title": str(summary.get("title", "mereo reconstruction")),
         "facts": _facts(summary, unit),
         "warnings": _warnings(summary),
-        "heads": ["segment", f"centre x, y, z ({unit.length_name})", f"volume ({unit.volume_name})", title],
+        "heads": _heads(summary, unit, title),
         "rows": [_row(told, unit) for told in summary.get("segments") or ()],
         "weights": str(summary.get("weights") or ""),
         "timings_s": {STAGES.get(name, _plain(name)): value for name, value in times.items() if value is not None},
     }
+
+
+def _heads(summary: Mapping[str, Any], unit: Unit, confidence: str) -> list[str]:
+    """Heads of the table; with radii of 95 % its centres and volumes say how sure they are."""
+    sure = isinstance(summary.get("radius95"), Mapping)
+    centre, volume = (", ± 95 %", " and 95 % of it") if sure else ("", "")
+    heads = [f"centre x, y, z{centre} ({unit.length_name})", f"volume{volume} ({unit.volume_name})"]
+    return ["segment", *heads, confidence]
 
 
 def _facts(summary: Mapping[str, Any], unit: Unit) -> list[str]:
@@ -71,6 +91,8 @@ def _facts(summary: Mapping[str, Any], unit: Unit) -> list[str]:
     source, spacing = summary.get("source"), _number(summary.get("spacing"))
     if source is not None and str(source) != str(summary.get("title")):
         facts.append(f"from {source}")
+    if isinstance(summary.get("radius95"), Mapping):
+        facts.append(_sure(summary["radius95"], unit))
     if spacing is not None:
         facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
     if summary.get("device"):
@@ -81,6 +103,12 @@ def _facts(summary: Mapping[str, Any], unit: Unit) -> list[str]:
         if key not in said and (number is not None or isinstance(value, str)):
             facts.append(f"{_plain(key)}: {value if number is None else rounded(number)}")
     return facts
+
+
+def _sure(radius95: Mapping[str, Any], unit: Unit) -> str:
+    middle, most = (rounded(float(radius95[key]) * unit.length_factor) for key in ("median", "max"))
+    how = "" if radius95.get("calibrated") else ", not calibrated"
+    return f"surface within {middle} {unit.length_name} in the median, {most} at most (95 %{how})"
 
 
 def _answer(registration: Mapping[str, Any]) -> str:
@@ -107,7 +135,10 @@ def _warnings(summary: Mapping[str, Any]) -> list[str]:
 def _row(told: Mapping[str, Any], unit: Unit) -> list[Any]:
     centre, volume = told.get("centroid"), _number(told.get("volume"))
     place: Sequence[str] = [] if centre is None else unit.place(np.asarray(centre, dtype=float)).split()
-    words = [GAP.join(place) or DASH, DASH if volume is None else unit.volume(volume)]
+    radius, between = _number(told.get("centroid_radius95")), told.get("volume95")
+    off = "" if radius is None else f"{GAP}± {rounded(radius * unit.length_factor)}"
+    span = "" if between is None else f"{GAP}{unit.volume(between[0])} to {unit.volume(between[1])}"
+    words = [GAP.join(place) + off or DASH, DASH if volume is None else unit.volume(volume) + span]
     return [*words, _number(told.get("confidence"))]
 
 

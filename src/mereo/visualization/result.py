@@ -106,7 +106,16 @@ class Result(Answer):
         frame = self.seen.frame
         facts = self.facts(carried)
         write_files(
-            directory, self.reconstruction, self.seen.cloud, frame.axes, files, frame.unit_m, facts, carried, self.unit
+            directory,
+            self.reconstruction,
+            self.seen.cloud,
+            frame.axes,
+            files,
+            frame.unit_m,
+            facts,
+            carried,
+            self.unit,
+            self.registered,
         )
         write_state(directory, self, self.registrar, self.model.name, frame.axes, frame.unit_m)
 
@@ -146,7 +155,16 @@ class Result(Answer):
                 files, facts = FilesConfig((), millimetres), self.facts()
                 cloud = self.seen.cloud
                 write_one(
-                    partial, suffix, self.reconstruction, cloud, frame.axes, files, frame.unit_m, facts, self.unit
+                    partial,
+                    suffix,
+                    self.reconstruction,
+                    cloud,
+                    frame.axes,
+                    files,
+                    frame.unit_m,
+                    facts,
+                    self.unit,
+                    self.registered,
                 )
         return path
 
