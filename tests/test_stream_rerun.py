@@ -47,7 +47,7 @@ def answer(*segments: Segment, tracked: bool = True, recognition: Recognition = 
     frame = SensorFrame(Path("a.png"), cloud, 1.0, "camera", image)
     reading = Reading(cloud, np.array([True, True, False, True]))
     mesh, seen = SegmentedMesh(segments), Observation(frame, cloud)
-    return FrameAnswer(mesh, {}, reading, "modes", tracked, 0.75, recognition, seen, 0.05)
+    return FrameAnswer(mesh, {}, reading, "modes", tracked, 0.75, recognition, {"max": 2.5}, seen, 0.05)
 
 
 def outcome(number: int, result: FrameAnswer | None, error: str = "") -> Outcome[FrameAnswer]:
@@ -133,6 +133,7 @@ def test_numbers_and_sentences_are_those_of_the_answers(rows: Rows) -> None:
     assert curve("answer/tracked") == [(0.0, 0.0), (0.125, 1.0), (0.375, 1.0), (0.5, 1.0)]
     assert [value for _, value in curve("points/dropped_frames")] == [0, 1, 2, 3, 4]
     assert {value for _, value in curve("points/strays")} == {1}
+    assert {value for _, value in curve("radius95/max")} == {2.5}
     parts = [dict(curve(f"milliseconds/{name}")) for name in ("waiting", "decoding", "answering", "latency")]
     assert sum(part[0.0] for part in parts[:3]) == pytest.approx(parts[3][0.0]) == pytest.approx(100.0)
     assert dict(curve("milliseconds/failing")) == {0.25: pytest.approx(70.0)}

@@ -142,8 +142,7 @@ class StreamCommand:
         every_frame: answer all frames, however long it takes, instead of the latest.
         watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
         surfaces: folder for the surfaces of each answered frame, one GLB file each; one with content is refused.
-        rerun: a new file FILE.rrd that `rerun FILE.rrd` plays: what was seen, found and doubted, and how long it took;
-            or the address of an open viewer (rerun+http://127.0.0.1:9876/proxy). Needs the extra `rerun`.
+        rerun: a new recording FILE.rrd for `rerun FILE.rrd`, or the address of an open viewer: needs the extra `rerun`.
         force: write into a folder with content, and replace the files of the same names in it; replace a recording.
         reading: how a frame is read.
         isolation: what is left out of it.
