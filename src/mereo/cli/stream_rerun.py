@@ -156,7 +156,8 @@ class RerunLog:
     def __init__(self, recording: Any, axes: CloudAxes) -> None:
         """Log whose clouds have these axes."""
         self._rerun, self.recording = import_rerun(), recording
-        self._number, self._camera, self._found = 0, None, dict[str, Segment]()
+        self._number, self._found = 0, dict[str, Segment]()
+        self._camera: Camera | None = None
         coordinates = self._rerun.ViewCoordinates
         self._log("/", coordinates.RDF if axes == "camera" else coordinates.RIGHT_HAND_Y_UP, static=True)
 
