@@ -98,6 +98,8 @@ def test_noise_alone_moves_a_still_object_less_than_it_moves_single_fits(
         float(np.sqrt(one.var(axis=0).sum(axis=1).mean())) for one in (places, np.stack([vertices(m) for m in alone]))
     )
     assert spread < 0.05 and spread < single
+    # nor does it drift: what a still object seems to move is not gone on with
+    assert apart(found[-1], here) < apart(found[1], here) + 0.05
 
 
 def test_a_jump_is_found_again_in_its_own_frame(
@@ -210,7 +212,12 @@ def test_without_evidence_the_expected_state_is_the_answer(
     velocity = 0.1 * np.random.default_rng(0).normal(size=count)
     moving = replace(track, velocity=velocity)
     state = moving.expected(0.5, config)
-    np.testing.assert_allclose(between(track.posed, state), 0.5 * velocity, atol=1e-9)
+    # what noise alone may be does not count as motion
+    np.testing.assert_allclose(
+        between(track.posed, state), 0.5 * velocity * (1 - (config.dead / moving.speed) ** 2), atol=1e-9
+    )
+    slow = replace(track, velocity=velocity * config.dead / moving.speed)
+    np.testing.assert_allclose(between(track.posed, slow.expected(0.5, config)), 0.0, atol=1e-9)
     assert replace(track, velocity=velocity).expected(0.5, replace(config, motion="pose")) is track.posed
     expectation = Expectation.of(moving, state, 0.5, config)
     nothing = NormalEquations(np.zeros((count, count)), np.zeros(count))
@@ -220,6 +227,32 @@ def test_without_evidence_the_expected_state_is_the_answer(
     # what moves is less certain than what is still
     still = Expectation.of(replace(moving, velocity=np.zeros(count), unsure=0.0), state, 0.5, config)
     assert np.trace(still.precision) > 10 * np.trace(expectation.precision)
+
+
+def test_the_speed_of_a_track_is_that_of_its_points(registrar: Registrar, scene: Scene, here: SegmentedMesh) -> None:
+    track = Track.of(registrar.fit_modes(seen(scene, here), scene_unit=1.0), 0.0, TrackConfig())
+    shift = np.zeros(POSE + track.problem.model.count)
+    assert track.speed == 0.0
+    shift[3:6] = (1.0, -2.0, 2.0)
+    assert replace(track, velocity=shift).speed == pytest.approx(3.0, rel=1e-6)
+
+
+def test_frames_that_become_noisier_are_met_with_their_own_constants(
+    registrar: Registrar, scene: Scene, here: SegmentedMesh
+) -> None:
+    tracker = Tracker(registrar)
+    tracker.follow(seen(scene, here, 0.02), 0.0, scene_unit=1.0)
+    assert tracker._track is not None
+    quiet = tracker._track.problem.config
+    for number in range(1, 11):
+        found = tracker.follow(seen(scene, here, 0.5, number), number / RATE_HZ, scene_unit=1.0)
+        assert found.tracked or number == 1
+    loud = tracker._track
+    assert 0.2 < loud.noise < 0.5 and loud.problem.config.cloud_sigma > 1.5 * quiet.cloud_sigma
+    assert loud.problem.config.tolerance > quiet.tolerance and quiet == tracker.registrar.config
+    for number in range(11, 21):
+        tracker.follow(seen(scene, here, 0.02, number), number / RATE_HZ, scene_unit=1.0)
+    assert tracker._track.problem.config == quiet
 
 
 def test_no_correspondences_add_nothing(registrar: Registrar) -> None:

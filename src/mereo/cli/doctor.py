@@ -15,6 +15,7 @@ from mereo.models.device import bfloat16_gain, cpu_features, pick_device, pick_p
 
 PURPOSES: dict[str, str] = {
     "view": "the pages of `mereo view`",
+    "rerun": "streams as Rerun recordings",
     "track": "training curves in TensorBoard",
     "plots": "curves of training runs, charts of experiments and of modes",
     "onnx": "networks for other runtimes",

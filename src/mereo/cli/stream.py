@@ -4,11 +4,13 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mereo.cli.stream_answers import Answering, FrameAnswer, Seen
+from mereo.cli.stream_rerun import RerunLog, RerunTarget
 from mereo.fitting.register import registrar_for
 from mereo.fitting.track_config import StreamFit
 from mereo.geometry.conventions import CloudAxes
@@ -34,6 +36,7 @@ def stream_reconstructions(
     every_frame: bool = False,
     watch: bool = False,
     surfaces: Path | None = None,
+    rerun: str | None = None,
     force: bool = False,
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
@@ -44,14 +47,17 @@ def stream_reconstructions(
     """Print a line of JSON for each answered or bad frame, and the summary at the end or after Ctrl-C.
 
     Where the object's model is registered, it is followed from frame to frame (``fitting.tracker``). ``surfaces`` is a
-    folder without content, or with ``force`` one in which files of the same name are replaced. ``uncertainty`` says how
-    sure each answer is that is the registered model.
+    folder without content, or with ``force`` one in which files of the same name are replaced. ``rerun`` is a new
+    recording's file or a viewer's address (``RerunTarget``). ``uncertainty`` says how sure each answer is that is the
+    registered model.
 
     Raises ``ValueError`` where not one frame could be answered, and what broke the sequence off, where something did;
-    ``FileExistsError`` for a folder of surfaces with content, without ``force``.
+    ``FileExistsError`` for a folder of surfaces with content or a recording that is there, without ``force``; and as
+    ``RerunTarget`` does.
     """
     source, reading = frames_of_recording(source, reading or InputConfig())
     folder = None if surfaces is None else SurfaceFolder(surfaces, force)
+    target = None if rerun is None else RerunTarget(rerun, force)
     isolation = isolation or IsolationConfig()
     model = load_for(weights, inference or InferenceConfig())
     frames: Iterable[StreamFrame[Observation] | None] = (
@@ -62,13 +68,32 @@ def stream_reconstructions(
     pace = not every_frame and not watch and source != STANDARD_INPUT
     timed = (None if frame is None else with_time(frame) for frame in frames)
     outcomes: Iterator[Outcome[FrameAnswer]] = stream(timed, answer, recorded_pace=pace, every_frame=every_frame)
+    with nullcontext() if target is None else target.opened(Path(source).name, reading.frame) as log:
+        broken_off, last_error, summary = answer_all(outcomes, folder, log, reading.frame)
+        if not summary.answered and broken_off is None and last_error:
+            broken_off = ValueError(
+                f"none of the {summary.failed} frames could be answered; the last one: {last_error}"
+            )
+        if not summary.answered and broken_off is not None:
+            raise broken_off  # nothing is recorded
+    if broken_off is not None:
+        raise broken_off
+    return summary
+
+
+def answer_all(
+    outcomes: Iterable[Outcome[FrameAnswer]], folder: "SurfaceFolder | None", log: RerunLog | None, axes: CloudAxes
+) -> tuple[Exception | None, str, Summary]:
+    """Print and write outcomes until they end or Ctrl-C: what broke them off, the last frame's error, the summary."""
     counter, last_error = Counter(), ""
     broken_off: Exception | None = None
     try:
         for answered in outcomes:
-            outcome = answered if folder is None else folder.written(answered, reading.frame)
+            outcome = answered if folder is None else folder.written(answered, axes)
             counter.add(outcome)
             last_error = outcome.error or last_error
+            if log is not None:
+                log.add(outcome)
             print(json.dumps(to_json(line(outcome))), flush=True)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
@@ -78,11 +103,7 @@ def stream_reconstructions(
         broken_off = problem
     summary = counter.summary()
     print(summary, file=sys.stderr)
-    if broken_off is not None:
-        raise broken_off
-    if not summary.answered and last_error:
-        raise ValueError(f"none of the {summary.failed} frames could be answered; the last one: {last_error}")
-    return summary
+    return broken_off, last_error, summary
 
 
 def frames_of_recording(source: str, reading: InputConfig) -> tuple[str, InputConfig]:

@@ -1,6 +1,7 @@
 """What ``mereo stream`` says of a frame: of the registered model that is followed, or of the network's surfaces."""
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from mereo.geometry.moments import owned_centroids
 from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import Reconstruction, extract, reconstruct
+from mereo.reconstruction.strays import Reading
 
 DIGITS = 6
 """Digits of a printed coordinate."""
@@ -34,23 +36,32 @@ class FrameAnswer:
         surfaces: of all segments.
         segments: facts of each that was found, by its name: ``centroid``, ``volume``, and the network's ``confidence``
             where the answer is the network's.
-        strays: number of points that were dropped.
+        reading: the frame's points, and which of them are taken for the object's.
         method: "modes" of the registered model, or "network".
         tracked: whether the last frame's state led to it, so that the network was not asked.
         explained: share of the observed points that the registered model explains; None without one.
         recognition: whether the frame shows the object, in a state that was learned.
         radius95: median and greatest radius of 95 % of the surface, input unit, and whether they are calibrated; None
             where it was not asked for, or not known.
+        observation: what was answered.
+        seconds: of the answer alone, without decoding the frame.
     """
 
     surfaces: SegmentedMesh
     segments: dict[str, Any]
-    strays: int
+    reading: Reading
     method: str
     tracked: bool
     explained: float | None
     recognition: Recognition = NOT_ASKED
     radius95: dict[str, float | bool] | None = None
+    observation: Observation | None = None
+    seconds: float = 0.0
+
+    @property
+    def strays(self) -> int:
+        """Number of points that were dropped."""
+        return self.reading.dropped
 
     @classmethod
     def of_network(
@@ -65,7 +76,7 @@ class FrameAnswer:
             for segment in found.segments
             if segment.voxels
         }
-        return cls(found.surfaces, segments, found.reading.dropped, "network", False, explained, recognition)
+        return cls(found.surfaces, segments, found.reading, "network", False, explained, recognition)
 
     @classmethod
     def of_registration(cls, found: Followed, uncertainty: bool = False) -> "FrameAnswer":
@@ -82,7 +93,7 @@ class FrameAnswer:
             segments[one.name] |= {"centroid_radius95": round(one.centroid_radius95, DIGITS), "volume95": one.volume95}
         radius95 = None if sure is None else sure.summary(sure.outline)
         method, known = registration.method, found.recognition
-        return cls(mesh, segments, found.reading.dropped, method, found.tracked, explained, known, radius95)
+        return cls(mesh, segments, found.reading, method, found.tracked, explained, known, radius95)
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
@@ -106,6 +117,11 @@ class Answering:
 
     def __call__(self, seen: Seen) -> FrameAnswer:
         """Answer to a frame; raises ``ValueError`` for unusable clouds, and where nothing is found."""
+        started = time.perf_counter()
+        answer = self._answer(seen)
+        return replace(answer, observation=seen.observation, seconds=time.perf_counter() - started)
+
+    def _answer(self, seen: Seen) -> FrameAnswer:
         frame, cloud = seen.observation.frame, seen.observation.cloud
         if self.tracker is None:
             found = reconstruct(cloud, self.model, self.resolution, frame.axes, keep_all=self.keep_all)

@@ -18,7 +18,8 @@ class TrackConfig:
         motion: what is expected of the next frame.
         speed: standard deviation of a material point's way from there, scene units per second.
         gain: how many times its present speed is added to that: what is still stays still, what moves may turn.
-        dead: speed that noise alone makes a still object seem to have, which is not counted; scene units per second.
+        dead: speed that noise alone makes a still object seem to have, which is not counted, neither here nor in where
+            it is expected; scene units per second.
         first_speed: the same while nothing is known of its motion, right after the network was asked.
         least: standard deviation in however short a time, scene units.
         smoothing: share of what a frame says of the motion that is believed, the rest is what was known before.

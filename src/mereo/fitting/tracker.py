@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import FitChoice, FitConfig
 from mereo.fitting.fit import ModesFit
 from mereo.fitting.readings import FittedFrame, fitted_frame
 from mereo.fitting.recognition import NOT_ASKED, Recognition, recognize, recognized
@@ -132,7 +132,7 @@ class Tracker:
         if asked.modes is None and tracked is None and self.registrar.choice != "auto":
             assert asked.error is not None
             raise asked.error
-        own = None if asked.modes is None else _Candidate.of_frame(asked, time_s, self.config)
+        own = None if asked.modes is None else _Candidate.of_frame(asked, time_s, self.config, self.registrar.config)
         if (
             tracked is not None
             and self._takes(tracked)
@@ -200,11 +200,11 @@ class _Candidate:
     reading: Reading
 
     @classmethod
-    def of_frame(cls, asked: FittedFrame, time_s: float, config: TrackConfig) -> "_Candidate":
+    def of_frame(cls, asked: FittedFrame, time_s: float, config: TrackConfig, clean: FitConfig) -> "_Candidate":
         """Candidate of a frame that was fitted by itself."""
         assert asked.modes is not None
         fitted = replace(asked.modes, rest=None)
-        return cls(fitted, Track.of(fitted, time_s, config), asked.reading)
+        return cls(fitted, Track.of(fitted, time_s, config, clean), asked.reading)
 
     @cached_property
     def registration(self) -> Registration:

@@ -9,16 +9,19 @@ have any other evidence, they come to rest.
 
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
 from mereo.fitting.fit import KNOWN_SCALE_STD, ModesFit, one_thread
 from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed, in_space
+from mereo.fitting.noise import constants_for, noise_of
 from mereo.fitting.priors import Prior
 from mereo.fitting.problem import Problem
 from mereo.fitting.residuals import NetworkTerm
@@ -37,6 +40,8 @@ class Track:
         time_s: of the frame.
         velocity: of the parameters, in the order of ``gauss_newton``, a second.
         unsure: how far the velocity may be off because little is known yet, scene units per second.
+        noise: of the frames, smoothed, scene units.
+        clean: constants of frames without noise; ``problem`` has those for ``noise``.
         radius_scale: as ``ModesFit`` has it.
     """
 
@@ -46,24 +51,51 @@ class Track:
     time_s: float
     velocity: Float[np.ndarray, " p"]
     unsure: float
+    noise: float
+    clean: FitConfig
     radius_scale: float | None = None
 
     @classmethod
-    def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig) -> "Track":
+    def of(
+        cls,
+        fitted: ModesFit,
+        time_s: float,
+        config: TrackConfig,
+        clean: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+    ) -> "Track":
         """Track that begins with a frame's own fit."""
         posed, scale = without_scale(fitted.posed)
         base, model = fitted.problem, fitted.problem.model
         scale_std = KNOWN_SCALE_STD if base.scale_std == KNOWN_SCALE_STD else config.scale_std
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
         share_surfaces(base, problem)
-        still = np.zeros(POSE + model.count)
-        return cls(problem, fitted.unit * scale, posed, time_s, still, config.first_speed, fitted.radius_scale)
+        still, noise = np.zeros(POSE + model.count), noise_in(fitted)
+        unit, unsure = fitted.unit * scale, config.first_speed
+        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, fitted.radius_scale)
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
         if config.motion == "pose":
             return self.posed
-        return self.posed.moved(self.velocity * (time_s - self.time_s))
+        # James and Stein's estimate of a mean, positive part: small motion may be noise alone, large motion is not
+        counted = max(1.0 - (config.dead / max(self.speed, 1e-9)) ** 2, 0.0)
+        return self.posed.moved(counted * self.velocity * (time_s - self.time_s))
+
+    @cached_property
+    def squared(self) -> Float[np.ndarray, "p p"]:
+        """Mean square of a material point's way, as a form of the parameters' step."""
+        model = self.problem.model
+        rows = model.sparse
+        modes = model.modes[rows]
+        place = self.posed.place(model.mean[rows] + modes @ self.posed.z.astype(np.float32))
+        jacobian = in_space(self.posed, place, modes).astype(np.float64)
+        form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(rows)
+        return form
+
+    @property
+    def speed(self) -> float:
+        """Speed that the object seems to have: root mean square of its points, scene units per second."""
+        return float(np.sqrt(self.velocity @ self.squared @ self.velocity))
 
 
 def without_scale(posed: Posed) -> tuple[Posed, float]:
@@ -121,7 +153,16 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     passed = max(time_s - track.time_s, 1e-3)
     velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
     unsure = track.unsure * (1 - config.smoothing)
-    return Track(fitted.problem, track.unit * scale, posed, time_s, velocity, unsure, track.radius_scale)
+    noise = track.noise + config.smoothing * (noise_in(fitted) - track.noise)
+    problem = replace(fitted.problem, config=constants_for(noise, track.clean))
+    share_surfaces(fitted.problem, problem)
+    return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise, track.clean, track.radius_scale)
+
+
+def noise_in(fitted: ModesFit) -> float:
+    """Noise of a fitted frame, in scene units."""
+    evidence = fitted.problem.evidence
+    return noise_of(fitted.surface.offsets(evidence.points), evidence.around)
 
 
 def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:
@@ -146,16 +187,11 @@ class Expectation:
     @classmethod
     def of(cls, track: Track, state: Posed, passed_s: float, config: TrackConfig) -> "Expectation":
         """Expectation after a time: each point is where ``state`` has it, up to its speeds times that."""
-        model = track.problem.model
-        rows = model.sparse
-        modes = model.modes[rows]
-        place = state.place(model.mean[rows] + modes @ state.z.astype(np.float32))
-        jacobian = in_space(state, place, modes).astype(np.float64)
-        squared = jacobian.T @ jacobian / len(rows)
-        known = float(np.sqrt(track.velocity @ squared @ track.velocity))
-        speed = config.speed + max(config.gain * max(known - config.dead, 0.0), track.unsure)
-        sigma = speed * passed_s + config.least
-        return cls(state, squared * (config.motion_worth / sigma**2))
+        speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
+        # noisy frames weigh less, and a moving object must not lag behind for that
+        coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
+        sigma = coarser * (speed * passed_s + config.least)
+        return cls(state, track.squared * (config.motion_worth / sigma**2))
 
     def add_to(self, normal: NormalEquations, posed: Posed) -> NormalEquations:
         """Sum with the squared distance from the expectation."""

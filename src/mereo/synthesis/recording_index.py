@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
+from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.errors import first_problem, reason
 
 INDEX = "recording.json"
@@ -69,6 +71,11 @@ class RecordingIndex(_Block):
     nested: tuple[tuple[Text, Text], ...]
     frames: Annotated[tuple[RecordedFrame, ...], Field(min_length=1)]
 
+    def check_segments(self) -> None:
+        """Raise ``ValueError`` where the segments cannot be those of one object: the mesh knows the rules."""
+        nothing, faces = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
+        SegmentedMesh(tuple(Segment(s.name, s.color, nothing, faces, s.solid) for s in self.segments), self.nested)
+
 
 def read_index(path: Path) -> RecordingIndex:
     """Index from its file; raises ``ValueError`` where it is none."""
@@ -81,6 +88,7 @@ def read_index(path: Path) -> RecordingIndex:
         index = RecordingIndex.model_validate_json(content)
         if index.format != FORMAT:
             raise ValueError(f"its format is {index.format}; this mereo reads format {FORMAT}")
+        index.check_segments()
     except ValidationError as error:
         raise ValueError(f"{path} is no recording: {first_problem(error)}: record the sequence again") from None
     except (ValueError, RecursionError) as error:
