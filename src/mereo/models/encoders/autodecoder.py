@@ -36,10 +36,10 @@ class Autodecoder(nn.Module):
         self.mean: Tensor
         self.register_buffer("mean", torch.zeros(latent))
 
-    def add_codes(self, examples: int) -> None:
-        """Make random codes for training, about one away from the mean (which is zero in a new network)."""
+    def add_codes(self, examples: int, length: float) -> None:
+        """Make random codes for training, about ``length`` away from the mean (which is zero in a new network)."""
         width = len(self.mean)
-        self.codes = nn.Parameter(self.mean + torch.randn(examples, width) / math.sqrt(width))
+        self.codes = nn.Parameter(self.mean + length * torch.randn(examples, width) / math.sqrt(width))
 
     @torch.no_grad()
     def update_mean(self) -> None:
