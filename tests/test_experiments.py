@@ -125,7 +125,7 @@ def test_an_encoder_is_compared_like_for_like_or_the_table_says_what_it_lacks() 
     cpu = SCALES["cpu"]
     assert [lacks(cpu, encoder, "ce+l1") for encoder in ("pointnet2", "point-transformer")] == ["", ""]
     missing = lacks(cpu, "autodecoder", "ce+l1")
-    assert missing == "local features, lines of sight, augmentation, weight decay, class offsets"
+    assert missing == "local features, lines of sight, augmentation, weight decay"
     for encoder in ENCODERS:
         assert lacks(SCALES["paper"], encoder, "ce+l1") == "", "as published none has what is ours"
         for scale in SCALES.values():

@@ -199,20 +199,21 @@ def _preset(column: int) -> TrainConfig:
 def _tiny_autodecoder() -> TrainConfig:
     """The published autodecoder with the widths and the schedule of `tiny`, and what else lets it learn in minutes.
 
-    Low frequencies, so that codes in between mean shapes in between; few queries, so that each code is met often.
+    Low frequencies, so that codes in between mean shapes in between; few queries, so that each code is met often; codes
+    that begin short, and a search that gets as far as trained codes lie (docs/design/0009-encoders.md).
     """
     tiny = PRESETS["tiny"]
     bare = {"local_neighbors": 0, "sight_neighbors": 0, "align_points": 0, "rest_template": False}
     return replace(
         tiny,
-        network=tiny.network.changed(encoder="autodecoder", search_rate=5e-3, highest_exponent=1, **bare),
+        network=tiny.network.changed(encoder="autodecoder", search_rate=2e-2, highest_exponent=1, **bare),
         loss="ce+l1",
         queries=64,
         epochs=160,
         code_rate=1e-2,
         code_length=0.16,
         weight_decay=0.0,
-        offset_examples=0,
+        offset_examples=64,
         augment=AugmentConfig(),
         holdout=16,
     )
