@@ -140,11 +140,14 @@ class AutodecoderConfig:
         search_steps: steps of the autodecoder's search for a cloud's code.
         search_rate: learning rate of that search.
         code_penalty: weight of a code's squared length in it, beside the L1 distance.
+        spread_penalty: the same for a search in units of the trained codes' spread along their principal axes, in place
+            of ``code_penalty``; the rate is in these units too. 0 searches the code itself, as DeepSDF.
     """
 
     search_steps: Count = 75
     search_rate: Positive = 1e-3
     code_penalty: NotNegative = 1e-4
+    spread_penalty: NotNegative = 0.0
 
     def __post_init__(self) -> None:
         check_bounds(self, "network.")

@@ -200,13 +200,15 @@ def _tiny_autodecoder() -> TrainConfig:
     """The published autodecoder with the widths and the schedule of `tiny`, and what else lets it learn in minutes.
 
     Low frequencies, so that codes in between mean shapes in between; few queries, so that each code is met often; codes
-    that begin short, and a search that gets as far as trained codes lie (docs/design/0009-encoders.md).
+    that begin short, and a search among codes like the trained ones (docs/design/0009-encoders.md).
     """
     tiny = PRESETS["tiny"]
     bare = {"local_neighbors": 0, "sight_neighbors": 0, "align_points": 0, "rest_template": False}
     return replace(
         tiny,
-        network=tiny.network.changed(encoder="autodecoder", search_rate=2e-2, highest_exponent=1, **bare),
+        network=tiny.network.changed(
+            encoder="autodecoder", search_rate=0.1, spread_penalty=1e-3, highest_exponent=1, **bare
+        ),
         loss="ce+l1",
         queries=64,
         epochs=160,
