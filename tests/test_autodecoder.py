@@ -203,6 +203,21 @@ def test_codes_begin_as_long_as_the_recipe_says(data: Dataset) -> None:
     assert torch.allclose(codes * 10, start_network(replace(SMALL, holdout=2), data).encoder.codes, atol=1e-6)
 
 
+def test_a_search_in_the_codes_spread_stays_among_codes_like_them() -> None:
+    """Codes on a line: the axes have its length, every other direction none, and so nothing found leaves it."""
+    encoder = Autodecoder(AutodecoderConfig(spread_penalty=1e-3, search_rate=0.1), latent=4)
+    line, middle = torch.tensor([2.0, 0.0, 1.0, 0.0]), torch.tensor([0.5, 1.0, 0.0, -1.0])
+    encoder.codes = torch.nn.Parameter(middle + torch.linspace(-1, 1, 21)[:, None] * line)
+    encoder.update_distribution()
+    assert torch.allclose(encoder.mean, middle, atol=1e-6)
+    spread = torch.linspace(-1, 1, 21).std(correction=0) * line.norm()
+    assert torch.allclose(encoder.axes.norm(dim=1).sort().values, torch.tensor([0.0, 0.0, 0.0, spread]), atol=1e-5)
+    wish = middle + 0.5 * line + torch.tensor([0.0, 3.0, 0.0, 3.0])
+    found = encoder.search(lambda code: code - wish, 2)
+    assert torch.allclose(found, (middle + 0.5 * line).expand(2, 4), atol=0.1)
+    assert torch.allclose(found[:, 1], torch.tensor(1.0)) and torch.allclose(found[:, 3], torch.tensor(-1.0))
+
+
 def test_the_prior_is_the_codes_squared_length() -> None:
     encoder = Autodecoder(AutodecoderConfig(code_penalty=0.5), latent=4)
     assert torch.equal(
