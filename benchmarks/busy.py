@@ -14,33 +14,9 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-
-LIMIT = 1.5
-"""Times of the fair share that the policy mereo sets may take."""
 
 SETTINGS = (("passive", None), ("passive", 1), ("active", None), (None, None))
 """OMP_WAIT_POLICY and OMP_NUM_THREADS of each row; None is not set."""
-
-BUSY = "import os; parent = os.getppid(); print('started', flush=True)\nwhile os.getppid() == parent: pass"
-"""A process that never rests, and ends with whoever started it."""
-
-
-@contextmanager
-def busy_processes(count: int) -> Iterator[None]:
-    """That many run meanwhile."""
-    command = [sys.executable, "-c", BUSY]
-    processes = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(count)]
-    try:
-        for process in processes:
-            assert process.stdout is not None
-            process.stdout.readline()
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
 
 
 def measure(queries: int, rounds: int, beside: int) -> None:
@@ -48,6 +24,7 @@ def measure(queries: int, rounds: int, beside: int) -> None:
     import torch  # before mereo, so that OpenMP finds the variable as this row has it
 
     from mereo.evaluation.sample_views import load_view
+    from mereo.experiments.speed.beside import busy_processes
     from mereo.experiments.speed.stages import random_points
     from mereo.models.weights import load_model
 
@@ -70,6 +47,9 @@ def measure(queries: int, rounds: int, beside: int) -> None:
 
 def row(policy: str | None, threads: int | None, options: argparse.Namespace) -> float:
     """Print one row of the table; returns the times of the fair share."""
+    from mereo.experiments.speed.beside import fair_share
+    from mereo.io.cores import cores
+
     variables = {
         name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "OMP_NUM_THREADS")
     }
@@ -83,12 +63,14 @@ def row(policy: str | None, threads: int | None, options: argparse.Namespace) ->
     ]
     told = subprocess.run(command, env=variables, stdout=subprocess.PIPE, text=True, check=True).stdout.split()
     used, alone, busy = int(told[0]), float(told[1]), float(told[2])
-    fair = alone * max(1.0, (used + options.beside) / (os.cpu_count() or 1))
+    fair = fair_share(alone, used, options.beside, cores())
     print(f"| {policy or 'not set'} | {used} | {alone:.2f} | {fair:.2f} | {busy:.2f} | {busy / fair:.2f} |", flush=True)
     return busy / fair
 
 
 def main() -> None:
+    from mereo.experiments.speed.beside import LIMIT
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--queries", type=int, default=40_000)
     parser.add_argument("--rounds", type=int, default=9)

@@ -1,15 +1,31 @@
-"""Array shapes are checked in every call while tests run; files that are not in the repository are found or skipped."""
+"""Array shapes are checked in every call while tests run; what many tests need is made once.
 
+Files that are not in the repository are found, or the test that needs them is skipped.
+"""
+
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from jaxtyping import install_import_hook
+
+# before torch is loaded: the tests' products are small, and others may hold the second core
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # before the first import of mereo: from here on a wrong shape or dtype is an error
 install_import_hook("mereo", "type_checker.check")
 
 from mereo.scenes import assets  # noqa: E402
+
+if TYPE_CHECKING:
+    from mereo.fitting.playback import DrawnStates
+    from mereo.models.model import Model
+    from mereo.scenes.statistical_model import StatisticalModel
+
+FEW_STATES = 60
+"""Random states of a scene, among which a fit of its draws starts in the tests: a tenth of what users have."""
 
 
 def find_asset(name: str) -> Path:
@@ -31,3 +47,47 @@ def assets_dir() -> Path:
     """A folder that holds the Stanford bunny and its scans under their asset names, or the test is skipped."""
     found = [find_asset(name) for name in assets.ASSETS if name.startswith("bunny/")]
     return found[0].parent.parent
+
+
+@pytest.fixture(scope="session")
+def rope() -> "Model":
+    """The shipped weights of the rope, for all who do not change them."""
+    from mereo.models.weights import load_model
+
+    return load_model("rope")
+
+
+@pytest.fixture(scope="session")
+def toy_model() -> "StatisticalModel":
+    """The statistical model of the toy scene, from 200 states."""
+    from toy_scene import toy_scene
+
+    from mereo.scenes.random_states import scene_model
+
+    return scene_model(toy_scene(), count=200)
+
+
+@pytest.fixture(scope="session")
+def few_rope_states(rope: "Model") -> "DrawnStates":
+    """Random states of the rope, ``FEW_STATES`` of them."""
+    from mereo.fitting.playback import DrawnStates
+    from mereo.scenes.registry import load_scene
+
+    assert rope.statistical_model is not None
+    return DrawnStates.of(load_scene("rope"), rope.statistical_model, FEW_STATES)
+
+
+@pytest.fixture
+def few_states(few_rope_states: "DrawnStates", monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a fit of the rope's draws start among those few, which are made once."""
+    from mereo.fitting.playback import DrawnStates
+
+    monkeypatch.setattr(DrawnStates, "of", lambda scene, model: few_rope_states)
+
+
+@pytest.fixture
+def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let trainings leave an empty curves.png: drawing one takes as long as ten steps of a small network."""
+    from mereo.training import metrics_log
+
+    monkeypatch.setattr(metrics_log, "draw_curves", lambda rows, path: path.write_bytes(b""))

@@ -122,8 +122,8 @@ def test_aligner_learns_a_turned_object() -> None:
     optimizer = torch.optim.Adam(aligner.parameters(), lr=3e-3)
 
     def batch(seed: int) -> tuple[Tensor, Tensor]:
-        rest = shape.expand(16, -1, -1)
-        return replace(random_motion(16, seed), shift=torch.zeros(16, 3)).apply(rest), rest
+        rest = shape.expand(8, -1, -1)
+        return replace(random_motion(8, seed), shift=torch.zeros(8, 3)).apply(rest), rest
 
     for step in range(80):
         cloud, rest = batch(step)

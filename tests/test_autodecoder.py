@@ -29,6 +29,8 @@ from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
 from mereo.training.dataset import Dataset
 from mereo.training.run_directory import start_network
 
+pytestmark = pytest.mark.usefixtures("without_curves")
+
 SMALL = TrainConfig(
     network=NetworkConfig().changed(
         encoder="autodecoder",

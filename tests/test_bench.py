@@ -1,7 +1,9 @@
 """The benchmark's own parts: its rival gives the model's answers, its floor counts what must be asked."""
 
+import sys
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from mereo.cli import tool_commands
 from mereo.evaluation.sample_views import load_view
 from mereo.experiments.speed import fitted_model
 from mereo.experiments.speed.baseline import Rival, farthest_points
+from mereo.experiments.speed.beside import LIMIT, Share, busy_processes, fair_share, measure_beside, shares_table
 from mereo.experiments.speed.report import table
 from mereo.experiments.speed.roofline import Machine, Work, count_operations
 from mereo.experiments.speed.stages import Bench, Stage, needed_nodes, random_points
@@ -19,6 +22,12 @@ from mereo.models.weights import load_model
 from mereo.training.config import PRESETS
 
 MACHINE = Machine(1e11, 1e10)
+
+
+def children() -> set[str]:
+    """Numbers of the processes that this one has started and that run."""
+    lists = Path("/proc/self/task").glob("*/children")
+    return {number for path in lists for number in path.read_text().split()}
 
 
 def test_the_rival_answers_as_the_model() -> None:
@@ -96,8 +105,51 @@ def test_the_table_names_ratio_and_floor() -> None:
         "precision": "float32",
         "gigaflops": 200.0,
         "gigabytes_per_second": 10.0,
+        "load": 0.25,
+        "free_cores": 1.9,
     }
-    assert "| encoder | 20 | 30 | 5 | 4.0 | 100 | 5.0 |" in table([stage, replace(stage, rival=None)], facts)
+    told = table([replace(stage, differing=0.0), replace(stage, rival=None)], facts)
+    assert "| encoder | 20 | 30 | 5 | 4.0 | 100 | 5.0 | 0.000% |" in told
+    assert "before it began, 1.9 cores were free (load 0.2)" in told
+
+
+def test_a_stage_says_how_many_labels_the_straightforward_way_gives_otherwise() -> None:
+    bench = Bench(load_model("rope"), load_view("rope"), MACHINE, repeats=2, rival=True)
+    ours = np.zeros((2, 2, 5), dtype=np.uint8)
+    theirs = ours.copy()
+    theirs[0, 0, 0] = 1
+    stage = bench._grid_stage("labels", Work(1.0, 1.0), lambda: ours, lambda: theirs)
+    assert stage.differing == 0.05 and stage.ratio is not None
+    assert bench._grid_stage("labels", Work(1.0, 1.0), lambda: ours, lambda: theirs[:1]).differing is None
+
+
+def test_the_fair_share_is_what_an_even_division_of_the_cores_gives() -> None:
+    assert fair_share(1.0, 2, 1, 2) == 1.5 and fair_share(1.0, 1, 1, 2) == 1.0 and fair_share(2.0, 2, 4, 2) == 6.0
+    chosen = Share("as many as are free", 1, 0.5, 0.6, 1, 2)
+    assert chosen.fair == 0.75 and chosen.times == pytest.approx(0.8)
+    table = shares_table([chosen, replace(chosen, rule="one per core", threads=2, busy=9.0)], "40,000 queries")
+    assert "| as many as are free | 1 | 500 | 750 | 600 | 0.80 |" in table and "must be" not in table
+    assert f"must be at most {LIMIT}" in shares_table([replace(chosen, busy=9.0)], "40,000 queries")
+
+
+def test_work_beside_busy_processes_takes_the_threads_that_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mereo.experiments.speed.beside.FreeCores.now", lambda _: 0.0)
+    monkeypatch.setattr("mereo.experiments.speed.beside.cores", lambda: 2)
+    before, used = torch.get_num_threads(), []
+    shares = measure_beside(lambda: used.append(torch.get_num_threads()), beside=1, rounds=2)
+    assert used == 2 * [2, 1, 2] and torch.get_num_threads() == before
+    assert [(one.rule, one.threads, one.beside) for one in shares] == [
+        ("as many as are free", 1, 1),
+        ("one per core", 2, 1),
+    ]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists the children of a process")
+def test_busy_processes_run_meanwhile_and_end() -> None:
+    before = children()
+    with busy_processes(2):
+        assert len(children() - before) == 2
+    assert children() <= before
 
 
 def test_bad_options_are_refused() -> None:

@@ -17,7 +17,7 @@ from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.atomic_files import write_json
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.random_states import state_points
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
@@ -29,7 +29,7 @@ SEED = 1_000_021
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return replace(load_model("engine"), statistical_model=scene_model(load_scene("engine"), 100))
+    return load_model("engine")
 
 
 @pytest.fixture(scope="module")

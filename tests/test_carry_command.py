@@ -16,15 +16,16 @@ from mereo.io.attachments import Surfaces, read_attachments
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.pose_tables import PoseTable, read_pose_table
 from mereo.models.model import Model
-from mereo.models.weights import load_model, save_model
-from mereo.scenes.random_states import scene_model
+from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
 
 
 @pytest.fixture(scope="module")
-def weights() -> Model:
-    states = scene_model(replace(load_scene("rope"), unit_m=0.01), 300)
-    return replace(load_model("rope"), statistical_model=states)
+def weights(rope: Model) -> Model:
+    """Those of the rope, whose own files are in centimetres."""
+    assert rope.statistical_model is not None
+    frame = replace(load_scene("rope"), unit_m=0.01).source_frame
+    return replace(rope, statistical_model=replace(rope.statistical_model, source_frame=frame))
 
 
 @pytest.fixture(scope="module")

@@ -16,14 +16,7 @@ from mereo.geometry.solids import Solids
 from mereo.io.output_folders import MARKER, new_directory
 from mereo.models.model import EncodedCloud, Model
 from mereo.models.weights import load_model
-from mereo.scenes.random_states import scene_model
-from mereo.scenes.registry import load_scene
 from mereo.visualization.viewer.laboratory import QuickRegistrar
-
-
-@pytest.fixture(scope="module")
-def model() -> Model:
-    return replace(load_model("rope"), statistical_model=scene_model(load_scene("rope"), 300))
 
 
 @pytest.fixture
@@ -38,15 +31,15 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> list[EncodedCloud]:
 
 
 def test_weights_with_a_statistical_model_show_the_fit_and_write_it(
-    model: Model,
+    rope: Model,
     shown: list[EncodedCloud],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert model.statistical_model is not None
-    modes = QuickRegistrar(model, model.statistical_model)  # the scene's draws would take long
-    monkeypatch.setattr(demo, "load_model", lambda _: model)
+    assert rope.statistical_model is not None
+    modes = QuickRegistrar(rope, rope.statistical_model)  # the scene's draws would take long
+    monkeypatch.setattr(demo, "load_model", lambda _: rope)
     monkeypatch.setattr(demo, "registrar_for", lambda *_: modes)
     demo.main(tmp_path)
     out = capsys.readouterr().out
@@ -55,7 +48,7 @@ def test_weights_with_a_statistical_model_show_the_fit_and_write_it(
     assert fit > network and "network" in out and "fit" in out
     assert f"mereo view {tmp_path / 'rope'}" in out
     assert "the registered model explains" in out and len(shown) == 1
-    again = load_state(tmp_path / "rope", model.statistical_model)
+    again = load_state(tmp_path / "rope", rope.statistical_model)
     seen = load_view("rope").depth.to_points().points
     assert np.median(Solids(again.mesh).nearest(seen).distance) < 0.3
 

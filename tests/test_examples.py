@@ -29,8 +29,8 @@ ASSETS = {
 OPTIONS = {"loop.py": ("--fps", "1"), "shipped_weights.py": ("--weights", "rope", "--cells", "24")}
 """What keeps an example short."""
 
-LONG = ("loop.py",)
-"""Those that take half a minute."""
+LONG = ("isolate_object.py", "loop.py", "shipped_weights.py")
+"""Those that take longer; what they call has tests of its own."""
 
 EXTRAS = {"simulate_liver.py": "mujoco"}
 """Modules that come with an extra of the package."""

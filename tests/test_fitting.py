@@ -9,12 +9,14 @@ from toy_scene import toy_scene
 
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
-from mereo.fitting.fit import estimate_unit, fit_correspondences
+from mereo.fitting.fit import fit_correspondences
 from mereo.fitting.gauss_newton import POSE, Posed, along
 from mereo.fitting.playback import Drawn, DrawnStates, material_moved
+from mereo.fitting.recognition import recognize
 from mereo.fitting.registration import Registration
+from mereo.fitting.scene_unit import estimate_unit
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
-from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
@@ -26,8 +28,8 @@ CLEAN = replace(GenerateConfig(), noise_std=0.0)
 
 
 @pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=200)
+def model(toy_model: StatisticalModel) -> StatisticalModel:
+    return toy_model
 
 
 def true_material(model: StatisticalModel, view: View) -> np.ndarray:
@@ -103,18 +105,13 @@ def test_another_object_is_not_believed(model: StatisticalModel, view: View) -> 
 
 def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, registration: Registration) -> None:
     """Nothing of a right fit; half of a cloud leaves the model's other half where nothing of it was seen."""
-    assert registration.ruled_out == 0.0 and registration.doubt is None
+    assert registration.ruled_out == 0.0 and recognize(registration).known is True
     points = view.depth.to_points().points
     half = fit_correspondences(points[points[:, 0] < np.median(points[:, 0])], told(model, view), model, 1.0)
     assert half.ruled_out is not None and half.ruled_out > 0.1
-    assert half.doubt is not None and "lies where the frame shows none of it" in half.doubt
-    few = replace(registration, explained=0.9)
-    assert few.doubt is not None and few.doubt.startswith("doubtful: 10% of the points are not the model's")
-    assert replace(few, explained=0.93, ruled_out=None).doubt is None
-    other = replace(registration, explained=0.2, accepted=False).doubt
-    assert other is not None and "only 20% of the points can be the model's: this is probably another object" in other
-    far = replace(registration, z=registration.z + 10.0, method="modes")
-    assert far.beyond_states > 1.0 and far.doubt is not None and "outside those that were learned" in far.doubt
+    said = recognize(half)
+    assert said.known is not True and said.reason is not None
+    assert "lies where the frame shows none of it" in said.reason
 
 
 def test_to_rest_undoes_to_camera(registration: Registration) -> None:

@@ -14,15 +14,14 @@ from mereo.fitting.draws_problem import narrowing as draws_narrowing
 from mereo.fitting.fit import ModesFit, is_drawn
 from mereo.fitting.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.rest_fit import narrowing as modes_narrowing
-from mereo.scenes.random_states import scene_model
 from mereo.scenes.statistical_model import StatisticalModel
 
 SCENE = toy_scene()
 
 
 @pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=200)
+def model(toy_model: StatisticalModel) -> StatisticalModel:
+    return toy_model
 
 
 @pytest.fixture(scope="module")

@@ -9,14 +9,14 @@ from mereo.deformation.moving_least_squares import Anchors
 from mereo.geometry.procrustes import robust_rigid
 from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.principal_components import build_model
-from mereo.scenes.random_states import interior_nodes, sample_states, scene_model, state_points
+from mereo.scenes.random_states import interior_nodes, sample_states, state_points
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 
 
 @pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(toy_scene(), count=200)
+def model(toy_model: StatisticalModel) -> StatisticalModel:
+    return toy_model
 
 
 def test_modes_reproduce_states_they_were_not_built_from(model: StatisticalModel) -> None:

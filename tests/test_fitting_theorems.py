@@ -11,7 +11,7 @@ from mereo.fitting.residuals import Surface
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
-from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.random_states import state_points
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.depth_rendering import render_depth
 
@@ -21,8 +21,8 @@ IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matri
 
 
 @pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=200)
+def model(toy_model: StatisticalModel) -> StatisticalModel:
+    return toy_model
 
 
 def said(model: StatisticalModel, material: np.ndarray, error: float = 0.5) -> Correspondences:

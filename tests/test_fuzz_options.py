@@ -22,6 +22,7 @@ COMMANDS = {
     "generate": "generate missing.yaml --examples 2 --output out",
     "train": "train missing --output out",
     "evaluate": "evaluate missing.safetensors --output out",
+    "calibrate": "calibrate missing.safetensors --output out",
     "reconstruct": "reconstruct missing.ply --weights missing --output out",
     "align": "align missing.ply --scene missing.yaml --output out",
     "view": "view missing",

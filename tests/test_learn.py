@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import load_file
 from scene_files import write_bar
 
+from mereo.fitting.playback import DrawnStates
 from mereo.io.sensor_frame import read_frame
 from mereo.learning import learn as learning
 from mereo.learning import outcome, probe, schedule
@@ -22,7 +23,9 @@ from mereo.learning.object_files import check, deformation, scene_for
 from mereo.learning.schedule import Plan, Rates, epochs_for, holdout, plan_for, views_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object, size_warning
+from mereo.scenes.files import check_states
 from mereo.scenes.registry import load_scene
+from mereo.synthesis import shards
 from mereo.training import trial
 from mereo.training.config import PRESETS
 from mereo.training.trainer import Trainer
@@ -100,7 +103,8 @@ def test_what_hardly_deforms_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert deformation(load_scene(write_bar(tmp_path))) > 0.006
 
 
-def test_a_faulty_object_is_refused_with_what_may_mend_it(tmp_path: Path) -> None:
+def test_a_faulty_object_is_refused_with_what_may_mend_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(check_states, "STATES", 3)
     path = write_bar(tmp_path)
     (tmp_path / "right.stl").write_bytes((tmp_path / "left.stl").read_bytes())
     with pytest.raises(ValueError, match=r"bar.yaml --repair` try, and learn .*bar-repaired.yaml"):
@@ -176,7 +180,10 @@ def test_the_command_names_the_scene_where_it_is_not_built_in() -> None:
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """So little of everything that a run takes seconds."""
     for module, name, value in (
+        (check_states, "STATES", 3),
         (probe, "EXAMPLES", 12),
+        (shards, "states_for", lambda _: 12),
+        (DrawnStates, "of", partial(DrawnStates.of, count=30)),
         (trial, "STEPS", 2),
         (trial, "SCORED", 4),
         (trial, "shipped_names", lambda: ("rope",)),

@@ -12,6 +12,7 @@ from camera_files import write_camera
 from PIL import Image
 
 from mereo.cli.stream import stream_reconstructions
+from mereo.evaluation.sample_views import load_view
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid
@@ -23,13 +24,13 @@ from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.scenes.registry import load_scene
 from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
 
-FRAMES, BAD, RATE_HZ = 30, 12, 30.0
+FRAMES, BAD, RATE_HZ = 12, 5, 30.0
 UNIT_M = 0.005
 
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[SegmentedMesh]]:
-    """A rope that swings at one joint within a second, as depth images, one of them damaged; and the truth."""
+    """A rope that swings at one joint in half a second, as depth images, one of them damaged; and the truth."""
     folder = tmp_path_factory.mktemp("sequence")
     scene, rng = load_scene("rope"), np.random.default_rng(0)
     played = random_state(scene, 1_000_003)
@@ -60,7 +61,7 @@ def read(folder: Path) -> InputConfig:
     return InputConfig(intrinsics=folder / "camera.json", depth_scale=10_000.0)
 
 
-def test_every_frame_of_a_second_is_answered_but_the_bad_one(
+def test_every_frame_is_answered_but_the_bad_one(
     sequence: tuple[Path, list[SegmentedMesh]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, truth = sequence
@@ -73,7 +74,7 @@ def test_every_frame_of_a_second_is_answered_but_the_bad_one(
     assert [one["frame"] for one in lines] == [f"{number:03}.png" for number in range(FRAMES)]
     assert "error" in lines[BAD] and f"{BAD:03}.png" in lines[BAD]["error"]
     assert len(list((tmp_path / "glb").iterdir())) == FRAMES - 1
-    assert "29 frames answered at" in err and "1 bad" in err
+    assert f"{FRAMES - 1} frames answered at" in err and "1 bad" in err
     # the base of the rope is found where it is, in metres
     base = truth[0].segments[0].vertices.mean(axis=0) * UNIT_M
     found = np.array([one["segments"]["base"]["centroid"] for one in lines if "segments" in one])
@@ -123,11 +124,8 @@ def damaged_clouds(folder: Path, cloud: np.ndarray) -> set[str]:
     return {file.name for file in folder.glob("1 *")}
 
 
-def test_no_damaged_frame_ends_a_stream(
-    sequence: tuple[Path, list[SegmentedMesh]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    _, truth = sequence
-    cloud = np.concatenate([segment.vertices for segment in truth[0].segments])
+def test_no_damaged_frame_ends_a_stream(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cloud = load_view("rope").depth.to_points().points
     np.save(tmp_path / "0.npy", cloud)
     np.save(tmp_path / "2.npy", cloud)
     bad = damaged_clouds(tmp_path, cloud)

@@ -105,7 +105,11 @@ def test_an_existing_file_is_refused_before_the_work(
 
 
 @pytest.mark.parametrize(
-    "command", ["scene export bar.yaml --output rest.ply", "scene modes bar.yaml --states 100 --output modes.png"]
+    "command",
+    [
+        "scene export bar.yaml --output rest.ply",
+        pytest.param("scene modes bar.yaml --states 100 --output modes.png", marks=pytest.mark.slow),
+    ],
 )
 def test_force_replaces_a_file(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So a command can run twice, and leaves nothing beside its output."""

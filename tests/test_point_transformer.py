@@ -26,6 +26,8 @@ from mereo.reconstruction.pipeline import reconstruct
 from mereo.training import trainer
 from mereo.training.config import PRESETS, AugmentConfig
 
+pytestmark = pytest.mark.usefixtures("without_curves")
+
 TINY = NetworkConfig().changed(
     encoder="point-transformer",
     points=128,

@@ -15,23 +15,25 @@ from mereo.evaluation.sample_views import SampleView, load_view
 from mereo.evaluation.scoring import evaluate
 from mereo.fitting import register
 from mereo.fitting.answer import Answer, answer
+from mereo.fitting.fit import ModesFit
+from mereo.fitting.playback import DrawnStates
 from mereo.fitting.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
+from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.solids import Solids
 from mereo.models.model import Model
-from mereo.models.weights import load_model, save_model
+from mereo.models.weights import save_model
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.scenes.assets import AssetUnavailable
-from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
-    return replace(load_model("rope"), statistical_model=scene_model(load_scene("rope"), 300))
+def model(rope: Model) -> Model:
+    return rope
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +93,7 @@ def test_weights_without_states_say_what_to_do() -> None:
         statistical_model_of(other)
 
 
-def test_the_command_says_which_answer_it_is(model: Model, view: SampleView, tmp_path: Path) -> None:
+def test_the_command_says_which_answer_it_is(model: Model, view: SampleView, few_states: None, tmp_path: Path) -> None:
     save_model(model, tmp_path / "rope.safetensors")
     np.save(tmp_path / "cloud.npy", view.depth.to_points().points)
     arguments = ["reconstruct", str(tmp_path / "cloud.npy"), "--weights", str(tmp_path / "rope.safetensors")]
@@ -137,7 +139,10 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
     assert evaluate(model, changed, examples=1, cells=12, choice="off").sources == ("network",)
 
 
-def test_auto_plays_the_scene_where_it_is_at_hand(model: Model, view: SampleView) -> None:
+def test_auto_plays_the_scene_where_it_is_at_hand(
+    model: Model, view: SampleView, few_rope_states: DrawnStates, few_states: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fit of its draws takes long, and is the command's above; here it is asked for, and with what."""
     registrar = Registrar.of(model)
     fitted = registrar.fit_modes(view.depth.to_points())
     assert fitted.rest is None
@@ -145,7 +150,15 @@ def test_auto_plays_the_scene_where_it_is_at_hand(model: Model, view: SampleView
     assert modes.finish(fitted).method == "modes" and "states" not in vars(modes)
     foreign = replace(registrar, network=replace(model, provenance={"scene": "mine"}))
     assert foreign.finish(fitted).method == "modes" and foreign.at_hand is None
-    assert registrar.finish(fitted).seconds > fitted.seconds and registrar.at_hand is not None
+    asked: list[DrawnStates] = []
+
+    def with_draws(self: ModesFit, states: DrawnStates) -> Registration:
+        asked.append(states)
+        return self.registration()
+
+    monkeypatch.setattr(ModesFit, "with_draws", with_draws)
+    registrar.finish(fitted)
+    assert asked == [few_rope_states] and registrar.at_hand is few_rope_states
 
 
 def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from toy_scene import toy_scene
 
 from mereo.geometry.transforms import rigid, transform_points
-from mereo.scenes.random_states import scene_model
 from mereo.scenes.statistical_model import StatisticalModel
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -22,8 +20,8 @@ POSE = rigid(Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix(), np.array([3.0, 
 
 
 @pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(toy_scene(), count=200)
+def model(toy_model: StatisticalModel) -> StatisticalModel:
+    return toy_model
 
 
 def started(model: StatisticalModel, shape: np.ndarray, cloud: np.ndarray, T: np.ndarray) -> Frame:

@@ -106,8 +106,9 @@ def test_figures_are_in_millimetres_where_the_unit_is_known(
 
 def test_the_page_counts_the_points_once_and_has_no_words_of_programs(tmp_path: Path) -> None:
     cloud, mesh, summary = example()
-    told = {"answer": "registration", "explained": 0.973, "doubt": "doubtful: look at it"}
-    write_report(tmp_path / "r.html", cloud, mesh, {**summary, "registration": told, "patient_pose": "supine"})
+    told = {"answer": "registration", "explained": 0.973}
+    said = {"recognition": {"known": "unsure", "reason": "look at it", "signs": {"size": 0.1}}}
+    write_report(tmp_path / "r.html", cloud, mesh, {**summary, **said, "registration": told, "patient_pose": "supine"})
     data = page_data(tmp_path / "r.html")
     words = data["words"]
     assert words["facts"][0] == "your model, registered: it explains 97.3% of the points"

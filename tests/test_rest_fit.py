@@ -12,13 +12,12 @@ from mereo.fitting.playback import DrawnStates
 from mereo.fitting.problem import Problem
 from mereo.fitting.rest_fit import narrowing
 from mereo.geometry.transforms import transform_points
-from mereo.scenes.random_states import scene_model
 from mereo.scenes.statistical_model import StatisticalModel
 
 
 @pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=200)
+def model(toy_model: StatisticalModel) -> StatisticalModel:
+    return toy_model
 
 
 @pytest.mark.parametrize(("noise", "unit"), [(0.0, 1.0), (0.1, 1.0), (0.1, 0.004)])
@@ -45,7 +44,7 @@ def test_an_object_at_rest_needs_no_draws(model: StatisticalModel) -> None:
     points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
     fitted = ModesFit.of(points, said(model, material), model, 1.0)
     assert fitted.rest is not None
-    found = fitted.with_draws(DrawnStates.of(SCENE, model))
+    found = fitted.with_draws(DrawnStates.of(SCENE, model, 30))
     assert found.method == "rest" and found.seconds == fitted.seconds
 
 

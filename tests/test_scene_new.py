@@ -14,6 +14,7 @@ import mereo.__main__ as command_line
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.camera import Camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.scenes.files import check_states
 from mereo.scenes.files.template import identifier, write_scene_file
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES
@@ -38,7 +39,7 @@ def test_the_file_loads_and_the_object_is_in_view(longest: float, tmp_path: Path
     assert scene.unit_m * (scene.rest.bounds[1] - scene.rest.bounds[0]).max() == pytest.approx(longest / 1000)
     camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
     rng = np.random.default_rng(0)
-    for _ in range(30):
+    for _ in range(10):
         mesh = scene.sample_state(rng).mesh
         pose = scene.workspace.sample(rng, mesh.bounds.mean(axis=0))
         pixels = camera.project(transform_points(inverse_rigid(pose), mesh.merged()[0]))
@@ -110,6 +111,7 @@ def test_names_are_valid_and_new() -> None:
 
 
 def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(check_states, "STATES", 3)
     write_mesh(ball((0, 0, 0), 30.0), tmp_path / "a.ply")
     monkeypatch.chdir(tmp_path)
     assert command_line.main(["scene", "new", "a.ply", "--units", "cm"]) == 0

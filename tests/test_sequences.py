@@ -195,7 +195,12 @@ def test_the_command_records_what_stream_answers(tmp_path: Path, capsys: pytest.
     small = ["--seconds", "0.2", "--rate", "10", "--seed", "3"]
     assert command_line.main(["scene", "record", "rope", "--output", str(out), *small]) == 0
     assert "2 frames in 0.2 s" in capsys.readouterr().out and len(list((out / "frames").iterdir())) == 2
-    assert command_line.main(["stream", str(out), "--weights", "rope", "--every-frame", "--rate", "10"]) == 0
+    assert (
+        command_line.main(
+            ["stream", str(out), "--weights", "rope", "--every-frame", "--rate", "10", "--resolution", "16"]
+        )
+        == 0
+    )
     lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
     assert [(one["method"], one["tracked"]) for one in lines] == [("modes", False), ("modes", True)]
     assert all(one["explained"] > 0.9 for one in lines)

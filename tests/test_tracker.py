@@ -114,7 +114,7 @@ def test_a_jump_is_found_again_in_its_own_frame(
     assert apart(found[1], there) < apart(found[0], there) + 0.05
 
 
-@pytest.mark.parametrize("unit", [1.0, None])
+@pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.slow), None])
 def test_a_slow_sequence_is_tracked_as_its_frames_are_fitted(
     registrar: Registrar, scene: Scene, unit: float | None
 ) -> None:

@@ -20,6 +20,8 @@ from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
 from mereo.training.examples_seen import seen_before, seen_by, seen_in_training, told
 from mereo.training.run_directory import claim_run, start_network
 
+pytestmark = pytest.mark.usefixtures("without_curves")
+
 SMALL = replace(
     PRESETS["tiny"],
     network=PRESETS["tiny"].network.changed(points=64, width=48, neighbors=8, mlp_global=(32, 48)),
@@ -36,30 +38,43 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_toy_dataset(tmp_path_factory.mktemp("toy") / "data")
 
 
+@pytest.fixture(scope="module")
+def finished(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that has ended; not to be changed."""
+    run = tmp_path_factory.mktemp("finished") / "run"
+    trainer.train(dataset, run, SMALL)
+    return run
+
+
+@pytest.fixture(scope="module")
+def first(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a short run."""
+    return trainer.train(dataset, tmp_path_factory.mktemp("first") / "run", replace(SMALL, epochs=0.2))
+
+
 def test_killed_and_resumed_equals_uninterrupted(dataset: Path, tmp_path: Path) -> None:
-    assert_resumes_exactly(dataset, tmp_path, replace(SMALL, epochs=1), steps=5)
+    assert_resumes_exactly(dataset, tmp_path, replace(SMALL, epochs=0.6), steps=3)
 
 
-def test_a_finished_run_is_left_alone(dataset: Path, tmp_path: Path) -> None:
-    first = trainer.train(dataset, tmp_path / "run", SMALL).read_bytes()
-    assert trainer.train(dataset, tmp_path / "run", SMALL).read_bytes() == first
+def test_a_finished_run_is_left_alone(dataset: Path, finished: Path) -> None:
+    first = (finished / "weights.safetensors").read_bytes()
+    assert trainer.train(dataset, finished, SMALL).read_bytes() == first
 
 
-def test_other_settings_do_not_continue_a_run(dataset: Path, tmp_path: Path) -> None:
-    trainer.train(dataset, tmp_path / "run", SMALL)
+def test_other_settings_do_not_continue_a_run(dataset: Path, finished: Path) -> None:
     with pytest.raises(ValueError, match=r"another train setting learning_rate \(0\.004 instead of 0\.1\)"):
-        trainer.train(dataset, tmp_path / "run", replace(SMALL, learning_rate=0.1))
+        trainer.train(dataset, finished, replace(SMALL, learning_rate=0.1))
 
 
-def test_a_run_of_an_older_mereo_is_continued(dataset: Path, tmp_path: Path) -> None:
+def test_a_run_of_an_older_mereo_is_continued(dataset: Path, first: Path, tmp_path: Path) -> None:
     """It does not state the settings that came later, and their defaults are what it did."""
-    first = trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes()
+    shutil.copytree(first.parent, tmp_path / "run")
     path = tmp_path / "run" / "config.json"
     settings = json.loads(path.read_text())
     del settings["train"]["network"]["encoder"], settings["train"]["network"]["dropout"], settings["train"]["init"]
     del settings["train"]["learned_box"]  # which every network had then
     path.write_text(json.dumps(settings))
-    assert trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes() == first
+    assert trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes() == first.read_bytes()
     with pytest.raises(ValueError, match="another train setting network"):
         other = SMALL.network.changed(encoder="point-transformer")
         trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2, network=other))
@@ -72,25 +87,24 @@ def test_a_directory_with_other_things_is_not_a_run(dataset: Path, tmp_path: Pat
     assert os.listdir(tmp_path) == ["thesis.tex"]
 
 
-def test_run_directory_tells_the_story(dataset: Path, tmp_path: Path) -> None:
-    trainer.train(dataset, tmp_path / "run", SMALL)
-    with (tmp_path / "run" / "metrics.csv").open() as file:
+def test_run_directory_tells_the_story(finished: Path) -> None:
+    with (finished / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["step"]) for row in rows] == list(range(1, 16))  # 58 examples, batches of 8, two passes
     assert 0 <= float(rows[-1]["val_iou"]) <= 1
-    assert json.loads((tmp_path / "run" / "config.json").read_text())["train"]["batch"] == 8
-    assert (tmp_path / "run" / "curves.png").read_bytes().startswith(b"\x89PNG")
-    model = load_model(tmp_path / "run" / "weights.safetensors")
+    assert json.loads((finished / "config.json").read_text())["train"]["batch"] == 8
+    assert (finished / "curves.png").read_bytes().startswith(b"\x89PNG")
+    model = load_model(finished / "weights.safetensors")
     assert model.names == NAMES
     assert model.provenance["training_seed"] == 5 and model.provenance["scene"] == "toy"
     assert model.provenance["visible_m"] is None, "the dataset states no unit"
 
 
-def test_class_offsets_are_in_the_last_bias_and_nowhere_else(dataset: Path, tmp_path: Path) -> None:
-    weights = load_model(trainer.train(dataset, tmp_path / "run", SMALL))
+def test_class_offsets_are_in_the_last_bias_and_nowhere_else(finished: Path) -> None:
+    weights = load_model(finished / "weights.safetensors")
     offsets = weights.provenance["class_offsets"]
     assert isinstance(offsets, list) and len(offsets) == 3 and offsets[0] == 0
-    average = load_file(tmp_path / "run" / "checkpoint.safetensors")
+    average = load_file(finished / "checkpoint.safetensors")
     for name, value in weights.network.state_dict().items():
         expected = average[f"average/{name}"].clone()
         if name == "decoder.head.bias":
@@ -109,8 +123,8 @@ def test_batches_visit_every_example_once_per_pass(dataset: Path, tmp_path: Path
 
 
 def test_it_learns_the_two_halves(dataset: Path, tmp_path: Path) -> None:
-    """Thirty passes over 58 examples suffice to beat any constant answer by far."""
-    trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=40, augment=AugmentConfig()))
+    """Twenty-four passes over 58 examples suffice to beat any constant answer by far."""
+    trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=24, augment=AugmentConfig()))
     with (tmp_path / "run" / "metrics.csv").open() as file:
         last = list(csv.DictReader(file))[-1]
     assert float(last["val_iou"]) > 0.85 and float(last["val_miou"]) > 0.75
@@ -139,13 +153,12 @@ def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, lo
 
 
 def test_bfloat16_trains(dataset: Path, tmp_path: Path) -> None:
-    model = load_model(trainer.train(dataset, tmp_path / "run", replace(SMALL, precision="bfloat16")))
+    model = load_model(trainer.train(dataset, tmp_path / "run", replace(SMALL, precision="bfloat16", epochs=0.5)))
     assert all(torch.isfinite(value).all() for value in model.network.state_dict().values())
 
 
-def test_training_starts_from_given_weights(dataset: Path, tmp_path: Path) -> None:
+def test_training_starts_from_given_weights(dataset: Path, first: Path, tmp_path: Path) -> None:
     """Without any step, the network is that of the weights; other networks are refused."""
-    first = trainer.train(dataset, tmp_path / "first", replace(SMALL, epochs=0.2))
     data, config = trainer.Dataset.load(dataset), replace(SMALL, init=str(first))
     network = start_network(config, data)
     assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
@@ -162,9 +175,8 @@ def test_training_starts_from_given_weights(dataset: Path, tmp_path: Path) -> No
     assert not (tmp_path / "second").exists()
 
 
-def test_training_starts_from_another_objects_weights(dataset: Path, tmp_path: Path) -> None:
+def test_training_starts_from_another_objects_weights(dataset: Path, first: Path) -> None:
     """All that is not about segments is taken; segments and template are new."""
-    first = trainer.train(dataset, tmp_path / "first", replace(SMALL, epochs=0.2))
     data = trainer.Dataset.load(dataset)
     manifest = data.manifest | {"segments": [{"name": "whole", "color": [1, 2, 3]}]}
     data = replace(data, manifest=manifest, template=torch.rand(1, 64, 64, 64))
@@ -207,11 +219,11 @@ def test_a_dataset_without_template_is_refused(dataset: Path, tmp_path: Path) ->
 
 def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:
     """Under torchrun, both halves of every batch count: the result is finite, complete, and resumable."""
-    run = train_in_two_processes(dataset, tmp_path, "test_training", "replace(SMALL, epochs=1)")
+    run = train_in_two_processes(dataset, tmp_path, "test_training", "replace(SMALL, epochs=0.5)")
     tensors = load_file(run / "checkpoint.safetensors")
     assert all(torch.isfinite(value).all() for value in tensors.values())
     with (run / "metrics.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 8
+        assert len(list(csv.DictReader(file))) == 4
 
 
 def test_only_the_first_process_claims_the_directory(

@@ -22,6 +22,8 @@ from mereo.training.model_card import card
 from mereo.training.run_directory import fit_config
 from mereo.training.validation import choose_offsets, held_out, validate
 
+pytestmark = pytest.mark.usefixtures("without_curves")
+
 KINDS = 3
 FIRST = torch.zeros(8, dtype=torch.long)
 

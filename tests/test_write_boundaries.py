@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from analytic import untrained
 from failpoints import Commands, command_server
 from fuzz_files import weights as tiny_weights
 from scene_files import write_bar
@@ -17,7 +18,8 @@ from toy_data import write_toy_dataset
 from write_boundaries import Case, check_boundaries
 
 from mereo.evaluation.sample_views import load_view
-from mereo.models.weights import find_weights
+from mereo.models.weights import find_weights, save_model
+from mereo.scenes.registry import load_scene
 
 TRAIN = (
     "train INPUTS/data --output out --preset tiny --precision float32 --compile off --batch 8 --queries 48 --epochs 1 "
@@ -40,6 +42,9 @@ CASES = {
         again="choose another --output",
         timed=("metrics.json",),
         dear=True,
+    ),
+    "calibrate": Case(
+        "calibrate INPUTS/rope.safetensors --output out.safetensors --views 8", again="--force", dear=True
     ),
     "release": Case(f"{RELEASE} new", again="--force"),
     "release over another": Case(f"{RELEASE} new --force", first=f"{RELEASE} old"),
@@ -75,6 +80,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.save(folder / "cloud.npy", points)
     shutil.copy(find_weights("rope"), folder / "w.safetensors")
     tiny_weights(folder / "tiny.safetensors")
+    save_model(untrained(load_scene("rope").rest.names), folder / "rope.safetensors")
     write_bar(folder)
     ball = trimesh.creation.icosphere(2)
     ball.export(folder / "ball.ply")

@@ -4,6 +4,7 @@ import importlib.metadata
 import io
 import os
 import sys
+import time
 import warnings
 from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout, suppress
@@ -17,6 +18,7 @@ import tyro
 from tyro.conf import subcommand
 
 from mereo.cli import commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
+from mereo.cli.calibrate import CalibrateCommand
 from mereo.cli.config_file import GivenOptions, defaults_from, read_options
 from mereo.cli.last_resort import is_foreseen, sentence
 from mereo.cli.learn import LearnCommand
@@ -24,17 +26,32 @@ from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.cli.usage import noted_events, usage_sentence
 from mereo.io.bounds import check_bounds
-from mereo.io.cores import use_threads
+from mereo.io.cores import FreeCores, use_free_cores, use_threads
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
 Choice = TypeVar("Choice")
+
+BEGUN, BRIEF_S = FreeCores(), 5.0
+"""Count of free cores from the process's first moments on, which no command need wait for, and how long it serves."""
 
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 """Environment variable that shows where an error comes from."""
 
 CONFIGURABLE = ("generate", "train", "evaluate", "reconstruct", "learn")
 """Commands with the option --config."""
+
+ANSWERING = (
+    commands.Demo,
+    commands.Evaluate,
+    ReconstructCommand,
+    tool_commands.Align,
+    tool_commands.BenchCommand,
+    tool_commands.StreamCommand,
+    tool_commands.ViewCommand,
+)
+"""Commands that compute on the cores that are free. Not what trains: it outlives what is busy as it starts, and the
+same command gives the same weights."""
 
 USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 """Exit codes; 70 is EX_SOFTWARE of sysexits.h, the last two are 128 plus the signal's number, as shells report them."""
@@ -59,9 +76,12 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="replace")
     try:
         with stop_signals():
+            watch = BEGUN if time.monotonic() - BEGUN.at_s < BRIEF_S else FreeCores()
             command = parse(arguments)
             if threads := getattr(command, "threads", 0):
                 use_threads(threads)
+            elif isinstance(command, ANSWERING):
+                use_free_cores(watch)
             command.run()
             sys.stdout.flush()
     except Stopped as stopped:
@@ -202,6 +222,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         | starting(commands.Generate, "generate", settings=GenerateConfig(sensor=sensor))
         | starting(commands.Train, "train", config=recipe)
         | starting(commands.Evaluate, "evaluate", terms=sensor)
+        | Annotated[CalibrateCommand, subcommand("calibrate")]
         | starting(ReconstructCommand, "reconstruct")
         | Annotated[tool_commands.Align, subcommand("align")]
         | Annotated[tool_commands.ViewCommand, subcommand("view")]

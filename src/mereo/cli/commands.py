@@ -184,7 +184,7 @@ class Evaluate:
         fit: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the modes'
             and the draws' own scores beside it; off the network alone; modes leaves the draws out.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
-        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 

@@ -35,6 +35,7 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import Reconstruction, extract, segment_names
 from mereo.scenes.assets import AssetUnavailable
+from mereo.visualization.report_words import confidence_title
 from mereo.visualization.result import registration_facts
 from mereo.visualization.result_files import write_files
 from mereo.visualization.units import Unit
@@ -152,7 +153,7 @@ def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
     found = Answer(network)
     if registrar is not None:
         started = time.perf_counter()
-        found = answer_fitted(fitted, model, registrar, RESOLUTION)
+        found = answer_fitted(fitted, model, registrar, RESOLUTION, stated_unit=stated)
         seconds = spent + time.perf_counter() - started
         if found.registration is not None:
             labels = label_grid(found.registration.mesh, *case.truth.grid.axes())
@@ -174,9 +175,18 @@ def _write(case: Case, found: Answer, registrar: Registrar | None, folder: Path)
     else:
         print_source(found)
         facts["registration"] = registration_facts(found)
+        facts["recognition"] = found.recognition.facts()
     with new_directory(folder, force=True) as directory:
         write_files(
-            directory, found.reconstruction, case.cloud, case.frame, DEFAULT_FILES, 1.0, facts, unit=Unit(case.unit_m)
+            directory,
+            found.reconstruction,
+            case.cloud,
+            case.frame,
+            DEFAULT_FILES,
+            1.0,
+            facts,
+            unit=Unit(case.unit_m),
+            registered=found.registered,
         )
         write_state(directory, found, registrar, case.weights, case.frame, 1.0)
 
@@ -195,7 +205,7 @@ def _table(case: Case, result: Reconstruction, columns: dict[str, Column]) -> Ta
     """Table of the scores of each segment by network and fit, and of what is written."""
     table = Table(title=case.title, title_justify="left")
     table.add_column("IoU with the truth")
-    for column in (*columns, "confidence", "volume"):
+    for column in (*columns, confidence_title(result.calibrated), "volume"):
         table.add_column(column, justify="right")
     each = [column.scores.per_segment for column in columns.values()]
     for found, *ious in zip(result.segments, *each, strict=True):

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import torch
 
+from mereo.io.cores import threads_for
 from mereo.models.device import bfloat16_gain, cpu_features, pick_device, pick_precision
 
 PURPOSES: dict[str, str] = {
@@ -112,13 +113,14 @@ def describe_load(load: float, cores: int, threads: int) -> str:
         threads: that OpenMP would use.
     """
     found = f"{load:.1f} on {cores} cores"
-    free = max(1, round(cores - load))
-    if load >= 1.5 * cores:  # fewer threads then get a smaller share of the cores and gain nothing
-        return f"{found}, which is crowded: everything waits for a core"
-    if load < cores / 2 or threads <= free:
+    if load < cores / 2:
         return found
+    fewer = threads_for(cores - load, cores)
+    if threads <= fewer:
+        return f"{found}, which is crowded: everything waits for a core" if load >= 1.5 * cores else found
     return (
-        f"{found}, which is busy: OMP_NUM_THREADS={free} would help, as all threads wait for the one that shares a core"
+        f"{found}, which is busy: commands that answer take {fewer} thread{'' if fewer == 1 else 's'} while it is so; "
+        f"OMP_NUM_THREADS={fewer} would help others, as all threads wait for the one that shares a core"
     )
 
 

@@ -9,18 +9,19 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from mereo.cli.explain import explain, print_sure, wish_of
 from mereo.fitting.answer import Answer
 from mereo.fitting.carry import Carried, Placed, place
 from mereo.fitting.carry import carry as carry_one
 from mereo.fitting.config import FitChoice
 from mereo.fitting.register import Registrar, registrar_for
-from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
 from mereo.io.output_folders import new_directory
 from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.formats import chosen_formats
+from mereo.io.writers.medical import MM_PER_M
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_for
@@ -29,6 +30,7 @@ from mereo.reconstruction.observation import find_object
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import files_of
 from mereo.visualization.answering import answer
+from mereo.visualization.report_words import confidence_title
 from mereo.visualization.result import Result
 
 
@@ -48,6 +50,7 @@ class FrameJob:
         carry: files of what is defined in the rest model, to be brought to where the object is.
         carry_frame: their frame and unit: of the object's own files, or of its scene.
         force: replace an existing folder that mereo wrote.
+        explain: segments and places of which it is told what decides them.
         options: what config.json of the results says, with the frame's own name as its only input; without any, none.
     """
 
@@ -62,6 +65,7 @@ class FrameJob:
     carry: tuple[str | Path, ...] = ()
     carry_frame: CarryFrame = "source"
     force: bool = False
+    explain: tuple[str, ...] = ()
     options: Mapping[str, Any] | None = field(default=None, compare=False)
 
     def check(self) -> None:
@@ -74,6 +78,8 @@ class FrameJob:
             raise ValueError(f"--carry-frame is {self.carry_frame!r} and nothing is carried: name a file with --carry")
         if self.attachments and self.choice == "off":
             raise ValueError("--fit is off, but --carry needs a registration, along which things move: use --fit auto")
+        if self.explain and self.choice == "off":
+            raise ValueError("--fit is off, but --explain needs a registration, whose fit is explained: use --fit auto")
 
     @property
     def read(self) -> tuple[str | Path, ...]:
@@ -113,7 +119,8 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Re
         job: everything else.
 
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``FrameJob.check``, ``read_frame``,
-    ``find_object`` and ``reconstruct`` do, and ``ValueError`` for ``carry`` without a registration.
+    ``find_object`` and ``reconstruct`` do, and ``ValueError`` for ``carry`` and
+    ``explain`` without a registration.
     """
     job.check()
     with new_directory(output, job.force, [input, *job.read]) as directory:
@@ -121,6 +128,7 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Re
         seen = find_object(frame, job.isolation)
         print(seen)
         placed = job.placed  # what is carried is refused before the work
+        wishes = [wish_of(text, job.model.names) for text in job.explain]
         found = answer(
             seen,
             job.model,
@@ -133,7 +141,10 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Re
             print(found.reconstruction.reading)
         if job.registrar is not None:
             print_source(found)
+            print_sure(found.registered, found.unit)
         found.write(directory, job.files, carried_along(placed, found))
+        factor = MM_PER_M * frame.unit_m if job.files.millimetres else 1.0
+        explain(found.registered, wishes, directory, found.seen.cloud.points, factor, found.unit)
         if job.options is not None:
             write_json(directory / CONFIG, {**job.options, "inputs": [str(Path(input).absolute())]})
     print_segments(found.reconstruction, f"{frame.source}, {len(found.seen.cloud)} points")
@@ -153,10 +164,9 @@ def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...
             "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
             "cloud what is not the object, or take the registered model in any case with --fit modes"
         )
-    if found.registration is None:
+    if found.registered is None:
         return ()
-    here = found.registration.moved(inverse_rigid(found.reconstruction.T_camera_input))
-    carried = tuple(carry_one(one, here) for one in placed)
+    carried = tuple(carry_one(one, found.registered) for one in placed)
     for one in carried:
         outside = len(one.content.points) - one.inside
         away = f"{outside} of them outside, up to {one.farthest:.4g} away" if outside else "all inside"
@@ -174,15 +184,15 @@ def print_source(found: Answer) -> None:
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
         print("that is too little to believe it: --fit auto keeps the network's answer")
-    if registration.doubt is not None:
-        print(registration.doubt)
+    if found.recognition.told is not None:
+        print(found.recognition.told)
 
 
 def print_segments(result: Reconstruction, title: str) -> None:
     """Print a table of the segments, and a line of the stages' seconds."""
     table = Table(title=title, title_justify="left")
     table.add_column("segment")
-    for column in ("volume", "confidence", "components", "centroid"):
+    for column in ("volume", confidence_title(result.calibrated), "components", "centroid"):
         table.add_column(column, justify="right")
     for found in result.segments:
         place = " ".join(f"{value:.4g}" for value in found.centroid)

@@ -39,8 +39,11 @@ class ReconstructCommand:
         carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
             glTF), points (PLY, PCD, XYZ, NPY) or CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses).
         carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
+        explain: segment, for its centroid, or place x,y,z in the input's frame and unit: print how sure the object's
+            point there is and what leaves it unsure, and write the observed points coloured by how much each decides it
+            (explained/1.ply, those that the model does not explain in red); once for each. The report has all segments.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
-        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
@@ -56,6 +59,7 @@ class ReconstructCommand:
     scene: str | None = None
     carry: UseAppendAction[tuple[Path, ...]] = ()
     carry_frame: CarryFrame = "source"
+    explain: UseAppendAction[tuple[str, ...]] = ()
     force: bool = False
     threads: Threads = 0
     options_from: ConfigFile = None
@@ -77,6 +81,7 @@ class ReconstructCommand:
             self.carry,
             self.carry_frame,
             self.force,
+            self.explain,
             options_of(self, "reconstruct"),
         )
         reconstruct_inputs(self.inputs, self.output, job)

@@ -5,7 +5,7 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from rich.table import Table
 
 from mereo.cli.reconstruct import FrameJob, reconstruct_file, seconds_of
 from mereo.fitting.answer import Answer
+from mereo.fitting.recognition import Known
 from mereo.io.config import InputConfig
 from mereo.io.output_folders import MARKER
 from mereo.io.progress import duration
@@ -129,13 +130,17 @@ def _answered(file: Path, folder: Path, job: FrameJob) -> Answer | None:
         return None
 
 
+KNOWN: Mapping[Known, str] = {True: "yes", False: "no", "unsure": "unsure"}
+"""Words of a table for whether a frame shows the object."""
+
+
 def _show(outcomes: Sequence[Outcome], output: Path) -> None:
     """Table of all frames."""
     print()
     table = Table(title=f"{len(outcomes)} frames, results in {output}", title_justify="left")
     table.add_column("frame")
     table.add_column("answer")
-    for column in ("explained", "segments", "seconds"):
+    for column in ("explained", "known", "segments", "seconds"):
         table.add_column(column, justify="right")
     table.add_column("folder", overflow="fold")
     for outcome in outcomes:
@@ -147,9 +152,9 @@ def _show(outcomes: Sequence[Outcome], output: Path) -> None:
 def _row(outcome: Outcome) -> tuple[str, ...]:
     found = outcome.found
     if found is None:
-        return "none", "", "", "", ""
+        return "none", "", "", "", "", ""
     registration, segments = found.registration, found.reconstruction.segments
     explained = "" if registration is None else f"{registration.explained:.1%}"
     seen = f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}"
     who = "registered model" if found.taken else "network"
-    return who, explained, seen, f"{seconds_of(found):.1f}", outcome.folder.name
+    return who, explained, KNOWN[found.recognition.known], seen, f"{seconds_of(found):.1f}", outcome.folder.name

@@ -39,11 +39,13 @@ def stream_reconstructions(
     isolation: IsolationConfig | None = None,
     inference: InferenceConfig | None = None,
     fit: StreamFit = "auto",
+    uncertainty: bool = False,
 ) -> Summary:
     """Print a line of JSON for each answered or bad frame, and the summary at the end or after Ctrl-C.
 
     Where the object's model is registered, it is followed from frame to frame (``fitting.tracker``). ``surfaces`` is a
-    folder without content, or with ``force`` one in which files of the same name are replaced.
+    folder without content, or with ``force`` one in which files of the same name are replaced. ``uncertainty`` says how
+    sure each answer is that is the registered model.
 
     Raises ``ValueError`` where not one frame could be answered, and what broke the sequence off, where something did;
     ``FileExistsError`` for a folder of surfaces with content, without ``force``.
@@ -55,7 +57,7 @@ def stream_reconstructions(
     frames: Iterable[StreamFrame[Observation] | None] = (
         watched_frames(source, reading, isolation) if watch else frames_of(source, reading, isolation, rate_hz)
     )
-    answer = Answering(model, registrar_for(model, fit), resolution, isolation.keep_all)
+    answer = Answering(model, registrar_for(model, fit), resolution, isolation.keep_all, uncertainty)
     # what is written to standard input or into a watched folder arrives when it does
     pace = not every_frame and not watch and source != STANDARD_INPUT
     timed = (None if frame is None else with_time(frame) for frame in frames)
@@ -144,7 +146,10 @@ def line(outcome: Outcome[FrameAnswer]) -> dict[str, Any]:
     if outcome.result is None:
         return {**facts, "error": outcome.error}
     found = outcome.result
-    where = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
+    where: dict[str, Any] = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
+    where |= {"known": found.recognition.known, "reason": found.recognition.reason}
+    if found.radius95 is not None:
+        where["radius95"] = found.radius95
     return {**facts, **where, "strays": found.strays, "segments": found.segments}
 
 

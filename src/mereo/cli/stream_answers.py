@@ -6,9 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mereo.fitting.recognition import NOT_ASKED, Recognition
 from mereo.fitting.register import Registrar
 from mereo.fitting.tracker import Followed, Tracker
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.moments import owned_centroids
 from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import Reconstruction, extract, reconstruct
@@ -36,6 +38,9 @@ class FrameAnswer:
         method: "modes" of the registered model, or "network".
         tracked: whether the last frame's state led to it, so that the network was not asked.
         explained: share of the observed points that the registered model explains; None without one.
+        recognition: whether the frame shows the object, in a state that was learned.
+        radius95: median and greatest radius of 95 % of the surface, input unit, and whether they are calibrated; None
+            where it was not asked for, or not known.
     """
 
     surfaces: SegmentedMesh
@@ -44,9 +49,13 @@ class FrameAnswer:
     method: str
     tracked: bool
     explained: float | None
+    recognition: Recognition = NOT_ASKED
+    radius95: dict[str, float | bool] | None = None
 
     @classmethod
-    def of_network(cls, found: Reconstruction, explained: float | None = None) -> "FrameAnswer":
+    def of_network(
+        cls, found: Reconstruction, explained: float | None = None, recognition: Recognition = NOT_ASKED
+    ) -> "FrameAnswer":
         """Answer that is the network's; ``explained`` is of a registration that was not taken."""
         segments = {
             segment.name: {
@@ -56,11 +65,11 @@ class FrameAnswer:
             for segment in found.segments
             if segment.voxels
         }
-        return cls(found.surfaces, segments, found.reading.dropped, "network", False, explained)
+        return cls(found.surfaces, segments, found.reading.dropped, "network", False, explained, recognition)
 
     @classmethod
-    def of_registration(cls, found: Followed) -> "FrameAnswer":
-        """Answer that is the registered model."""
+    def of_registration(cls, found: Followed, uncertainty: bool = False) -> "FrameAnswer":
+        """Answer that is the registered model; with ``uncertainty`` it says how sure that is."""
         assert found.registration is not None
         mesh, registration = found.surfaces, found.registration
         centroids, volumes = owned_centroids(mesh), mesh.owned_volumes
@@ -68,38 +77,31 @@ class FrameAnswer:
             name: _facts(centroid, float(volume))
             for name, centroid, volume in zip(mesh.names, centroids, volumes, strict=True)
         }
-        explained = round(registration.explained, 4)
-        return cls(mesh, segments, found.reading.dropped, registration.method, found.tracked, explained)
+        explained, sure = round(registration.explained, 4), registration.uncertainty if uncertainty else None
+        for one in () if sure is None else sure.segments:
+            segments[one.name] |= {"centroid_radius95": round(one.centroid_radius95, DIGITS), "volume95": one.volume95}
+        radius95 = None if sure is None else sure.summary(sure.outline)
+        method, known = registration.method, found.recognition
+        return cls(mesh, segments, found.reading.dropped, method, found.tracked, explained, known, radius95)
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
     return {"centroid": [round(float(value), DIGITS) for value in centroid], "volume": volume}
 
 
-def owned_centroids(mesh: SegmentedMesh) -> Float[np.ndarray, "s 3"]:
-    """Centre of the volume that belongs to each segment: its mesh's without that of the segments nested in it."""
-    volumes, moments = mesh.owned_volumes, np.stack([first_moment(segment) for segment in mesh.segments])
-    for outer in range(len(moments)):  # the inner ones come first and are done
-        moments[outer] -= sum((moments[inner] for inner, other in mesh.nesting if other == outer), np.zeros(3))
-    centroids: Float[np.ndarray, "s 3"] = moments / volumes[:, None]
-    return centroids
-
-
-def first_moment(segment: Segment) -> Float[np.ndarray, "3"]:
-    """Volume times centroid of a closed mesh (divergence theorem), by tetrahedra with one corner at its middle."""
-    middle = segment.vertices.mean(axis=0)
-    a, b, c = (segment.vertices[segment.faces[:, i]] - middle for i in range(3))
-    volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
-    moment: Float[np.ndarray, "3"] = (volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle
-    return moment
-
-
 class Answering:
     """Answers frames one after the other, following the object where there is a registrar."""
 
-    def __init__(self, model: Model, registrar: Registrar | None, resolution: int, keep_all: bool = False) -> None:
+    def __init__(
+        self,
+        model: Model,
+        registrar: Registrar | None,
+        resolution: int,
+        keep_all: bool = False,
+        uncertainty: bool = False,
+    ) -> None:
         """Answering with a model; without a registrar the network alone answers each frame."""
-        self.model, self.resolution, self.keep_all = model, resolution, keep_all
+        self.model, self.resolution, self.keep_all, self.uncertainty = model, resolution, keep_all, uncertainty
         self.tracker = None if registrar is None else Tracker(registrar)
 
     def __call__(self, seen: Seen) -> FrameAnswer:
@@ -109,9 +111,17 @@ class Answering:
             found = reconstruct(cloud, self.model, self.resolution, frame.axes, keep_all=self.keep_all)
             return FrameAnswer.of_network(found)
         stated = self.tracker.registrar.stated_unit(frame.unit_m)
-        followed = self.tracker.follow(cloud, seen.time_s, frame.axes, stated_unit=stated, keep_all=self.keep_all)
+        followed = self.tracker.follow(
+            cloud,
+            seen.time_s,
+            frame.axes,
+            stated_unit=stated,
+            keep_all=self.keep_all,
+            unit_assumed=not frame.unit_stated,
+        )
         if followed.taken:
-            return FrameAnswer.of_registration(followed)
+            return FrameAnswer.of_registration(followed, self.uncertainty)
         assert followed.asked is not None
         explained = None if followed.registration is None else round(followed.registration.explained, 4)
-        return FrameAnswer.of_network(extract(followed.asked.unaided, self.model, self.resolution), explained)
+        found = extract(followed.asked.unaided, self.model, self.resolution)
+        return FrameAnswer.of_network(found, explained, followed.recognition)

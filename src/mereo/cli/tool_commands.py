@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
 from mereo.fitting.track_config import StreamFit
-from mereo.io.bounds import Cells, Count, Port, Positive, PositiveOrUnknown, Threads, Workers
+from mereo.io.bounds import Cells, Count, CountOrNone, Port, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
 from mereo.io.cores import workers_for
 from mereo.models.config import Device, InferenceConfig, Precision
@@ -136,6 +136,8 @@ class StreamCommand:
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         fit: auto follows the registered model where it explains the frame, if the weights carry one, and else asks the
             network; off asks the network alone, for each frame anew; modes takes the model in any case.
+        uncertainty: say how sure the registered model is: radii, in the input's unit, that hold the true places of the
+            surface and of each segment's centroid with probability 0.95, and intervals of its volume; takes some 30 ms.
         rate: frames per second at which a folder was recorded.
         every_frame: answer all frames, however long it takes, instead of the latest.
         watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
@@ -144,13 +146,14 @@ class StreamCommand:
         reading: how a frame is read.
         isolation: what is left out of it.
         inference: where and how exactly the network computes.
-        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
     """
 
     input: InputName
     weights: str
     resolution: Cells = 48
     fit: StreamFit = "auto"
+    uncertainty: bool = False
     rate: Positive = 30.0
     every_frame: bool = False
     watch: bool = False
@@ -180,6 +183,7 @@ class StreamCommand:
             isolation=self.isolation,
             inference=self.inference,
             fit=self.fit,
+            uncertainty=self.uncertainty,
         )
 
 
@@ -194,6 +198,8 @@ class BenchCommand:
         precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
+        beside: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
         output: a JSON file for the figures.
         force: replace an existing file, unless the weights are read from it.
     """
@@ -204,6 +210,8 @@ class BenchCommand:
     precision: Precision = "float32"
     repeats: Count = 7
     rival: bool = False
+    beside: CountOrNone = 1
+    threads: Threads = 0
     output: Path | None = None
     force: bool = False
 
@@ -213,7 +221,17 @@ class BenchCommand:
         from mereo.models.device import find_device
 
         device = find_device(self.device)
-        benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.output, self.force)
+        benchmark(
+            self.weights,
+            self.preset,
+            device,
+            self.precision,
+            self.repeats,
+            self.rival,
+            self.beside,
+            self.output,
+            self.force,
+        )
 
 
 @dataclass(frozen=True)

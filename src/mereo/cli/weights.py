@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.io.atomic_files import to_json
+from mereo.models.calibration import Calibration
 from mereo.models.weights import SHIPPED, shipped_names
 from mereo.models.weights_facts import WeightsFacts, read_facts
 from mereo.training.examples_seen import seen_in_all, told
@@ -109,6 +110,7 @@ def _everything(facts: WeightsFacts) -> dict[str, Any]:
         "parameters": facts.parameters,
         "network": facts.network.to_dict(),
         "statistical_model": None if states is None else vars(states),
+        "calibration": facts.header.calibration and facts.header.calibration.model_dump(exclude_none=True),
         "examples_seen": seen_in_all(facts.header.provenance),
         "provenance": facts.header.provenance,
         "results": [{"title": result.title, **result.scores} for result in _card(facts.path)],
@@ -133,6 +135,7 @@ def _rows(facts: WeightsFacts) -> list[tuple[str, str]]:
         ("answers", ", ".join(kind for kind, known in kinds.items() if known)),
         ("network", f"{ENCODERS[network.encoder]}, {facts.parameters:,} parameters, sees {network.points} points"),
         ("registration", _registration(facts)),
+        *calibration_rows(facts.header.calibration),
         ("training", _training(made)),
     ]
     return rows
@@ -153,6 +156,21 @@ def _registration(facts: WeightsFacts) -> str:
         f"mesh at rest ({states.vertices:,} vertices) and {states.modes} modes of {states.states:,} states, which "
         f"leave {states.residue:.2g} scene units of an unseen state"
     )
+
+
+def calibration_rows(found: Calibration | None) -> list[tuple[str, str]]:
+    """Calibration in words, each with its title."""
+    if found is None:
+        return [("calibration", "none: confidences are not calibrated, recognition has conservative limits")]
+    rows = [("calibration", f"{found.views} views of the training seed {found.seed}")]
+    if found.temperature is not None:
+        kind = "a temperature" if found.biases is None else "a temperature and a bias for each class"
+        error = "" if found.ece is None else f"; calibration error {found.ece[0]:.3f}, with it {found.ece[1]:.3f}"
+        rows.append(("probabilities", f"{kind} ({found.temperature:.2f}){error}"))
+    if found.recognizing is not None:
+        limits = found.recognizing
+        rows.append(("recognition", f"unsure above a strangeness of {limits.unsure:.2g}, no from {limits.refused:.2g}"))
+    return rows
 
 
 def _training(made: dict[str, Any]) -> str:

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.spatial import cKDTree
 
+from mereo.evaluation.coverage import seen_points
 from mereo.fitting.readings import fitted_frame
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
@@ -19,9 +19,6 @@ from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 
 AnswerName = Literal["network", "modes", "full"]
 """Who answers: the network alone, the registered modes, the better of these and the scene's own draws."""
-
-SEEN_WITHIN = 1.5
-"""Distance in scene units up to which a material point counts as seen: that of the nearest observed point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +135,7 @@ class RegistrationErrors:
     ) -> "RegistrationErrors":
         """Errors at the material points whose true places are given, the first ones, in the cloud's unit."""
         error = np.linalg.norm(registration.material[: len(truth)] - truth, axis=1) / scene_unit
-        near = cKDTree(cloud.points).query(truth)[0] <= SEEN_WITHIN * scene_unit
+        near = seen_points(truth, cloud, scene_unit)
         return cls(error[near], error[~near])
 
     @classmethod

@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mereo.evaluation.candidates import AnswerName, Candidate, RegistrationErrors
+from mereo.evaluation.coverage import RadiusRatios
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.evaluation.reliability import Reliability
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color
@@ -66,6 +68,10 @@ class Evaluation:
         sources: where that answer came from, in each example: network, modes or draws.
         errors: distances of registered points from their true places, where a registration was taken.
         unit_mm: millimetres per scene unit, where they are known.
+        coverage: distances of the same points over the radii that are told of them.
+        radii_calibrated: whether all of these are.
+        reliability: of the network's probabilities.
+        calibrated: whether these are.
     """
 
     names: tuple[str, ...]
@@ -77,6 +83,10 @@ class Evaluation:
     sources: tuple[str, ...] = ()
     errors: RegistrationErrors | None = None
     unit_mm: float | None = None
+    coverage: RadiusRatios | None = None
+    radii_calibrated: bool = False
+    reliability: Reliability = field(default_factory=Reliability)
+    calibrated: bool = False
 
     def __repr__(self) -> str:
         scores, count = self.scores, counted(len(self.examples), "example")

@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.evaluation.candidates import Candidates, RegistrationErrors, find_candidates, names_for, network_labels
+from mereo.evaluation.coverage import RadiusRatios, seen_points
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
+from mereo.evaluation.reliability import Reliability
 from mereo.evaluation.results import EvaluatedView, Evaluation, Tally, grid_confusion
 from mereo.fitting.config import FitChoice
 from mereo.fitting.register import CURE, Registrar, other_mesh, registrar_for
@@ -154,10 +156,10 @@ def trained_scene(model: Model) -> str:
 def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, index: int) -> TestCase:
     view = sample_view(scene.for_seed(seed), settings, example_rng(seed, index))
     name = f"{scene.name} {index}"
-    return TestCase(name, view.depth.to_points(), truth_grid(view.mesh, cells), 1.0, partial(_true_material, view))
+    return TestCase(name, view.depth.to_points(), truth_grid(view.mesh, cells), 1.0, partial(true_material, view))
 
 
-def _true_material(view: View, model: StatisticalModel) -> Float[np.ndarray, "m 3"]:
+def true_material(view: View, model: StatisticalModel) -> Float[np.ndarray, "m 3"]:
     """Where a view's state has moved the material points of its object, camera frame."""
     state = State(view.mesh.transformed(view.T_world_camera), view.deformations)
     return transform_points(inverse_rigid(view.T_world_camera), state_points(state, model.nodes, model.node_labels))
@@ -185,19 +187,24 @@ def score_cases(
     examples: dict[str, Scores] = {}
     views: list[EvaluatedView] = []
     tallies = {name: Tally() for name in names_for(registrar)}
-    answer, sources, errors = Tally(), [], []
+    answer, sources, errors, reliability = Tally(), [], [], Reliability()
+    ratios, calibrated = list[RadiusRatios](), list[bool]()
     for index in tracked("evaluate", count, "views", quiet=not progress):
         one = case(index)
         found = find_candidates(model, one.cloud, one.truth.grid, registrar, one.scene_unit)
         for name, tally in tallies.items():
             tally.add(one.truth, found.each[name], len(names), model.segmented)
         answer.add(one.truth, found.answer, len(names), model.segmented)
+        reliability.add_view(model, found.code, one.truth)
         examples[one.name] = answer.examples[-1]
         sources.append(found.source)
         registration = found.answer.registration
         if registration is not None and one.material is not None and one.scene_unit is not None:
             truth = one.material(registration.model)
             errors.append(RegistrationErrors.of(registration, truth, one.cloud, one.scene_unit))
+            ratio = RadiusRatios.of(registration, truth, seen_points(truth, one.cloud, one.scene_unit))
+            ratios.append(ratio.by(registration.radius_scale))
+            calibrated.append(registration.radius_scale is not None)
         if len(views) < kept:
             views.append(_evaluated_view(one, model, found, colors))
     return Evaluation(
@@ -209,6 +216,10 @@ def score_cases(
         answers={name: tally.scores for name, tally in tallies.items()},
         sources=tuple(sources),
         errors=RegistrationErrors.together(errors) if errors else None,
+        coverage=RadiusRatios.together(ratios) if ratios else None,
+        radii_calibrated=bool(calibrated) and all(calibrated),
+        reliability=reliability,
+        calibrated=model.calibrates,
     )
 
 

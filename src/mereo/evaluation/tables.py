@@ -1,6 +1,7 @@
 """Results of an evaluation as ``metrics.json`` and as a table."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,6 +33,9 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "example_mean": {"iou": iou, "miou": miou},
         "per_example": {name: {"iou": each.iou, "miou": each.miou} for name, each in evaluation.examples.items()},
         "confusion": evaluation.confusion,
+        "ece": evaluation.reliability.ece,
+        "calibrated": evaluation.calibrated,
+        "reliability": evaluation.reliability.facts(),
         **answers(evaluation),
     }
 
@@ -40,7 +44,8 @@ def answers(evaluation: Evaluation) -> dict[str, Any]:
     """Part of ``metrics.json`` that compares who could have answered: network, modes, full.
 
     ``chosen`` has the share of examples by where the scored answer came from, ``better`` the share in which another
-    answer would have been better than it by more than ``CLEARLY``. ``registration_error`` is None where none was taken.
+    answer would have been better than it by more than ``CLEARLY``. ``registration_error`` and
+    ``coverage95``, the share of true places within the registration's radii, are None where none was taken.
     """
     count = max(1, len(evaluation.sources))
     sources = {name: evaluation.sources.count(name) / count for name in ("network", "rest", "modes", "draws")}
@@ -57,7 +62,31 @@ def answers(evaluation: Evaluation) -> dict[str, Any]:
         "chosen": sources,
         "better": better,
         "registration_error": errors,
+        "coverage95": coverage(evaluation),
     }
+
+
+def coverage(evaluation: Evaluation) -> dict[str, float | bool | None] | None:
+    """Share of the true places within the radii of 95 %, and medians of these; None where none was registered."""
+    if evaluation.coverage is None:
+        return None
+    return {**evaluation.coverage.summary(evaluation.unit_mm), "calibrated": evaluation.radii_calibrated}
+
+
+def coverage_line(found: Mapping[str, Any]) -> str:
+    """Sentence on ``coverage``."""
+    shares = ", ".join(f"{name} {found[name]:.1%}" for name in ("seen", "hidden") if found[name] is not None)
+    medians = [
+        f"{name} {found[f'radius_{name}']:.3g} scene units"
+        + ("" if found[f"radius_{name}_mm"] is None else f" ({found[f'radius_{name}_mm']:.3g} mm)")
+        for name in ("seen", "hidden")
+        if found[f"radius_{name}"] is not None
+    ]
+    how = "calibrated" if found["calibrated"] else "not calibrated"
+    return (
+        f"Radii of 95 % ({how}) hold {found['all']:.1%} of the true places: {shares}. In the median they are "
+        f"{', '.join(medians)}."
+    )
 
 
 def _value(scores: Scores) -> float:
@@ -70,17 +99,19 @@ def _answer(found: AnswerScores, segmented: bool) -> dict[str, float]:
 
 
 def markdown_table(evaluation: Evaluation) -> str:
-    """Markdown table of the whole set and the mean over its examples; a dash where a score is undefined."""
+    """Markdown table of the whole set and the mean over its examples, and a line on the radii; a dash for no score."""
     scores, (iou, miou) = evaluation.scores, evaluation.example_mean
     names = " | ".join(evaluation.names)
     values = " | ".join(format_score(value) for value in scores.per_segment)
     blank = " | ".join("" for _ in evaluation.names)
+    found = coverage(evaluation)
     return (
         f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
         f"|---|---|---|{'---|' * len(evaluation.names)}\n"
         f"| whole set | {format_score(scores.iou)} | {format_score(scores.miou)} | {values} |\n"
         f"| mean over examples | {format_score(iou)} | {format_score(miou)} | {blank} |\n"
         + _answer_rows(evaluation, blank)
+        + ("" if found is None else f"\n{coverage_line(found)}\n")
     )
 
 

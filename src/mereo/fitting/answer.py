@@ -3,13 +3,15 @@
 cloud -fitted_frame-> FittedFrame -finish-> Registration -segments, labels-> Reconstruction
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.fitting.config import FitChoice
 from mereo.fitting.readings import FittedFrame, fitted_frame
+from mereo.fitting.recognition import NOT_ASKED, Recognition, recognized
 from mereo.fitting.register import Registrar, registrar_for
 from mereo.fitting.registration import Registration, nearest_labels
 from mereo.geometry.camera import PointCloud
@@ -17,6 +19,7 @@ from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
+from mereo.geometry.transforms import inverse_rigid
 from mereo.models.model import Model
 from mereo.reconstruction.isosurfaces import Extraction
 from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, extract, timed, turned_back
@@ -33,15 +36,24 @@ class Answer:
             input's unit; None where none was asked for or none was found.
         taken: whether the reconstruction is the registered model; otherwise it is the network's.
         refusal: why no registration was found, where one was asked for.
+        recognition: whether the frame shows the object, in a state that was learned; whoever answers.
     """
 
     reconstruction: Reconstruction
     registration: Registration | None = None
     taken: bool = False
     refusal: str | None = None
+    recognition: Recognition = NOT_ASKED
 
     def __repr__(self) -> str:
         return f"Answer({self.source}; {self.reconstruction!r})"
+
+    @cached_property
+    def registered(self) -> Registration | None:
+        """Registration in the input's frame, where the reconstruction is that model; else None."""
+        if self.registration is None or not self.taken:
+            return None
+        return self.registration.moved(inverse_rigid(self.reconstruction.T_camera_input))
 
     @property
     def source(self) -> str:
@@ -62,6 +74,7 @@ def answer(
     scene_unit: float | None = None,
     stated_unit: float | None = None,
     keep_all: bool = False,
+    unit_assumed: bool = False,
 ) -> Answer:
     """Answer to the frame that a cloud shows.
 
@@ -78,13 +91,14 @@ def answer(
         stated_unit: the same as the input states it (``Registrar.stated_unit``), believed only where the network's own
             estimate agrees.
         keep_all: drop no strays.
+        unit_assumed: ``stated_unit`` is only assumed: an object of another size is no sign of another object then.
 
     Raises ``ValueError`` as ``mereo.reconstruct`` does, and for other choices than "auto" as ``fit_frame`` does.
     """
     if isinstance(registrar, str):
         registrar = registrar_for(model, registrar)
     found = fitted_frame(cloud, model, registrar, frame, scene_unit, stated_unit, keep_all)
-    return answer_fitted(found, model, registrar, resolution, label_points)
+    return answer_fitted(found, model, registrar, resolution, label_points, None if unit_assumed else stated_unit)
 
 
 def answer_fitted(
@@ -93,18 +107,20 @@ def answer_fitted(
     registrar: Registrar | None,
     resolution: int = 128,
     label_points: bool = False,
+    stated_unit: float | None = None,
 ) -> Answer:
     """``answer`` to a frame that ``registrar`` has been fitted to already, with its arguments."""
     if registrar is not None and registrar.choice != "auto" and found.error is not None:
         raise found.error
-    registration = None
+    registration, refusal = None, None if found.error is None else str(found.error)
     if registrar is not None and found.modes is not None:
         registration = registrar.finish(found.modes)
-        if registrar.takes(registration):
-            result = registered(found.seen, registration, model, resolution, label_points)
-            return Answer(result, registration, taken=True)
+    known = recognized(found, registration, model, stated_unit)
+    if registrar is not None and registration is not None and registrar.takes(registration):
+        result = registered(found.seen, registration, model, resolution, label_points)
+        return Answer(result, registration, taken=True, recognition=known)
     result = extract(found.unaided, model, resolution, label_points)
-    return Answer(result, registration, refusal=None if found.error is None else str(found.error))
+    return Answer(result, registration, refusal=refusal, recognition=known)
 
 
 def registered(
@@ -136,6 +152,7 @@ def registered(
         T_camera_input=seen.T_camera_input,
         reading=seen.reading,
         observed=observed,
+        calibrated=model.calibrates,
     )
     return result if seen.axes == "camera" else turned_back(result)
 
@@ -143,8 +160,9 @@ def registered(
 def _observed(seen: EncodedFrame, registration: Registration, model: Model) -> SegmentedCloud:
     """Segment of each observed point by the registration, with the network's probabilities of it."""
     points = seen.seen.points
-    cloud = segment_points(model.logits(seen.code, points), seen.points, model.names, model.colors)
-    return replace(cloud, labels=nearest_labels(registration.solids, points))
+    labels = nearest_labels(registration.solids, points)
+    logits = model.logits(seen.code, points)
+    return segment_points(logits, seen.points, model.names, model.colors, model.calibration, labels)
 
 
 def padded_label_grid(mesh: SegmentedMesh, spacing: float) -> LabelGrid:

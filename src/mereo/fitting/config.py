@@ -38,6 +38,9 @@ class FitConfig:
         scale_std: standard deviation of the scale's logarithm where the unit is not known.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface,
             in scene units.
+        turned: whether the network is asked again, with the camera turned, where much is unexplained: seconds a frame.
+        agreed, accepted_agreed: where the network and the fit give as large a share of the correspondences on the
+            object's surface the same segment, this smaller share is enough.
     """
 
     start_sigma: float = 0.06
@@ -74,6 +77,9 @@ class FitConfig:
     exact_steps: int = 3
     accepted: float = 0.95
     tolerance: float = 0.45
+    turned: bool = True
+    agreed: float = 0.8
+    accepted_agreed: float = 0.85
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ at the observed points and along the lines of sight behind them: where it finds 
 at rest. It is right on what is seen and vague on what is hidden.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -51,7 +51,11 @@ class Correspondences:
 
     def scaled(self, factor: float) -> "Correspondences":
         """Correspondences with the camera frame in another unit."""
-        return Correspondences(self.points * factor, self.rest, self.labels, self.confidence, self.observed)
+        return replace(self, points=self.points * factor)
+
+    def turned(self, rotation: Float[np.ndarray, "3 3"]) -> "Correspondences":
+        """Correspondences in a camera frame that is turned about its origin."""
+        return replace(self, points=self.points @ rotation.T)
 
     def evenly(self, each: int = EACH) -> "Correspondences":
         """Even subset: at most ``each`` observed and as many inside, evenly spread in space."""

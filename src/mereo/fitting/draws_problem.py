@@ -15,8 +15,9 @@ from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.config import MANY_DRAWS, DrawsConfig
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.draws_approach import HELD, prior_of_draws, unmoving
-from mereo.fitting.gauss_newton import NormalEquations, Posed, along, geman_mcclure
+from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed, Rows, along, geman_mcclure
 from mereo.fitting.playback import Drawn, DrawnStates, as_sparse, material_moved
+from mereo.fitting.posterior import Terms
 from mereo.fitting.problem import Problem
 from mereo.fitting.residuals import MOST_VIOLATIONS, ROBUST, WITNESS_WEIGHT, NetworkTerm, Surface, robust_square
 from mereo.geometry.mesh import barycentric
@@ -154,29 +155,50 @@ def normal_equations(
     problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float
 ) -> NormalEquations:
     """Of everything that the frame shows, for changes of pose and draws, whose motion of the played points is given."""
+    return terms(problem, fit, motion, sigma).total
+
+
+def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Terms:
+    """Terms of ``normal_equations``."""
     base, posed, config = problem.base, fit.posed, problem.base.config
     flat, count = motion.reshape(len(motion), -1), len(fit.z)
-    spread = problem.states.played.spread
-    normal = prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std)
+    nothing, state = NormalEquations.nothing(POSE + count), replace(posed, z=np.zeros(count))
     network = problem.network(fit, (problem.followed @ flat).reshape(-1, 3, count))
-    state = replace(posed, z=np.zeros(count))
-    normal = network.add_to(normal, state, base.network_sigma, config.network_worth[1], robust=True)
+    return Terms(
+        known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
+        network=network.add_to(nothing, state, base.network_sigma, config.network_worth[1], robust=True),
+        cloud=cloud_rows(problem, fit, motion, sigma),
+        partners=base.evidence.partners,
+        ruled_out=ruled_out(problem, fit, motion, sigma),
+    )
+
+
+def cloud_rows(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Rows:
+    """Each observed partner's distance to its plane of the surface, its derivatives, and its weight."""
+    base, spread = problem.base, problem.states.played.spread
     corners = problem.model.faces[fit.surface.facing[fit.face]]
     within = barycentric(fit.surface.material[corners], fit.place).astype(np.float32)
     rows = np.repeat(np.arange(len(corners)), 3)
     at_places = csr_array((within.ravel(), (rows, corners.ravel())), shape=(len(corners), spread.shape[0])) @ spread
-    modes = (at_places @ flat).reshape(-1, 3, count)
+    modes = (at_places @ motion.reshape(len(motion), -1)).reshape(-1, 3, len(fit.z))
     direction = fit.surface.normals[fit.face]
     residual = np.einsum("pi,pi->p", direction, fit.place - base.evidence.partners)
-    weight = geman_mcclure(residual, ROBUST * sigma) * (config.cloud_worth / len(residual) / sigma**2)
-    normal = normal.add(along(posed, fit.place, modes, direction), residual, weight)
+    weight = geman_mcclure(residual, ROBUST * sigma) * (base.config.cloud_worth / len(residual) / sigma**2)
+    return along(fit.posed, fit.place, modes, direction), residual, weight
+
+
+def ruled_out(
+    problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float
+) -> NormalEquations:
+    """Normal equations of the vertices that are outside the silhouette or in free space."""
+    base, spread, nothing = problem.base, problem.states.played.spread, NormalEquations.nothing(POSE + len(fit.z))
     chosen = base.witnesses
     direction, amount = base.evidence.violations(fit.surface.material[chosen], ROBUST * sigma)
     rows = np.flatnonzero(amount > 0)
     if len(rows) == 0:
-        return normal
+        return nothing
     rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
-    modes = (spread[chosen[rows]] @ flat).reshape(-1, 3, count)
-    jacobian = along(posed, fit.surface.material[chosen[rows]], modes, direction[rows])
+    modes = (spread[chosen[rows]] @ motion.reshape(len(motion), -1)).reshape(-1, 3, len(fit.z))
+    jacobian = along(fit.posed, fit.surface.material[chosen[rows]], modes, direction[rows])
     weight = WITNESS_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
-    return normal.add(jacobian, -amount[rows], weight)
+    return nothing.add(jacobian, -amount[rows], weight)

@@ -18,6 +18,9 @@ from scipy.spatial.transform import Rotation
 POSE = 7
 """Parameters before the coefficients."""
 
+Rows = tuple[Float[np.ndarray, "p q"], Float[np.ndarray, " p"], Float[np.ndarray, " p"]]
+"""Derivatives of residuals by the q parameters, the residuals, and their weights, as ``NormalEquations.add`` takes."""
+
 
 @dataclass(frozen=True, eq=False)
 class Posed:
@@ -75,6 +78,15 @@ class NormalEquations:
         weighted = jacobian * weight[:, None].astype(jacobian.dtype)
         matrix = (weighted.T @ jacobian).astype(np.float64)
         return NormalEquations(self.matrix + matrix, self.gradient + weighted.T.astype(np.float64) @ residual)
+
+    @classmethod
+    def nothing(cls, count: int) -> "NormalEquations":
+        """Equations of no residuals in so many parameters."""
+        return cls(np.zeros((count, count)), np.zeros(count))
+
+    def plus(self, other: "NormalEquations") -> "NormalEquations":
+        """Sum with other equations."""
+        return NormalEquations(self.matrix + other.matrix, self.gradient + other.gradient)
 
     def step(self, damping: float) -> Float[np.ndarray, " p"]:
         """Levenberg and Marquardt's step."""

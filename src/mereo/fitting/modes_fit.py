@@ -22,9 +22,13 @@ from mereo.geometry.procrustes import robust_rigid
 
 def fit_modes(problem: Problem) -> "Judged":
     """The whole fit, and how well it explains the frame."""
-    config = problem.config
     first = fit_whole(problem)
-    best = Judged.of(problem, first).better(problem, refine(problem, first))
+    return explored(problem, Judged.of(problem, first).better(problem, refine(problem, first)))
+
+
+def explored(problem: Problem, best: "Judged") -> "Judged":
+    """The best of a state and, while that does not explain the cloud, of others that agree with it or the network."""
+    config = problem.config
     for number in range(config.rounds if len(problem.model.pairs) >= config.curved else 0):
         if problem.explained(best.misfit.cloud, best.surface, config.explained):
             break
@@ -65,10 +69,10 @@ def likely(problem: Problem, best: Posed, number: int) -> list[Posed]:
     screened = [
         group[index]
         for group in groups
-        for index in np.argsort([coarse.screen(other, sigma) for other in group])[: config.screened]
+        for index in np.argsort([coarse.screen(other, sigma).total for other in group])[: config.screened]
     ]
     drawn = distinct(problem, best, [refine(coarse, other, 2.0, config.screen_steps) for other in screened])
-    order = np.argsort([problem.screen(other, sigma) for other in drawn])
+    order = np.argsort([problem.screen(other, sigma).total for other in drawn])
     return [drawn[index] for index in order[: config.refined]]
 
 

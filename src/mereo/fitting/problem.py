@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import PARTNERS, Evidence
-from mereo.fitting.gauss_newton import NormalEquations, Posed
+from mereo.fitting.gauss_newton import NormalEquations, Posed, Rows
 from mereo.fitting.joints import Joints
 from mereo.fitting.noise import SHARED, constants_for, is_noise, noise_of, shared
 from mereo.fitting.priors import PairTerm, Prior
@@ -20,6 +20,7 @@ from mereo.fitting.residuals import (
     Surface,
     add_cloud,
     add_witnesses,
+    cloud_rows,
     robust_square,
 )
 from mereo.fitting.sampled_surface import SampledSurface
@@ -33,6 +34,12 @@ BESIDE = 1.0
 
 FAR = 1.0
 """Scene units beyond the tolerance by which a vertex is ruled out for good."""
+
+UNEXPLAINED = 0.3
+"""The cloud's misfit, in squared standard deviations of a partner, above which a fit is likely wrong."""
+
+TAILS = 1.5
+"""The same, in those of normal noise as great as what the fit leaves over."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +123,13 @@ class Problem:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_partners, noisy=True)
 
+    def wants_turns(self, cloud: float, surface: Surface) -> bool:
+        """Whether a misfit of the cloud, much greater than its noise, says that the fit is likely wrong."""
+        if cloud < UNEXPLAINED:
+            return False
+        noise = noise_of(surface.offsets(self.evidence.points), self.evidence.around)
+        return cloud > TAILS * (noise / self.config.cloud_sigma) ** 2
+
     def with_network(self, found: Correspondences) -> "Problem":
         """The problem with other correspondences."""
         return replace(self, network=NetworkTerm.of(self.model, found))
@@ -164,7 +178,7 @@ class Problem:
         vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))
         return coarse
 
-    def screen(self, posed: Posed, sigma: float) -> float:
+    def screen(self, posed: Posed, sigma: float) -> Misfit:
         """Misfit by the samples alone: good enough to choose among states, and ten times as fast."""
         samples = self.samples.posed(posed)
         place, normal, _ = samples.planes(self.evidence.partners)
@@ -178,7 +192,7 @@ class Problem:
             self.network.energy(posed, self.network_sigma),
             float(robust_square(amount, sigma, 4 * ROBUST).mean()),
             posed.z,
-        ).total
+        )
 
     def seen(
         self, normal: NormalEquations, posed: Posed, sigma: float, network_worth: float, exact: bool
@@ -189,6 +203,12 @@ class Problem:
         normal = self.network.add_to(normal, posed, self.network_sigma, network_worth, robust=True)
         normal = add_cloud(normal, posed, partners, planes, sigma, self.config.cloud_worth)
         return add_witnesses(normal, posed, samples.few(self.config.witnesses), self.evidence, sigma)
+
+    def cloud_rows(self, posed: Posed) -> Rows:
+        """Residuals of the observed partners from the faces, as the last steps of a fit have them."""
+        partners, config = self.evidence.partners, self.config
+        planes = Surface.of(self.model, posed).planes(partners, self.far)
+        return cloud_rows(posed, partners, planes, config.cloud_sigma, config.cloud_worth)
 
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""

@@ -87,19 +87,21 @@ def fitted_frame(
     Raises ``ValueError`` for unusable clouds. Where a fit finds too little, ``FittedFrame.error`` says so.
     """
     started = time.perf_counter()
+    found = readings(cloud, axes, keep_all)
+    # beside strays much stays unexplained in any case, which is no reason to ask again
+    fitting = registrar if registrar is None or len(found) == 1 else registrar.at_once
 
     def fitted(reading: Reading) -> FittedFrame:
         seen = encode_frame(reading, model, axes)
-        if registrar is None:
+        if fitting is None:
             return FittedFrame(seen, seen)
         doubtful = transform_points(seen.T_camera_input, reading.whole.points[~reading.keep])
         try:
-            modes = registrar.fit_modes(seen.seen, seen.code, scene_unit, stated_unit, doubtful)
+            modes = fitting.fit_modes(seen.seen, seen.code, scene_unit, stated_unit, doubtful)
         except ValueError as error:
             return FittedFrame(seen, seen, error=error)
         return FittedFrame(seen, seen, modes)
 
-    found = readings(cloud, axes, keep_all)
     first = fitted(found[0])
     if registrar is None or len(found) == 1:
         return first

@@ -4,13 +4,13 @@ EncodedFrame -Registrar-> Registration
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import FitChoice, FitConfig
 from mereo.fitting.fit import ModesFit, fit_frame
 from mereo.fitting.playback import DrawnStates
 from mereo.fitting.registration import Registration
@@ -38,12 +38,14 @@ class Registrar:
         choice: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
             misfit; "auto" does the same where the scene is at hand, and else fits the modes.
         given: the object's scene, where it is not the built-in one that the weights were trained on.
+        config: constants of the fit of the modes.
     """
 
     network: Model
     model: StatisticalModel
     choice: FitChoice = "auto"
     given: Scene | None = None
+    config: FitConfig = FitConfig()  # noqa: RUF009 (frozen)
 
     @classmethod
     def of(cls, network: Model, choice: FitChoice = "auto", scene: Scene | str | None = None) -> "Registrar":
@@ -94,6 +96,11 @@ class Registrar:
         """Random states of the scene, among which a fit of its draws starts; they take seconds once."""
         return None if self.scene is None else DrawnStates.of(self.scene, self.model)
 
+    @property
+    def at_once(self) -> "Registrar":
+        """The same without the patience to ask about a frame again with the camera turned."""
+        return replace(self, config=replace(self.config, turned=False))
+
     def stated_unit(self, unit_m: float) -> float | None:
         """Length of a scene unit in a cloud's unit of ``unit_m`` metres; None where the object's size is not known."""
         frame = self.model.source_frame
@@ -108,8 +115,9 @@ class Registrar:
         doubtful: Float[np.ndarray, "d 3"] | None = None,
     ) -> ModesFit:
         """Fit of the modes, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
-        network, model = self.network, self.model
-        return fit_frame(seen, network, model, scene_unit, code=code, stated_unit=stated_unit, doubtful=doubtful)
+        return fit_frame(
+            seen, self.network, self.model, scene_unit, self.config, code, stated_unit=stated_unit, doubtful=doubtful
+        )
 
     def register(
         self,
@@ -199,7 +207,6 @@ def describe(registration: Registration) -> dict[str, object]:
         "accepted": registration.accepted,
         "residual": registration.residual,
         "ruled_out": registration.ruled_out,
-        "doubt": registration.doubt,
         "beyond_states": registration.beyond_states,
         "scene_unit": registration.scene_unit,
         "unit": "known" if registration.unit_known else "found",

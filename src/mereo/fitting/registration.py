@@ -10,10 +10,15 @@ from numpy.typing import ArrayLike
 
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
+from mereo.fitting.explanation import Explanation
+from mereo.fitting.optimum import Optimum
 from mereo.fitting.playback import Drawn
+from mereo.fitting.uncertainty import Uncertainty
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.moments import owned_centroids
 from mereo.geometry.solids import Solids, signed_distance_and_direction
+from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.statistical_model import StatisticalModel, following
 
 Method = Literal["rest", "modes", "draws"]
@@ -21,21 +26,8 @@ Method = Literal["rest", "modes", "draws"]
 
 AT_ONCE = 20_000
 
-RULED_OUT = 0.03
-"""Share of the surface that a frame rules out, from which on a registration is doubtful."""
-
-EXPLAINED = 0.92
-"""Share of the observed points below which it is.
-
-Of 95 believed fits to training views of eight objects, 15 were worse than the network's worst on clean views. One or
-the other rule finds 12 of these, all that are worse by more than .1 among them, and 7 of the other 80, none clean."""
-
-
-HARDLY = 0.5
-"""Share of the observed points below which it is probably another object, or no camera frame."""
-
-BEYOND = 1.0
-"""Scene units outside all that the model has seen (``Registration.beyond_states``), from which on it is doubtful."""
+BELIEVED = 0.95
+"""Share of a clean frame's points that a fit must explain to be believed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +81,10 @@ class Registration:
         drawn: the scene's draws where ``method`` is "draws", with their seed: what plays the state again.
         ruled_out: share of the surface's vertices that the frame rules out, by more than a scene unit: they lie beside
             all that was seen of the object or in front of it; None where the registration was read from a file.
+        needed: least ``explained`` of a frame of this noise to be believed.
+        optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
+            where the registration was read from a file.
+        radius_scale: factor of the radii by the weights' calibration, which is of fits of the modes; None without one.
     """
 
     model: StatisticalModel
@@ -103,9 +99,12 @@ class Registration:
     drawn: Drawn | None = None
     residual: float | None = None
     ruled_out: float | None = None
+    needed: float = BELIEVED
+    optimum: Optimum | None = None
+    radius_scale: float | None = None
 
     def __repr__(self) -> str:
-        trust = "not believed, " if not self.accepted else "doubtful, " if self.doubt is not None else ""
+        trust = "" if self.accepted else "not believed, "
         unit = f"a scene unit is {self.scene_unit:.4g}"
         return f"Registration({self.told}, {trust}{unit}; {self.seconds:.1f} s)"
 
@@ -114,38 +113,15 @@ class Registration:
         """Phrase on how well the frame is explained."""
         return f"registered model ({self.method}) explains {self.explained:.1%} of the observed points"
 
-    @property
-    def doubt(self) -> str | None:
-        """Sentence on why a registration may be wrong; None without a reason."""
-        if self.explained < HARDLY:
-            return (
-                f"doubtful: only {self.explained:.0%} of the points can be the model's: this is probably another "
-                "object, not the object alone, or no camera frame: leave out what is not the object, turn the cloud "
-                "(--frame), or name the object's own weights"
-            )
-        if self.ruled_out is not None and self.ruled_out > RULED_OUT:
-            return (
-                f"doubtful: {self.ruled_out:.0%} of the model's surface lies where the frame shows none of it, beside "
-                "or in front of what was seen: look at the result before you rely on it, or take the frame from nearer"
-            )
-        if self.explained < EXPLAINED:
-            return (
-                f"doubtful: {1 - self.explained:.0%} of the points are not the model's: look at the result before you "
-                "rely on it, or leave out of the cloud what is not the object"
-            )
-        if self.beyond_states > BEYOND:
-            return (
-                f"doubtful: the state lies {self.beyond_states:.1f} scene units outside those that were learned, and "
-                "rigid parts may be bent: look at the result before you rely on it, or widen the scene's ranges and "
-                "learn it anew"
-            )
-        return None
-
     @cached_property
+    def modes_z(self) -> Float[np.ndarray, " k"]:
+        """Coefficients of the modes nearest to the state, whatever describes it."""
+        return self.z if self.method != "draws" else self.model.project(self.material / self.scene_unit)[1]
+
+    @property
     def beyond_states(self) -> float:
         """How far the state lies outside all that the model has seen (``StatisticalModel.beyond``), scene units."""
-        z = self.z if self.method != "draws" else self.model.project(self.material / self.scene_unit)[1]
-        return self.model.beyond(z)
+        return self.model.beyond(self.modes_z)
 
     @cached_property
     def mesh(self) -> SegmentedMesh:
@@ -198,6 +174,65 @@ class Registration:
         distance, direction = signed_distance_and_direction(self.solids, points, labels)
         nearest = np.where(labels > 0, labels, nearest_labels(self.solids, points)).astype(np.uint8)
         return Located(labels, distance, direction, self.to_rest(points, nearest))
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty | None:
+        """How far the true places may be from the registered ones; None where the registration was read from a file."""
+        return None if self.optimum is None else Uncertainty(self.optimum, self.model, self.radius_scale)
+
+    def radius95(
+        self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Literal["camera", "rest"]
+    ) -> Float[np.ndarray, " n"] | None:
+        """Radius around each point that holds its true place with probability 0.95, in the input's unit.
+
+        The point is one of the object: that which the registration has at the given place of the camera frame, or
+        that which was at the given place of the rest model. ``uncertainty`` has the radii of all vertices, and says
+        whether they are calibrated. None where the registration was read from a file.
+
+        Args:
+            points: n x 3.
+            labels: of the segments that they move along with, 1 or more; by default those that hold them or come
+                nearest.
+            at: "camera" for points of the camera frame in the input's unit, "rest" for scene units of the rest model.
+        """
+        if self.uncertainty is None:
+            return None
+        points = rows_of_three(points)
+        if labels is None:
+            labels = nearest_labels(self.solids if at == "camera" else self.rest_solids, points)
+        return self.uncertainty.of_rest(self.to_rest(points, labels) if at == "camera" else points, labels)
+
+    def explain(self, what: ArrayLike | str, *, at: Literal["camera", "rest"] = "camera") -> Explanation | None:
+        """What decides where a point of the object is: observed points, the network, or what was known of its states.
+
+        Args:
+            what: x, y, z of a point; or the name of a segment, for its centroid.
+            at: "camera" for a point of the camera frame in the input's unit, "rest" for scene units of the rest model.
+
+        Returns None where the registration was read from a file. Raises ``ValueError`` for a name of no segment and
+        for other than three coordinates.
+        """
+        if self.uncertainty is None:
+            return None
+        if isinstance(what, str):
+            names = self.model.rest.names
+            if what not in names:
+                raise ValueError(f"there is no segment {what!r}; the segments are {', '.join(names)}: name one of them")
+            place = owned_centroids(self.mesh)[names.index(what)]
+            decided = self.uncertainty.decided_centroid(names.index(what))
+        else:
+            point = rows_of_three(np.asarray(what, dtype=np.float64)[None])
+            label = nearest_labels(self.solids if at == "camera" else self.rest_solids, point)
+            rest = self.to_rest(point, label) if at == "camera" else point
+            place = self.to_camera(rest, label)[0]
+            decided = self.uncertainty.decided_point(rest, label)
+        return Explanation.of(place, decided, self.uncertainty.optimum, self._T_here_fit)
+
+    @cached_property
+    def _T_here_fit(self) -> Float[np.ndarray, "4 4"]:
+        """From the camera frame of the fit, in the input's unit, to that in which this registration is."""
+        assert self.optimum is not None
+        return fit_rigid(self.optimum.unit * self.optimum.posterior.material, self.material)
 
     def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
         """Registration in another frame."""

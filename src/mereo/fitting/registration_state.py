@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo.fitting.answer import Answer
+from mereo.fitting.noise import ACCEPTED
 from mereo.fitting.playback import Drawn, material_moved, shares_of
 from mereo.fitting.register import CURE, Registrar, other_mesh
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration import BELIEVED, Registration
 from mereo.fitting.state_file import FORMAT, STATE, WITNESSES, RegistrationState, StateDraws, read_state, save_state
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import fit_rigid, transform_points
@@ -161,6 +162,8 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
         accepted=state.accepted,
         seconds=state.seconds,
         drawn=drawn,
+        # the file does not say it; what is believed with less than a clean frame needs is noisy, or agrees otherwise
+        needed=ACCEPTED if state.accepted and state.explained < BELIEVED else BELIEVED,
     )
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Int
 
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
-from mereo.fitting.gauss_newton import NormalEquations, Posed, along, cross, geman_mcclure, in_space
+from mereo.fitting.gauss_newton import NormalEquations, Posed, Rows, along, cross, geman_mcclure, in_space
 from mereo.fitting.sampled_surface import Planes, PosedSamples
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.raycasting import first_faces, ray_scene
@@ -24,6 +24,7 @@ ROBUST = 2.5
 """Residuals beyond this many sigma count for little."""
 
 MOST_VIOLATIONS = 400
+
 WITNESS_WEIGHT = 0.2
 
 
@@ -186,10 +187,15 @@ def add_cloud(
     worth: float,
 ) -> NormalEquations:
     """Sum with each point's distance to its plane of the facing surface."""
+    return normal.add(*cloud_rows(posed, points, planes, sigma, worth))
+
+
+def cloud_rows(posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, sigma: float, worth: float) -> Rows:
+    """Each point's distance to its plane of the facing surface, its derivatives, and its weight."""
     place, across, modes = planes
     residual = np.einsum("pi,pi->p", across, place - points)
     weight = geman_mcclure(residual, ROBUST * sigma) * (worth / len(points) / sigma**2)
-    return normal.add(along(posed, place, modes, across), residual, weight)
+    return along(posed, place, modes, across), residual, weight
 
 
 def add_witnesses(

@@ -21,14 +21,19 @@ from mereo.geometry.transforms import fit_rigid
 
 def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> Judged:
     """Fit of the rest model's pose, from that of the modes; its ``posed.z`` is empty."""
-    model, config = problem.model, problem.config
-    rigid = model.around(model.rest_points, np.zeros((len(model.rest_points), 3, 0), dtype=np.float32))
-    rest = replace(problem, model=rigid, network=NetworkTerm.of(rigid, found))
+    model, config, rest = problem.model, problem.config, of_rest(problem, found)
     T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
     start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
     prior = Prior(np.empty(0), np.empty((0, 0)))
     posed = fit_cloud(rest, start, prior, config.refine_sigma, config.refine_steps, 0.0)
     return Judged.of(rest, posed)
+
+
+def of_rest(problem: Problem, found: Correspondences) -> Problem:
+    """The problem of the rest model's pose alone."""
+    model = problem.model
+    rigid = model.around(model.rest_points, np.zeros((len(model.rest_points), 3, 0), dtype=np.float32))
+    return replace(problem, model=rigid, network=NetworkTerm.of(rigid, found))
 
 
 def is_at_rest(problem: Problem, modes: Judged, rest: Judged) -> bool:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from mereo.fitting.config import FitChoice
 from mereo.fitting.fit import ModesFit
 from mereo.fitting.readings import FittedFrame, fitted_frame
+from mereo.fitting.recognition import NOT_ASKED, Recognition, recognize, recognized
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
 from mereo.fitting.track_config import TrackConfig
@@ -41,6 +42,7 @@ class Followed:
         T_camera_input: from the input's frame to the camera frame.
         seconds: of the whole answer.
         refusal: why no registration was found.
+        recognition: whether the frame shows the object, in a state that was learned.
     """
 
     registration: Registration | None
@@ -50,6 +52,7 @@ class Followed:
     T_camera_input: Float[np.ndarray, "4 4"]
     seconds: float
     refusal: str | None = None
+    recognition: Recognition = NOT_ASKED
 
     def __repr__(self) -> str:
         told = "no registration" if self.registration is None else self.registration.told
@@ -78,7 +81,9 @@ class Tracker:
     """
 
     def __init__(self, registrar: Registrar, config: TrackConfig = TrackConfig()) -> None:  # noqa: B008 (frozen)
-        self.registrar, self.config = registrar, config
+        # a frame that nobody understands comes 30 times a second while the object is away
+        self.registrar = registrar.at_once
+        self.config = config
         self.forget()
 
     @classmethod
@@ -101,6 +106,7 @@ class Tracker:
         scene_unit: float | None = None,
         stated_unit: float | None = None,
         keep_all: bool = False,
+        unit_assumed: bool = False,
     ) -> Followed:
         """Answer to the next frame.
 
@@ -111,15 +117,17 @@ class Tracker:
             scene_unit: length of a scene unit in the cloud's unit, where it is known.
             stated_unit: the same as the input states it (``Registrar.stated_unit``).
             keep_all: drop no strays.
+            unit_assumed: ``stated_unit`` is only assumed, see ``mereo.fitting.answer.answer``.
 
         Raises ``ValueError`` for unusable clouds and, unless the registrar's choice is "auto", where a frame that is
         fitted by itself finds too little. The track is kept: the object may come again.
         """
         started = time.perf_counter()
+        compared = None if unit_assumed else stated_unit
         seen = as_cloud(cloud if isinstance(cloud, PointCloud) else np.asarray(cloud, dtype=np.float64))
         tracked = self._tracked(seen, time_s, axes, keep_all)
         if tracked is not None and self._believed(tracked):
-            return self._gone_on(tracked, started)
+            return self._gone_on(tracked, started, compared)
         asked = fitted_frame(seen, self.registrar.network, self.registrar, axes, scene_unit, stated_unit, keep_all)
         if asked.modes is None and tracked is None and self.registrar.choice != "auto":
             assert asked.error is not None
@@ -130,8 +138,8 @@ class Tracker:
             and self._takes(tracked)
             and (own is None or own.score <= tracked.score + self.config.margin)
         ):
-            return self._gone_on(tracked, started, restart=True)
-        return self._begun(asked, own, axes, started)
+            return self._gone_on(tracked, started, compared, restart=True)
+        return self._begun(asked, own, axes, started, compared)
 
     def _tracked(self, seen: PointCloud, time_s: float, axes: CloudAxes, keep_all: bool) -> "_Candidate | None":
         """The frame fitted from the last state; None without one that leads here."""
@@ -152,13 +160,24 @@ class Tracker:
     def _takes(self, candidate: "_Candidate") -> bool:
         return self.registrar.takes(candidate.registration)
 
-    def _gone_on(self, tracked: "_Candidate", started: float, restart: bool = False) -> Followed:
+    def _gone_on(
+        self, tracked: "_Candidate", started: float, stated_unit: float | None, restart: bool = False
+    ) -> Followed:
         self._track = tracked.track
         self._best = tracked.score if restart else max(self._best, tracked.score)
+        known = recognize(tracked.registration, self.registrar.network.calibration, stated_unit=stated_unit)
         seconds = time.perf_counter() - started
-        return Followed(tracked.registration, True, None, tracked.reading, self._T_camera_input, seconds)
+        T_camera_input = self._T_camera_input
+        return Followed(tracked.registration, True, None, tracked.reading, T_camera_input, seconds, recognition=known)
 
-    def _begun(self, asked: FittedFrame, own: "_Candidate | None", axes: CloudAxes, started: float) -> Followed:
+    def _begun(
+        self,
+        asked: FittedFrame,
+        own: "_Candidate | None",
+        axes: CloudAxes,
+        started: float,
+        stated_unit: float | None,
+    ) -> Followed:
         """Answer of a frame by itself; the track begins with it, or ends where it is not believed."""
         taken = own is not None and self._takes(own)
         self._track = own.track if own is not None and taken else None
@@ -167,8 +186,9 @@ class Tracker:
         registration = None if own is None else own.registration
         reading = asked.reading if taken else asked.unaided.reading
         refusal = None if asked.error is None else str(asked.error)
+        known = recognized(asked, registration, self.registrar.network, stated_unit)
         seconds = time.perf_counter() - started
-        return Followed(registration, taken, asked, reading, asked.seen.T_camera_input, seconds, refusal)
+        return Followed(registration, taken, asked, reading, asked.seen.T_camera_input, seconds, refusal, known)
 
 
 @dataclass(frozen=True, eq=False)

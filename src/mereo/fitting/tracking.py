@@ -37,6 +37,7 @@ class Track:
         time_s: of the frame.
         velocity: of the parameters, in the order of ``gauss_newton``, a second.
         unsure: how far the velocity may be off because little is known yet, scene units per second.
+        radius_scale: as ``ModesFit`` has it.
     """
 
     problem: Problem
@@ -45,6 +46,7 @@ class Track:
     time_s: float
     velocity: Float[np.ndarray, " p"]
     unsure: float
+    radius_scale: float | None = None
 
     @classmethod
     def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig) -> "Track":
@@ -54,7 +56,8 @@ class Track:
         scale_std = KNOWN_SCALE_STD if base.scale_std == KNOWN_SCALE_STD else config.scale_std
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
         share_surfaces(base, problem)
-        return cls(problem, fitted.unit * scale, posed, time_s, np.zeros(POSE + model.count), config.first_speed)
+        still = np.zeros(POSE + model.count)
+        return cls(problem, fitted.unit * scale, posed, time_s, still, config.first_speed, fitted.radius_scale)
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
@@ -107,7 +110,8 @@ def next_fit(
         start = track.expected(time_s, config)
         passed = max(time_s - track.time_s, 0.0)
         posed = descend(problem, start, Expectation.of(track, start, passed, config), config)
-    fitted = ModesFit(problem, nothing(), track.unit, posed, time.perf_counter() - started)
+    seconds = time.perf_counter() - started
+    fitted = ModesFit(problem, nothing(), track.unit, posed, seconds, radius_scale=track.radius_scale)
     return fitted, followed(track, fitted, time_s, config)
 
 
@@ -117,7 +121,7 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     passed = max(time_s - track.time_s, 1e-3)
     velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
     unsure = track.unsure * (1 - config.smoothing)
-    return Track(fitted.problem, track.unit * scale, posed, time_s, velocity, unsure)
+    return Track(fitted.problem, track.unit * scale, posed, time_s, velocity, unsure, track.radius_scale)
 
 
 def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:

@@ -6,13 +6,13 @@ The plan is written down once it is made, so the same command continues where it
 """
 
 import json
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mereo.evaluation.calibrate import LEAST_VIEWS, VIEWS, calibrate
 from mereo.evaluation.scoring import evaluate
 from mereo.evaluation.tables import read_metrics
 from mereo.io.atomic_files import atomic_file, write_json
@@ -24,7 +24,7 @@ from mereo.learning.object_files import SCENE, check, names_scene, scene_for
 from mereo.learning.outcome import show_outcome
 from mereo.learning.probe import MADE_AS, measure
 from mereo.learning.schedule import OFFSET_EXAMPLES, Plan, Rates, epochs_for, holdout, plan_for, views_for
-from mereo.models.weights import WEIGHTS, find_weights, load_model
+from mereo.models.weights import WEIGHTS, find_weights, load_model, with_calibration
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.shards import generate
@@ -45,6 +45,9 @@ COMPILED_FROM_MIN = 60.0
 
 CHECKPOINT_S = 60.0
 """Seconds between checkpoints: what a stopped run loses at most."""
+
+CALIBRATION_SHARE = 0.25
+"""Of the time for the scores: what is then said of them, and of every later frame, rests on it."""
 
 TIMED = 2
 """Test views that are timed, to know how many there is time for."""
@@ -116,11 +119,13 @@ def learn(
         4, f"train from the weights of {plan.init}, {plan.epochs:.1f} passes, about {_duration(plan.training_s)}"
     )
     weights = train(output / DATA, output / RUN, trained(recipe, plan), checkpoint_every_s=CHECKPOINT_S)
-    with atomic_file(output / WEIGHTS) as partial:
-        shutil.copyfile(weights, partial)
-    clock.stage(5, "evaluate on views that training has not seen")
-    if not (output / TEST / MARKER).is_file():
-        _evaluate(output, scene, max(clock.left_s, plan.evaluation_s))
+    clock.stage(5, "calibrate, and evaluate on views that training has not seen")
+    evaluated = (output / TEST / MARKER).is_file()
+    if not evaluated or not (output / WEIGHTS).is_file():
+        left_s = max(clock.left_s, plan.evaluation_s)
+        each_s = _calibrated(weights, output, scene, left_s)
+        if not evaluated:
+            _evaluate(output, scene, max(clock.left_s, (1 - CALIBRATION_SHARE) * plan.evaluation_s), each_s)
     text = write_example_frame(loaded, output / FRAME)
     metrics = read_metrics(output / TEST / "metrics.json")
     show_outcome(metrics, output, scene, text, minutes, (time.monotonic() - clock.started) / 60)
@@ -195,13 +200,22 @@ def _revised(output: Path, plan: Plan, clock: Clock, batch: int) -> Plan:
     return plan
 
 
-def _evaluate(output: Path, scene: str, left_s: float) -> None:
-    """Score the weights on as many views as there is time for."""
+def _calibrated(weights: Path, output: Path, scene: str, left_s: float) -> float:
+    """Put the weights of the run, calibrated, into the folder; returns the seconds that a test view takes."""
     started = time.monotonic()
-    evaluate(load_model(output / WEIGHTS), scene, examples=TIMED, seed=TEST_SEED_START)
-    used_s = time.monotonic() - started
-    tests = views_for(left_s - used_s, used_s / TIMED)
-    evaluate_weights(output / WEIGHTS, output / TEST, examples=tests, scene=scene)
+    evaluate(load_model(weights), scene, examples=TIMED, seed=TEST_SEED_START)
+    each_s = (time.monotonic() - started) / TIMED
+    views = min(max(views_for(CALIBRATION_SHARE * left_s, each_s), LEAST_VIEWS), VIEWS)
+    # other things than the object would take as long again, and only place the second limit of recognition
+    found = calibrate(load_model(weights), scene, views=views, strangers=False, quiet=False)
+    with atomic_file(output / WEIGHTS) as partial:
+        partial.write_bytes(with_calibration(weights, found))
+    return each_s
+
+
+def _evaluate(output: Path, scene: str, left_s: float, each_s: float) -> None:
+    """Score the weights on as many views as there is time for."""
+    evaluate_weights(output / WEIGHTS, output / TEST, examples=views_for(left_s, each_s), scene=scene)
 
 
 def _duration(seconds: float) -> str:

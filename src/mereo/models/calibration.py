@@ -1,10 +1,49 @@
 """Calibration of weights: what was measured, on training seeds, of how far their answers can be trusted."""
 
-from typing import Annotated
+from functools import lru_cache
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import BaseModel, Field, FiniteFloat, model_validator
+from torch import Tensor
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+SignName = Literal["size", "unexplained", "ruled_out", "beyond", "unusual", "displaced"]
+"""Signs that a frame does not show the object in a state that was learned; ``mereo.fitting.recognition`` tells them."""
+
+
+class Usual(BaseModel, frozen=True):
+    """Usual logarithm of a sign in views of the object: its mean and its standard deviation."""
+
+    mean: FiniteFloat
+    std: Positive
+
+
+class Recognizing(BaseModel, frozen=True):
+    """What tells the object in learned states from other things and states (``mereo.fitting.recognition``).
+
+    Attributes:
+        clean: usual signs of views without noise beyond the paper's.
+        noisy: the same of simulated depth cameras' views.
+        unsure: strangeness up to which the object is known.
+        refused: strangeness from which on it is not.
+    """
+
+    clean: dict[SignName, Usual]
+    noisy: dict[SignName, Usual]
+    unsure: Positive
+    refused: Positive
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Recognizing":
+        if self.unsure >= self.refused:
+            raise ValueError(f"the limits are {self.unsure:g} and {self.refused:g}; the first must be the smaller")
+        return self
 
 
 class Calibration(BaseModel, frozen=True):
@@ -15,8 +54,39 @@ class Calibration(BaseModel, frozen=True):
         views: how many of them.
         radius_scale: factor between the radius that a fit's posterior gives for 95 % and the one that held 95 % of the
             true positions.
+        temperature: by which logits are divided before they become probabilities (temperature scaling; Guo et al.,
+            ICML 2017).
+        biases: added to the divided logits of empty space and each segment (with the temperature: vector scaling, but
+            for one temperature of all classes); None where the temperature does alone. Labels do not depend on either.
+        ece: expected calibration error of the probabilities as the network gives them, and as they are calibrated.
+        recognizing: what tells the object in learned states from other things and states.
     """
 
     seed: Annotated[int, Field(ge=0)]
     views: Annotated[int, Field(ge=1)]
     radius_scale: Positive | None = None
+    temperature: Positive | None = None
+    biases: tuple[FiniteFloat, ...] | None = None
+    ece: tuple[Share, Share] | None = None
+    recognizing: Recognizing | None = None
+
+    def scaled(self, logits: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
+        """Logits divided by the temperature, plus the biases; as they are where there is no temperature.
+
+        Only probabilities are made of them. Labels are decided by the logits as they are, whose class offsets (logit
+        adjustment, ``training.logit_adjustment``) serve the mIoU.
+        """
+        if self.temperature is None:
+            return logits
+        divided = logits.float() / self.temperature
+        return divided if self.biases is None else divided + _on_device(self.biases, logits.device)
+
+    def scaled_array(self, logits: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
+        """``scaled`` of logits that have left their device."""
+        return self.scaled(torch.from_numpy(logits)).numpy()
+
+
+@lru_cache(maxsize=16)
+def _on_device(biases: tuple[float, ...], device: torch.device) -> Float[Tensor, " c"]:
+    """Biases, made once: an upload for every chunk of queries would wait for the device."""
+    return torch.tensor(biases, device=device)

@@ -18,6 +18,7 @@ from mereo.models.config import HEADS, NetworkConfig
 from mereo.models.device import exact
 from mereo.models.encoders.encoding import Encoding, Level
 from mereo.models.ops.neighbors import gather, nearest
+from mereo.models.ops.products import linear
 from mereo.models.rigid_alignment import Alignment
 from mereo.models.template_lookup import RestLookup
 
@@ -216,11 +217,11 @@ def joint_linear(
     joined = torch.cat(list(rows), dim=-1) if len(rows) > 1 else rows[0]
     bias = layers[0].bias
     if latent is None:
-        return nn.functional.linear(joined, weight, bias)
+        return linear(joined, weight, bias)
     shift = latent if bias is None else latent + bias
     if len(shift) == 1:
-        return nn.functional.linear(joined, weight, shift[0])
-    return nn.functional.linear(joined, weight) + shift[:, None]
+        return linear(joined, weight, shift[0])
+    return linear(joined, weight) + shift[:, None]
 
 
 class Decoder(ConditionedMLP):

@@ -35,7 +35,7 @@ SURE_LOGIT = 20.0
 DENSE_FACTOR = 8
 """Density, relative to the network's input, above which clouds are thinned at random: ordering all is quadratic."""
 
-CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 4096, 65536
+CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 2048, 65536
 """Numbers of queries at once. On a CPU small chunks stay in cache and reuse their memory: half the time of 32768."""
 
 Vector = tuple[float, float, float]
@@ -67,7 +67,8 @@ class Answer:
 
     Attributes:
         label: 0 for empty space, i + 1 for the model's segment i.
-        probability: of empty space and each segment; rows sum to one.
+        probability: of empty space and each segment; rows sum to one. Calibrated where ``Model.calibrates``: another
+            class than the label, which is decided without that, may then have a greater one.
         distance: to the nearest segment surface, negative inside; NaN from a model that was not trained on distances.
         direction: unit vector towards it; NaN from a model that was not trained on directions.
     """
@@ -178,13 +179,14 @@ class Model:
     def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
         """Segment, probabilities, signed distance and direction at each point."""
 
-        def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             logits, distance, direction = self.respond(prediction, queries)
-            return logits.softmax(dim=-1), distance, direction
+            scaled = logits if self.calibration is None else self.calibration.scaled(logits)
+            return logits.argmax(dim=-1).to(torch.uint8), scaled.softmax(dim=-1), distance, direction
 
-        probability, distance, direction = self._chunked(code, points, answer)
+        label, probability, distance, direction = self._chunked(code, points, answer)
         return Answer(
-            label=probability.argmax(axis=-1).astype(np.uint8),
+            label=label,
             probability=probability,
             distance=distance / np.float32(code.normalizer.scale),
             direction=direction,
@@ -194,6 +196,11 @@ class Model:
         """Class logits at each point, without the rest of the answer: what surface extraction needs."""
         return self._chunked(code, points, lambda *found: (self.class_logits(*found),))[0]
 
+    @property
+    def calibrates(self) -> bool:
+        """Whether probabilities are calibrated: by the temperature, and biases, of the weights' calibration."""
+        return self.calibration is not None and self.calibration.temperature is not None
+
     def rest(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"] | None:
         """Rest coordinates of each point (``scenes.rest_pose``); None from a model without template."""
         found = self.correspond(code, points)
@@ -202,7 +209,7 @@ class Model:
     def correspond(
         self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n c"], Float[np.ndarray, "n 3"]] | None:
-        """Class probabilities and rest coordinates of each point in one pass; None from a model without template."""
+        """Class probabilities, not calibrated, and rest coordinates of points; None from a model without template."""
         if self.network.decoder.lookup is None:
             return None
 

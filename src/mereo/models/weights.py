@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mereo.io.atomic_files import atomic_file
 from mereo.io.errors import reason
+from mereo.models.calibration import Calibration
 from mereo.models.config import InferenceConfig
 from mereo.models.device import find_device
 from mereo.models.encoders.autodecoder import CODES
@@ -68,6 +69,29 @@ def weights_bytes(model: Model, dtype: torch.dtype = torch.float32) -> bytes:
     }
     tensors |= {STATES + name: torch.from_numpy(value) for name, value in states.items()}
     return save(tensors, metadata={"mereo": json.dumps(header)})
+
+
+def with_calibration(name: str | Path, calibration: Calibration) -> bytes:
+    """Content of a file of weights with another calibration; all else in it stays, bit for bit.
+
+    Raises as ``load_model`` does for a file that is none.
+    """
+    path = find_weights(name)
+    tensors, metadata = _read(path)
+    read_header(path, metadata)
+    header = json.loads(metadata["mereo"]) | {"calibration": calibration.model_dump(exclude_none=True)}
+    return save(tensors, metadata={**metadata, "mereo": json.dumps(header)})
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file; ``ValueError`` for another file."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {key: file.get_tensor(key) for key in file.keys()}, file.metadata() or {}  # noqa: SIM118 (no mapping)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(
+            f"{path} is not a safetensors file ({reason(error)}); give the weights written by mereo train"
+        ) from None
 
 
 def _stored(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
@@ -141,14 +165,7 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
     Raises ``FileNotFoundError`` for unknown names, ``ValueError`` when it is not weights of this version.
     """
     path = find_weights(name)
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, OSError) as error:
-        raise ValueError(
-            f"{path} is not a safetensors file ({reason(error)}); give the weights written by mereo train"
-        ) from None
+    tensors, metadata = _read(path)
     header = read_header(path, metadata)
     states = {key.removeprefix(STATES): tensors.pop(key).numpy() for key in list(tensors) if key.startswith(STATES)}
     config = read_config(path, header)

@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 from torch import Tensor
 
 from mereo.models.calibration import Calibration
-from mereo.models.config import Loss, NetworkConfig
+from mereo.models.config import Loss, NetworkConfig, Supervision
 from mereo.models.network import Network
 
 FORMAT_VERSION = 3
@@ -78,7 +78,19 @@ def read_header(path: Path, metadata: Mapping[str, str]) -> Header:
             f"{path} has a header whose names ({', '.join(header.names)}), {len(header.colors)} colours and nested "
             f"segments disagree; {CURE}"
         )
+    _check_biases(path, header)
     return header
+
+
+def _check_biases(path: Path, header: Header) -> None:
+    """Raise ``ValueError`` for a calibration of other classes than the network tells apart."""
+    biases = None if header.calibration is None else header.calibration.biases
+    classes = 1 + (len(header.names) if Supervision.of(header.loss).labels else 1)
+    if biases is not None and len(biases) != classes:
+        raise ValueError(
+            f"{path} has a calibration with {len(biases)} biases, and {classes} classes; calibrate it again with "
+            "`mereo calibrate`"
+        )
 
 
 def _checked(path: Path, model: type[Checked], content: Any, *within: str) -> Checked:

@@ -49,6 +49,7 @@ class Reconstruction:
         T_camera_input: from the input's frame to the camera frame.
         reading: which of the input's points are taken for the object's; the others were dropped as strays.
         observed: the segment of each of these points, where it was asked for.
+        calibrated: whether confidences and probabilities are calibrated (``Model.calibrates``).
     """
 
     surfaces: SegmentedMesh
@@ -61,6 +62,7 @@ class Reconstruction:
     T_camera_input: Float[np.ndarray, "4 4"]
     reading: Reading
     observed: SegmentedCloud | None = None
+    calibrated: bool = False
 
     @property
     def seconds(self) -> float:
@@ -158,7 +160,7 @@ def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_point
     observed = None
     if label_points:
         with timed(seconds, "points"):
-            observed = segment_points(field(seen.seen.points), seen.points, names, colors)
+            observed = segment_points(field(seen.seen.points), seen.points, names, colors, model.calibration)
     result = Reconstruction(
         surfaces=found.surfaces,
         labels=found.grid,
@@ -170,6 +172,7 @@ def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_point
         T_camera_input=seen.T_camera_input,
         reading=seen.reading,
         observed=observed,
+        calibrated=model.calibrates,
     )
     return result if seen.axes == "camera" else turned_back(result)
 

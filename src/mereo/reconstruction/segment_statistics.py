@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from scipy import ndimage
 from scipy.special import expit, logsumexp, softmax
 
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color, Segment
+from mereo.models.calibration import Calibration
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.isosurfaces import Extraction
 
@@ -50,21 +51,27 @@ def segment_points(
     points: Float[np.ndarray, "n 3"],
     names: tuple[str, ...],
     colors: tuple[Color, ...],
+    calibration: Calibration | None = None,
+    labels: UInt8[np.ndarray, " n"] | None = None,
 ) -> SegmentedCloud:
-    """Segment of each point from the model's logits there.
+    """Segment of each point from the model's logits there, and the model's probability of it.
 
     Args:
         logits: of empty space and each segment.
         points: in the input's frame and unit.
         names: of the segments.
         colors: of the segments.
+        calibration: of the weights, by which probabilities are made of logits; labels do not depend on it.
+        labels: of the points, 1 or more, where another than the network says them.
     """
-    parts = logits[:, 1:].astype(np.float64)
+    labels = (logits[:, 1:].argmax(axis=1) + 1).astype(np.uint8) if labels is None else labels
+    scaled = logits if calibration is None else calibration.scaled_array(logits)
+    parts = scaled[:, 1:].astype(np.float64)
     return SegmentedCloud(
         points=points,
-        labels=(parts.argmax(axis=1) + 1).astype(np.uint8),
-        confidence=softmax(parts, axis=1).max(axis=1),
-        occupancy=expit(logsumexp(parts, axis=1) - logits[:, 0]),
+        labels=labels,
+        confidence=np.take_along_axis(softmax(parts, axis=1), labels[:, None].astype(np.int64) - 1, axis=1)[:, 0],
+        occupancy=expit(logsumexp(parts, axis=1) - scaled[:, 0]),
         names=names,
         colors=colors,
     )

@@ -83,6 +83,7 @@ def answer(
         scene_unit,
         None if registrar is None or not stated else registrar.stated_unit(seen.frame.unit_m),
         keep_all=isolation is not None and isolation.keep_all,
+        unit_assumed=not seen.frame.unit_stated,
     )
     result = Result.of(found, seen, network, registrar, resolution, stated)
     warning = size_warning(result.seen, network.provenance) if stated else None

@@ -15,6 +15,7 @@ from jaxtyping import Int
 from PIL import Image
 
 from mereo.evaluation.metrics import format_score
+from mereo.evaluation.tables import coverage_line
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
 from mereo.visualization.reconstruction_report import BUDGET_BYTES
@@ -40,6 +41,8 @@ th:first-child, td:first-child { text-align: left; padding-left: 0; }
 .bar i { display: block; height: 100%; background: rgb(var(--accent)); }
 .long { max-height: 360px; overflow: auto; } .cm td { text-align: center; } .cm td:first-child { text-align: left; }
 img { width: 100%; border-radius: 8px; background: #fff; display: block; }
+.rel { width: min(100%, 320px); } .rel rect { fill: none; stroke: var(--line); } .rel line { stroke: var(--soft); stroke-dasharray: 5 5; }
+.rel polyline { fill: none; stroke: rgb(var(--accent)); stroke-width: 2; } .rel circle { fill: rgb(var(--accent) / .45); }
 footer { color: var(--soft); font-size: 13px; }
 """  # noqa: E501 (lines of CSS)
 
@@ -62,7 +65,7 @@ def write_evaluation_report(
     """
     names, mean = tuple(metrics["per_segment"]), metrics["example_mean"]
     title = " on ".join(str(metrics[key]) for key in ("weights", "scene") if key in metrics) or "mereo evaluation"
-    told = {"iou", "miou", "definition"}
+    told = {"iou", "miou", "definition", "ece", "calibrated"}
     facts = {k: v for k, v in metrics.items() if isinstance(v, str | int | float) and k not in told}
     shown = [f"{key.replace('_', ' ')}: {value}" for key, value in facts.items()]
     text = "".join(
@@ -70,8 +73,10 @@ def write_evaluation_report(
             f"<h1>{escape(title)}</h1>",
             f"<p>{escape('  ·  '.join(shown))}</p>",
             _overall(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]),
+            _coverage(metrics.get("coverage95")),
             f'<div class="pair">{_segments(metrics["per_segment"], colors)}{_examples(metrics["per_example"])}</div>',
             _confusion(("empty", *names), metrics["confusion"]),
+            _reliability(metrics.get("reliability") or [], metrics.get("ece"), metrics.get("calibrated") is True),
         )
     )
     words = escape(str(metrics.get("definition", "")))
@@ -98,6 +103,11 @@ def _overall(*figures: float) -> str:
     return f'<section><div class="big">{shown}</div></section>'
 
 
+def _coverage(found: Mapping[str, Any] | None) -> str:
+    """How often true places lie within the radii that a registration gives."""
+    return "" if found is None else f"<section><h2>How sure</h2>{escape(coverage_line(found))}</section>"
+
+
 def _segments(per_segment: Mapping[str, float], colors: Sequence[Color]) -> str:
     rows = "".join(
         f'<tr><td><span class="swatch" style="background:rgb{tuple(color)}"></span>{escape(name)}</td>'
@@ -121,6 +131,32 @@ def _confusion(classes: Sequence[str], confusion: Int[np.ndarray, "c c"]) -> str
     )
     title = "<h2>Confusion: rows are the true class, columns the predicted one, % of the true class</h2>"
     return f'<section class="cm">{title}<table><tr><th></th>{head}<th>points</th></tr>{rows}</table></section>'
+
+
+def _reliability(bins: Sequence[Mapping[str, float]], ece: float | None, calibrated: bool) -> str:
+    """Reliability diagram of the network's probabilities: share of right answers over confidence, and the diagonal."""
+    if not bins:
+        return ""
+    side = 260
+    points = " ".join(f"{side * b['confidence']:.1f},{side * (1 - b['right']):.1f}" for b in bins)
+    dots = "".join(
+        f'<circle cx="{side * b["confidence"]:.1f}" cy="{side * (1 - b["right"]):.1f}" '
+        f'r="{2 + 8 * b["share"] ** 0.5:.1f}"><title>{_percent(b["share"])} % of the cells: confidence '
+        f"{b['confidence']:.2f}, right {b['right']:.2f}</title></circle>"
+        for b in bins
+    )
+    svg = (
+        f'<svg class="rel" viewBox="-12 -12 {side + 24} {side + 24}" role="img" '
+        f'aria-label="share of right answers over confidence"><rect width="{side}" height="{side}"/>'
+        f'<line x1="0" y1="{side}" x2="{side}" y2="0"/>'
+        f'<polyline points="{points}"/>{dots}</svg>'
+    )
+    kind = "calibrated" if calibrated else "not calibrated"
+    return (
+        f"<section><h2>Reliability of the network's probabilities ({kind})</h2><p>Expected calibration error "
+        f"{format_score(ece, DASH)}. Across: confidence in a cell's label, 0 to 1; up: share of these that are right; "
+        f"a point's size: how many cells. On the diagonal it is as often right as it says.</p>{svg}</section>"
+    )
 
 
 def _examples(per_example: Mapping[str, Mapping[str, float]]) -> str:

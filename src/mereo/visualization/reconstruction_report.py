@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt16
 
+from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, OUTER_OPACITY
 from mereo.visualization.report_words import page_words
+from mereo.visualization.sure_colors import SureColors, sure_colors
 from mereo.visualization.units import UNKNOWN, Unit
 
 BUDGET_BYTES = 5_000_000
@@ -41,6 +43,7 @@ def write_report(
     summary: dict[str, Any],
     frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
     unit: Unit = UNKNOWN,
+    registered: Registration | None = None,
 ) -> None:
     """Write the page of a reconstruction.
 
@@ -54,11 +57,13 @@ def write_report(
             maps stages to seconds; of the other texts and numbers those for people are listed (``report_words``).
         frame_rotation: rotation from the input's frame to the viewer's (x right, y up, z toward the viewer).
         unit: of the cloud's lengths; the page has millimetres and cubic centimetres where it is known.
+        registered: the model that the last of ``surfaces`` are, in the cloud's frame, to show how sure they are.
 
     Raises ``ValueError`` when the page cannot be brought under the budget.
     """
     page = files("mereo.visualization").joinpath("report.html").read_text(encoding="utf-8")
-    data = _page_data(cloud, surfaces, page_words(summary, unit), np.asarray(frame_rotation))
+    sure = None if registered is None else sure_colors(registered, unit)
+    data = _page_data(cloud, surfaces, page_words(summary, unit), np.asarray(frame_rotation), sure)
     # "</script>" inside a name must not end the script; \u003c is the same character to JSON
     text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
     title = data["words"]["title"]
@@ -71,12 +76,17 @@ def write_report(
 
 
 def _page_data(
-    cloud: PointCloud, surfaces: SegmentedMesh, words: dict[str, Any], rotation: Float[np.ndarray, "3 3"]
+    cloud: PointCloud,
+    surfaces: SegmentedMesh,
+    words: dict[str, Any],
+    rotation: Float[np.ndarray, "3 3"],
+    sure: SureColors | None,
 ) -> dict[str, Any]:
     points = _thin(cloud.points)
     low, high = _joint_bounds(points, surfaces)
+    marks = None if sure is None else sure.of_points(points)
     # binary room: the page's text takes the rest; base64 grows data by a third
-    room = int((BUDGET_BYTES - 300_000 - len(json.dumps(words))) * 3 / 4) - 6 * len(points)
+    room = int((BUDGET_BYTES - 300_000 - len(json.dumps(words))) * 3 / 4) - (6 + len(marks or ())) * len(points)
     shown = _fit(surfaces, float((high - low).max()), room)
     return {
         "low": low.tolist(),
@@ -91,11 +101,13 @@ def _page_data(
                 "faces": len(full.faces),
                 "positions": _base64(_quantize(part.vertices, low, high)),
                 "indices": _base64(part.faces.astype("<u4")),
+                "sure": None if sure is None else sure.of_surface(part),
             }
             for full, part, opaque in zip(surfaces.segments, shown, surfaces.opaque, strict=True)
         ],
         "coarsened": any(len(a.faces) != len(b.faces) for a, b in zip(surfaces.segments, shown, strict=True)),
         "words": words,
+        "sure": None if sure is None else sure.page_data(marks),
     }
 
 
@@ -125,7 +137,7 @@ def _base64(array: np.ndarray) -> str:
 def _fit(surfaces: SegmentedMesh, extent: float, room_bytes: int) -> list[Segment]:
     """The segments, coarsened together until they take at most ``room_bytes``."""
     shown, cells = list(surfaces.segments), 400.0
-    while (size := sum(6 * len(s.vertices) + 12 * len(s.faces) for s in shown)) > room_bytes and cells > 4:
+    while (size := sum(7 * len(s.vertices) + 12 * len(s.faces) for s in shown)) > room_bytes and cells > 4:
         shown = [cluster(segment, extent / cells) for segment in surfaces.segments]
         # a surface meets about cells^2 cells of the grid; the factor keeps the last steps from crawling
         cells *= min(0.95, max(0.5, (max(room_bytes, 0) / size) ** 0.5))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mereo.fitting.recognition import told_of
 from mereo.visualization.units import Unit, rounded
 
 STAGES = {
@@ -23,7 +24,19 @@ STAGES = {
 """What each stage of ``timings_s`` does; another one keeps its name."""
 
 SAID_ELSEWHERE = frozenset(
-    {"title", "unit", "unit_m", "source", "frame", "points", "segments", "nested", "timings_s", "registration"}
+    {
+        "title",
+        "radius95",
+        "unit",
+        "unit_m",
+        "source",
+        "frame",
+        "points",
+        "segments",
+        "nested",
+        "timings_s",
+        "registration",
+    }
 )
 """Keys of a summary that the page shows in another place, or that its units say."""
 
@@ -33,6 +46,11 @@ FOR_PROGRAMS = frozenset({"precision", "evaluated_points", "depth_m", "visible_s
 DEVICES = {"cpu": "the processor", "cuda": "the GPU"}
 DASH, GAP = "\N{EN DASH}", 3 * "\N{NO-BREAK SPACE}"
 """For what there is no number of; between coordinates, which have commas at their thousands."""
+
+
+def confidence_title(calibrated: bool) -> str:
+    """Head of a column of confidences."""
+    return "confidence" if calibrated else "confidence, not calibrated"
 
 
 def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
@@ -46,16 +64,25 @@ def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
     volume and confidence of each segment; confidence is None where there is none), ``weights`` (their name) and
     ``timings_s``, seconds of each stage in words.
     """
+    title = confidence_title(summary.get("calibrated") is True)
     times = {name: _number(seconds) for name, seconds in dict(summary.get("timings_s") or {}).items()}
     return {
         "title": str(summary.get("title", "mereo reconstruction")),
         "facts": _facts(summary, unit),
         "warnings": _warnings(summary),
-        "heads": ["segment", f"centre x, y, z ({unit.length_name})", f"volume ({unit.volume_name})", "confidence"],
+        "heads": _heads(summary, unit, title),
         "rows": [_row(told, unit) for told in summary.get("segments") or ()],
         "weights": str(summary.get("weights") or ""),
         "timings_s": {STAGES.get(name, _plain(name)): value for name, value in times.items() if value is not None},
     }
+
+
+def _heads(summary: Mapping[str, Any], unit: Unit, confidence: str) -> list[str]:
+    """Heads of the table; with radii of 95 % its centres and volumes say how sure they are."""
+    sure = isinstance(summary.get("radius95"), Mapping)
+    centre, volume = (", ± 95 %", " and 95 % of it") if sure else ("", "")
+    heads = [f"centre x, y, z{centre} ({unit.length_name})", f"volume{volume} ({unit.volume_name})"]
+    return ["segment", *heads, confidence]
 
 
 def _facts(summary: Mapping[str, Any], unit: Unit) -> list[str]:
@@ -64,16 +91,24 @@ def _facts(summary: Mapping[str, Any], unit: Unit) -> list[str]:
     source, spacing = summary.get("source"), _number(summary.get("spacing"))
     if source is not None and str(source) != str(summary.get("title")):
         facts.append(f"from {source}")
+    if isinstance(summary.get("radius95"), Mapping):
+        facts.append(_sure(summary["radius95"], unit))
     if spacing is not None:
         facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
     if summary.get("device"):
         facts.append(f"computed on {DEVICES.get(str(summary['device']), str(summary['device']))}")
-    said = SAID_ELSEWHERE | FOR_PROGRAMS | {"weights", "spacing", "device", "resolution", "clipped"}
+    said = SAID_ELSEWHERE | FOR_PROGRAMS | {"weights", "spacing", "device", "resolution", "clipped", "calibrated"}
     for key, value in summary.items():
         number = None if isinstance(value, bool) else _number(value)
         if key not in said and (number is not None or isinstance(value, str)):
             facts.append(f"{_plain(key)}: {value if number is None else rounded(number)}")
     return facts
+
+
+def _sure(radius95: Mapping[str, Any], unit: Unit) -> str:
+    middle, most = (rounded(float(radius95[key]) * unit.length_factor) for key in ("median", "max"))
+    how = "" if radius95.get("calibrated") else ", not calibrated"
+    return f"surface within {middle} {unit.length_name} in the median, {most} at most (95 %{how})"
 
 
 def _answer(registration: Mapping[str, Any]) -> str:
@@ -87,7 +122,11 @@ def _warnings(summary: Mapping[str, Any]) -> list[str]:
     """Sentences on why the result may not be what it seems."""
     registration = summary.get("registration")
     told = registration if isinstance(registration, Mapping) else {}
-    warnings = [str(told[key]) for key in ("refusal", "doubt") if told.get(key)]
+    warnings = [str(told["refusal"])] if told.get("refusal") else []
+    recognition = summary.get("recognition")
+    known = recognition if isinstance(recognition, Mapping) else {}
+    if known.get("reason") and known.get("signs"):  # without signs nobody was asked, or the refusal has said it
+        warnings.append(told_of(known["known"], str(known["reason"])))
     if summary.get("clipped"):
         warnings.append("the object reaches the border of the volume that was searched and may be cut off there")
     return [text[0].upper() + text[1:] + ("" if text.endswith(".") else ".") for text in warnings]
@@ -96,7 +135,10 @@ def _warnings(summary: Mapping[str, Any]) -> list[str]:
 def _row(told: Mapping[str, Any], unit: Unit) -> list[Any]:
     centre, volume = told.get("centroid"), _number(told.get("volume"))
     place: Sequence[str] = [] if centre is None else unit.place(np.asarray(centre, dtype=float)).split()
-    words = [GAP.join(place) or DASH, DASH if volume is None else unit.volume(volume)]
+    radius, between = _number(told.get("centroid_radius95")), told.get("volume95")
+    off = "" if radius is None else f"{GAP}± {rounded(radius * unit.length_factor)}"
+    span = "" if between is None else f"{GAP}{unit.volume(between[0])} to {unit.volume(between[1])}"
+    words = [GAP.join(place) + off or DASH, DASH if volume is None else unit.volume(volume) + span]
     return [*words, _number(told.get("confidence"))]
 
 

@@ -95,6 +95,7 @@ class Result(Answer):
         }
         if self.registrar is not None:
             told["registration"] = registration_facts(self)
+        told["recognition"] = self.recognition.facts()
         told |= {"device": self.model.device.type, "precision": self.model.working_precision}
         if carried:
             told["carried"] = [one.facts() for one in carried]
@@ -105,7 +106,16 @@ class Result(Answer):
         frame = self.seen.frame
         facts = self.facts(carried)
         write_files(
-            directory, self.reconstruction, self.seen.cloud, frame.axes, files, frame.unit_m, facts, carried, self.unit
+            directory,
+            self.reconstruction,
+            self.seen.cloud,
+            frame.axes,
+            files,
+            frame.unit_m,
+            facts,
+            carried,
+            self.unit,
+            self.registered,
         )
         write_state(directory, self, self.registrar, self.model.name, frame.axes, frame.unit_m)
 
@@ -145,7 +155,16 @@ class Result(Answer):
                 files, facts = FilesConfig((), millimetres), self.facts()
                 cloud = self.seen.cloud
                 write_one(
-                    partial, suffix, self.reconstruction, cloud, frame.axes, files, frame.unit_m, facts, self.unit
+                    partial,
+                    suffix,
+                    self.reconstruction,
+                    cloud,
+                    frame.axes,
+                    files,
+                    frame.unit_m,
+                    facts,
+                    self.unit,
+                    self.registered,
                 )
         return path
 
@@ -180,9 +199,10 @@ class Result(Answer):
         to_camera = camera_axes(self.seen.frame.axes)
         points = transform_points(to_camera, self.seen.cloud.points)
         surfaces = self.reconstruction.surfaces.transformed(to_camera)
-        doubt = None if self.registration is None else self.registration.doubt
-        lines = [self.source, *([] if doubt is None else [doubt])]
-        return result_html(self.seen.frame.source, lines, points, surfaces, self.reconstruction.segments, self.unit)
+        told = self.recognition.told
+        lines = [self.source, *([] if told is None or self.registrar is None else [told])]
+        found, title = self.reconstruction, self.seen.frame.source
+        return result_html(title, lines, points, surfaces, found.segments, self.unit, found.calibrated)
 
 
 def registration_facts(found: Answer) -> dict[str, object]:

@@ -6,21 +6,22 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.evaluation.scoring import CELLS, evaluate, trained_scene
 from mereo.evaluation.tables import markdown_table, metrics
 from mereo.fitting.carry import Carried
 from mereo.fitting.config import FitChoice
+from mereo.fitting.registration import Registration
+from mereo.fitting.uncertainty import Uncertainty
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.radii import Radii
 from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import write_json
-from mereo.io.attachments import Surfaces, write_attachment
+from mereo.io.attachments import write_attachment
 from mereo.io.config import CONFIG, DEFAULT_FILES, FilesConfig
 from mereo.io.output_folders import new_directory
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
@@ -35,15 +36,10 @@ from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
 from mereo.visualization.error_maps import error_picture
 from mereo.visualization.evaluation_report import write_evaluation_report
+from mereo.visualization.pictured import pictured, with_carried
 from mereo.visualization.previews import render_cloud_and_segments
-from mereo.visualization.reconstruction_report import cluster, write_report
+from mereo.visualization.reconstruction_report import write_report
 from mereo.visualization.units import UNKNOWN, Unit
-
-PICTURED_FACES = 100_000
-"""A mesh of more faces is coarsened for pictures: shading takes seconds for each hundred thousand."""
-
-PICTURED_CELLS = 150
-"""Cells along the longest side to which it is coarsened."""
 
 
 def evaluate_weights(
@@ -141,9 +137,9 @@ def write_evaluation(
     write_evaluation_report(directory / "report.html", found, evaluation.views[0].colors, directory / "errors.png")
 
 
-def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:
-    """Content of ``summary.json``: ``facts``, then each segment and the stages' seconds."""
-    segments = [
+def summarize(result: Reconstruction, sure: Uncertainty | None = None, **facts: object) -> dict[str, Any]:
+    """Content of ``summary.json``: ``facts``, then how sure it is, each segment and the stages' seconds."""
+    segments: list[dict[str, Any]] = [
         {
             "name": found.name,
             "label": found.label,
@@ -157,12 +153,19 @@ def summarize(result: Reconstruction, **facts: object) -> dict[str, Any]:
         }
         for found, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]
+    told: dict[str, Any] = {}
+    if sure is not None:
+        told["radius95"] = {**sure.summary(), "unit_m": facts.get("unit_m")}
+        for row, one in zip(segments, sure.segments, strict=True):
+            row |= {"centroid_radius95": one.centroid_radius95, "volume95": list(one.volume95)}
     return {
         **facts,
+        **told,
         "nested": [list(pair) for pair in result.surfaces.nested],
         "spacing": float(result.labels.spacing[0]),
         "evaluated_points": result.evaluated,
         "clipped": result.clipped,
+        "calibrated": result.calibrated,
         "segments": segments,
         "timings_s": result.timings_s,
     }
@@ -202,10 +205,12 @@ def write_files(
     facts: dict[str, object],
     carried: Sequence[Carried] = (),
     unit: Unit = UNKNOWN,
+    registered: Registration | None = None,
 ) -> None:
     """Write what ``write_reconstruction`` does into a directory that is there; ``facts`` go into the summary.
 
-    ``unit`` is that of the report, which tells no metres where they were only assumed.
+    ``unit`` is that of the report, which tells no metres where they were only assumed. ``registered`` is the model that
+    the result is, in the input's frame (``Answer.registered``): then files, summary and report say how sure it is.
 
     What is carried goes into ``carried/`` under its files' own names; its surfaces also into pictures and report, and
     together with the segments into ``carried.glb``, where GLB is asked for.
@@ -213,20 +218,21 @@ def write_files(
     started = time.perf_counter()
     formats = chosen_formats(files.formats)
     to_viewer = viewer_rotation(frame)
-    results = Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, unit_m)
+    radii, sure = radii_of(registered), None if registered is None else registered.uncertainty
+    results = Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, unit_m, radii)
     write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
     for one in carried:
         write_attachment(directory / "carried" / one.name, one.content, results.factor, to_viewer, unit_m)
     shown = with_carried(result.surfaces, carried)
     if "glb" in formats and len(shown.segments) > len(result.surfaces.segments):
         write_segments_glb(directory / "carried.glb", shown, to_viewer, unit_m)
-    pictured = _pictured(shown)
-    write_preview(directory / "preview.png", pictured, cloud, frame, facts)
+    drawn = pictured(shown)
+    write_preview(directory / "preview.png", drawn, cloud, frame, facts)
     timings_s = {**result.timings_s, "write": time.perf_counter() - started}
-    summary = summarize(replace(result, timings_s=timings_s), **{"frame": frame, "unit_m": unit_m, **facts})
+    summary = summarize(replace(result, timings_s=timings_s), sure, **{"frame": frame, "unit_m": unit_m, **facts})
     extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
     told = [*({"name": part.name} for part in extra), *summary["segments"]]
-    write_report(directory / "report.html", cloud, pictured, {**summary, "segments": told}, to_viewer, unit)
+    write_report(directory / "report.html", cloud, drawn, {**summary, "segments": told}, to_viewer, unit, registered)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
 
 
@@ -240,22 +246,31 @@ def write_one(
     unit_m: float,
     facts: dict[str, object],
     unit: Unit = UNKNOWN,
+    registered: Registration | None = None,
 ) -> None:
     """Write the one file of a folder of results that has this suffix (".glb", ".html", ...) to a path."""
     if suffix in (".png", ".html"):
-        pictured = _pictured(result.surfaces)
+        drawn = pictured(result.surfaces)
         if suffix == ".png":
-            write_preview(path, pictured, cloud, frame, facts)
+            write_preview(path, drawn, cloud, frame, facts)
             return
-    summary = summarize(result, **{"frame": frame, "unit_m": unit_m, **facts})
+    sure = None if registered is None else registered.uncertainty
+    summary = summarize(result, sure, **{"frame": frame, "unit_m": unit_m, **facts})
     if suffix == ".html":
-        write_report(path, cloud, pictured, summary, viewer_rotation(frame), unit)
+        write_report(path, cloud, drawn, summary, viewer_rotation(frame), unit, registered)
         return
     (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
     chosen_formats([name])
     surfaces, labels, turn = result.surfaces, result.labels, viewer_rotation(frame)
-    results = Results.of(surfaces, labels, result.observed, turn, files, unit_m)
+    results = Results.of(surfaces, labels, result.observed, turn, files, unit_m, radii_of(registered))
     WRITERS[name].write(path, replace(results, summary=summary))
+
+
+def radii_of(registered: Registration | None) -> Radii | None:
+    """Radii of a registered model's points, in its frame; None where they are not known."""
+    if registered is None or registered.uncertainty is None:
+        return None
+    return registered.uncertainty.radii(registered.material)
 
 
 def write_preview(
@@ -266,32 +281,3 @@ def write_preview(
     seen = PointCloud(transform_points(to_camera, cloud.points))
     title = str(facts.get("title", "mereo reconstruction"))
     render_cloud_and_segments(path, seen, surfaces.transformed(to_camera), title)
-
-
-def _pictured(mesh: SegmentedMesh) -> SegmentedMesh:
-    """A mesh as pictures need it."""
-    return replace(mesh, segments=tuple(_coarsened(segment) for segment in mesh.segments))
-
-
-def _coarsened(segment: Segment) -> Segment:
-    if len(segment.faces) <= PICTURED_FACES:
-        return segment
-    return cluster(segment, float(np.ptp(segment.vertices, axis=0).max()) / PICTURED_CELLS)
-
-
-def with_carried(surfaces: SegmentedMesh, carried: Sequence[Carried]) -> SegmentedMesh:
-    """Segments with all carried surfaces before them, declared to lie inside them, so that they are seen through them.
-
-    Their names are those of their files, with that of the part where a file has several; their colours differ from the
-    segments'.
-    """
-    parts: list[Segment] = []
-    for one in carried:
-        if isinstance(one.content, Surfaces):
-            mesh = one.content.mesh
-            several = len(mesh.segments) > 1
-            parts += [replace(s, name=f"{one.name}: {s.name}" if several else one.name) for s in mesh.segments]
-    free = [color for color in reversed(PALETTE) if color not in surfaces.colors] or list(PALETTE)
-    parts = [replace(part, color=free[index % len(free)]) for index, part in enumerate(parts)]
-    nested = tuple((part.name, name) for part in parts for name in surfaces.names)
-    return SegmentedMesh((*parts, *surfaces.segments), (*surfaces.nested, *nested))

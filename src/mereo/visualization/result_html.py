@@ -13,6 +13,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.reconstruction.segment_statistics import FoundSegment
 from mereo.visualization.contact_sheets import Picture
 from mereo.visualization.previews import CAMERA_VIEWS, seen_on_found
+from mereo.visualization.report_words import confidence_title
 from mereo.visualization.units import Unit
 
 SIDES = ("as the camera sees it", "from its right")
@@ -33,6 +34,7 @@ def result_html(
     surfaces: SegmentedMesh,
     segments: Sequence[FoundSegment],
     unit: Unit,
+    calibrated: bool = False,
 ) -> str:
     """HTML of a result.
 
@@ -43,6 +45,7 @@ def result_html(
         surfaces: found, camera frame.
         segments: in figures, in the frame of the input.
         unit: of these.
+        calibrated: whether their confidences are.
     """
     views = {name: CAMERA_VIEWS[name] for name in SIDES}
     pictures = zip(views, _cropped(seen_on_found(points, surfaces, list(views.values()), PICTURE_PX)), strict=True)
@@ -52,9 +55,10 @@ def result_html(
         f'<figcaption style="text-align:center;font-size:smaller">{escape(name)}</figcaption></figure>'
         for name, picture in pictures
     )
+    table = _table(segments, surfaces, unit, calibrated)
     return (
         f'<div><p style="margin:0 0 6px"><b>{escape(title)}</b><br>{told}</p>'
-        f'<div style="display:flex;gap:8px;flex-wrap:wrap">{figures}</div>{_table(segments, surfaces, unit)}</div>'
+        f'<div style="display:flex;gap:8px;flex-wrap:wrap">{figures}</div>{table}</div>'
     )
 
 
@@ -65,8 +69,9 @@ def _cropped(pictures: Sequence[Picture]) -> list[Picture]:
     return [picture[rows] for picture in pictures]
 
 
-def _table(segments: Sequence[FoundSegment], surfaces: SegmentedMesh, unit: Unit) -> str:
-    heads = ("segment", f"volume, {unit.volume_name}", "confidence", f"centre, {unit.length_name}")
+def _table(segments: Sequence[FoundSegment], surfaces: SegmentedMesh, unit: Unit, calibrated: bool) -> str:
+    sure = confidence_title(calibrated)
+    heads = ("segment", f"volume, {unit.volume_name}", sure, f"centre, {unit.length_name}")
     rows = []
     for found, (red, green, blue) in zip(segments, surfaces.colors, strict=True):
         swatch = f'<span style="color:rgb({red},{green},{blue})">&#9632;</span>'

@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
+from mereo.geometry.radii import STOPS, Radii
 from mereo.geometry.solids import Solids
 from mereo.models.model import Answer
 from mereo.visualization.error_maps import OVER, UNDER
@@ -55,7 +56,6 @@ CONFIDENCE = ColorScale(
     ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)),
     ("0, a guess", "1, certain"),
 )
-SEEN: tuple[Color, ...] = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122, 24, 70))
 EVEN: Color = (228, 230, 234)
 
 
@@ -64,8 +64,14 @@ def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> Colo
     joint = np.concatenate([*values, np.zeros(1)])
     high = max(float(np.quantile(joint, 0.95)), 1e-9)
     return ColorScale(
-        "distance to the nearest observed point", 0.0, high, SEEN, ("0, seen", f"{high:.3g}{unit}, guessed")
+        "distance to the nearest observed point", 0.0, high, STOPS, ("0, seen", f"{high:.3g}{unit}, guessed")
     )
+
+
+def radius_scale(radii: Radii, unit: str) -> ColorScale:
+    """Scale for radii of 95 % in the unit that is named."""
+    title = "true places are within (95 %" + ("" if radii.calibrated else ", not calibrated") + ")"
+    return ColorScale(title, 0.0, max(radii.high, 1e-9), STOPS, (f"0{unit}, sure", f"{radii.high:.3g}{unit}"))
 
 
 def error_scale(truth: SegmentedMesh, unit: str) -> ColorScale:

@@ -224,7 +224,7 @@ def start_from_model(
     source, seen = guessed * half + center, transform_points(inverse_rigid(T_camera_scan), code.cloud)
     tolerance = 2 * PAIR_ERROR * diagonal(rest)
     common = pose_of_pairs(source, seen, "the object by its weights", scale, tolerance)
-    label = model.query(code, code.cloud).probability[:, 1:].argmax(axis=1)
+    label = model.logits(code, code.cloud)[:, 1:].argmax(axis=1)
     poses, own = [], []
     for index, name in enumerate(rest.names):
         mine = label == index

@@ -9,10 +9,10 @@ in the model itself.
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from mereo.geometry.normalizer import Normalizer
-from mereo.models.decoder import Code, Decoder, Prediction, joint_linear, line_of_sight
+from mereo.models.decoder import Code, Decoder, Prediction, line_of_sight
 from mereo.models.model import Model
 from mereo.models.network import Network
 
@@ -87,7 +87,9 @@ def decode(decoder: Decoder, code: Code, latent: Float[Tensor, "1 z"], queries: 
             rows += [everywhere, encoded]
             if decoder.lookup is not None:
                 rows.append(decoder.lookup(hidden, placed)[1])
-        hidden = joint_linear(decoder.summands(number), rows, None)
+        layers_here = decoder.summands(number)
+        weight = torch.cat([layer.weight for layer in layers_here], dim=1)
+        hidden = nn.functional.linear(torch.cat(rows, dim=-1), weight, layers_here[0].bias)
         hidden = torch.relu(norm(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
     logits, distance, direction = decoder.head(hidden).split([decoder.classes, 1, 3], dim=-1)
     return Prediction(logits, distance[..., 0], direction)

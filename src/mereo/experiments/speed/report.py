@@ -10,19 +10,24 @@ import numpy as np
 import torch
 
 from mereo.evaluation.sample_views import SampleView, load_view, shipped_views
+from mereo.experiments.speed.beside import measure_beside, shares_table
 from mereo.experiments.speed.fitted_model import fitted_model
 from mereo.experiments.speed.roofline import Machine, measure_machine
 from mereo.experiments.speed.stages import Bench, Stage, random_points
 from mereo.io.atomic_files import check_file_place, write_json
+from mereo.io.cores import FreeCores, cores
 from mereo.models.config import Precision
 from mereo.models.device import cpu_features
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 
+QUERIES = 40_000
+"""Number of points that precisions are compared at, and that are asked beside busy processes."""
+
 
 @dataclass(frozen=True)
 class Cost:
-    """Change of a model's answers by a lower precision, at 40,000 points of the object's box.
+    """Change of a model's answers by a lower precision, at ``QUERIES`` points of the object's box.
 
     Attributes:
         labels: share of points with another label.
@@ -40,10 +45,11 @@ def benchmark(
     precision: Precision,
     repeats: int,
     rival: bool,
+    beside: int,
     output: Path | None,
     force: bool = False,
 ) -> list[Stage]:
-    """Time all stages, print the table, and write it as JSON where ``output`` says so.
+    """Time all stages, print the tables, and write them as JSON where ``output`` says so.
 
     Args:
         weights: a shipped name or a file, with a shipped view of its object; None fits the preset's network first.
@@ -52,6 +58,7 @@ def benchmark(
         precision: precision of the network's products.
         repeats: repetitions of each stage.
         rival: whether to time the straightforward implementation too.
+        beside: processes that never rest, beside which queries are timed again on a CPU; 0 leaves that out.
         output: a JSON file, or None.
         force: replace an existing file, unless it is the weights.
 
@@ -59,17 +66,24 @@ def benchmark(
     shipped view.
     """
     check_file_place(output, force=force, inputs=[] if weights is None else [weights])
+    load = _load()
     model, view = _subject(weights, preset)
     model.network.to(device)
     fast = replace(model, precision=precision)
     machine = measure_machine(device, fast.working_dtype)
-    stages = Bench(fast, view, machine, repeats, rival).run()
-    facts = _facts(weights or f"preset {preset}, fitted to one frame", fast, machine)
+    bench = Bench(fast, view, machine, repeats, rival)
+    stages = bench.run()
+    shares = measure_beside(bench.ask(QUERIES), beside, repeats) if beside and device.type == "cpu" else []
+    facts = load | _facts(weights or f"preset {preset}, fitted to one frame", fast, machine)
     cost = _cost(model, fast, view) if fast.working_dtype is not torch.float32 else None
     print(table(stages, facts, cost))
+    if shares:
+        print(shares_table(shares, f"{QUERIES:,} queries"))
     if output is not None:
         rows = [{**asdict(stage), "ratio": stage.ratio} for stage in stages]
-        write_json(output, {**facts, "cost": None if cost is None else asdict(cost), "stages": rows}, force=force)
+        told = [{**asdict(share), "fair": share.fair, "times": share.times} for share in shares]
+        found = {**facts, "cost": None if cost is None else asdict(cost), "stages": rows, "beside": told}
+        write_json(output, found, force=force)
         print(f"wrote {output}")
     return stages
 
@@ -88,13 +102,21 @@ def _subject(weights: str | None, preset: str) -> tuple[Model, SampleView]:
     return model, load_view(scene)
 
 
+def _load() -> dict[str, Any]:
+    """How busy the machine is before anything is measured."""
+    return {
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "free_cores": FreeCores().now(),
+    }
+
+
 def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:
     device = model.device
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
     return {
         "model": subject,
         "device": f"{device.type}, {name}",
-        "cores": os.cpu_count(),
+        "cores": cores(),
         "threads": torch.get_num_threads(),
         "amx": bool(cpu_features()["amx"]),
         "precision": model.working_precision,
@@ -105,7 +127,7 @@ def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:
 
 def _cost(exact: Model, fast: Model, view: SampleView) -> Cost:
     cloud = view.depth.to_points()
-    points = random_points(view, 40_000, seed=1)
+    points = random_points(view, QUERIES, seed=1)
     code = exact.encode(cloud)
     one, two = exact.query(code, points), fast.query(fast.encode(cloud), points)
     change = np.abs(one.distance - two.distance).mean() * code.normalizer.scale
@@ -117,17 +139,19 @@ def table(stages: list[Stage], facts: dict[str, Any], cost: Cost | None = None) 
     lines = [
         f"{facts['model']}; {facts['device']}, {facts['threads']} threads of {facts['cores']} cores, AMX "
         f"{'yes' if facts['amx'] else 'no'}, {facts['precision']}; products {facts['gigaflops']:.0f} GFLOP/s, "
-        f"copies {facts['gigabytes_per_second']:.0f} GB/s",
+        f"copies {facts['gigabytes_per_second']:.0f} GB/s; before it began, {facts['free_cores']:.1f} cores were free"
+        + ("" if facts["load"] is None else f" (load {facts['load']:.1f})"),
         "",
-        "| stage | median, ms | 99 %, ms | floor, ms | times the floor | straightforward, ms | times faster |",
-        "|---|---|---|---|---|---|---|",
+        "| stage | median, ms | 99 %, ms | floor, ms | times the floor | straightforward, ms | faster | other labels |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for stage in stages:
         cells = [stage.median, stage.slowest, stage.floor]
         rival = "" if stage.rival is None else f"{1e3 * stage.rival:.0f}"
         ratio = "" if stage.ratio is None else f"{stage.ratio:.1f}"
+        other = "" if stage.differing is None else f"{stage.differing:.3%}"
         times = " | ".join(f"{1e3 * value:.3g}" for value in cells)
-        lines.append(f"| {stage.name} | {times} | {stage.median / stage.floor:.1f} | {rival} | {ratio} |")
+        lines.append(f"| {stage.name} | {times} | {stage.median / stage.floor:.1f} | {rival} | {ratio} | {other} |")
     if cost is not None:
         lines += [
             "",

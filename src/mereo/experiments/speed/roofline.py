@@ -1,12 +1,15 @@
 """Roofline: the least time that a stage can take here, by the measured rates of large products and of copies."""
 
+import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
+
+from mereo.models.ops.products import linear
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,15 @@ class Work:
         return max(self.operations / machine.operations, self.bytes / machine.bandwidth)
 
 
+def _operations_of_linear(rows: Sequence[int], weight: Sequence[int], *_: object, **__: object) -> int:
+    """Floating-point operations of a product of these shapes."""
+    return 2 * math.prod(rows) * weight[0]
+
+
+ONEDNN = {torch.ops.mkldnn._linear_pointwise: _operations_of_linear}
+"""Products of ``mereo.models.ops.products`` that torch's counter does not know."""
+
+
 def seconds(work: Callable[[], object], device: torch.device) -> float:
     """Seconds that ``work`` takes, until the device has done what it was asked."""
     start = time.perf_counter()
@@ -53,7 +65,8 @@ def measure_machine(device: torch.device, dtype: torch.dtype = torch.float32) ->
     left, right = torch.ones(4096, 512, device=device, dtype=dtype), torch.ones(512, 512, device=device, dtype=dtype)
     source = torch.ones(64 * 2**20, device=device)
     target = torch.empty_like(source)
-    product = _median(lambda: torch.nn.functional.linear(left, right), device)
+    with torch.inference_mode():
+        product = _median(lambda: linear(left, right), device)
     copied = _median(lambda: target.copy_(source), device)
     return Machine(2 * left.numel() * right.shape[0] / product, 2 * source.nbytes / copied)
 
@@ -64,6 +77,6 @@ def _median(work: Callable[[], object], device: torch.device, repeats: int = 15)
 
 def count_operations(work: Callable[[], object]) -> int:
     """Number of floating-point operations in the matrix products that ``work`` asks torch for."""
-    with FlopCounterMode(display=False) as counter:
+    with FlopCounterMode(display=False, custom_mapping=ONEDNN) as counter:
         work()
     return counter.get_total_flops()

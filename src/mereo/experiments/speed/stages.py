@@ -2,7 +2,7 @@
 
 import statistics
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -30,6 +30,7 @@ class Stage:
         slowest: their 99th percentile.
         floor: the least that this machine could take.
         rival: the straightforward implementation's median; None where it was not run.
+        differing: share of a grid's nodes that it labels otherwise; None where there is none to compare.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Stage:
     slowest: float
     floor: float
     rival: float | None = None
+    differing: float | None = None
 
     @property
     def ratio(self) -> float | None:
@@ -84,12 +86,16 @@ class Bench:
 
     def queries(self, count: int) -> Stage:
         """Times of class logits at random points of the object's box."""
-        points = random_points(self.view, count)
-        ours = partial(self.model.logits, self._code, points)
+        points, ours = random_points(self.view, count), self.ask(count)
         rival = partial(self._rival().logits, points) if self.rival else None
-        if rival is not None:
-            self._compare(ours(), rival())
+        if rival is not None:  # which is exact; what a lower precision changes is told apart
+            exact = replace(self.model, precision="float32")
+            self._compare(exact.logits(exact.encode(self.view.depth.to_points()), points), rival())
         return self._network_stage(f"{count // 1000}k queries", ours, rival)
+
+    def ask(self, count: int) -> Callable[[], Float[np.ndarray, "n c"]]:
+        """What ``queries`` times."""
+        return partial(self.model.logits, self._code, random_points(self.view, count))
 
     def whole_frame(self) -> Stage:
         """Times from depth image to labels of 10,000 and then 40,000 points, as in the authors' follow-up.
@@ -123,10 +129,11 @@ class Bench:
             return sample_coarse_to_fine(field, grid.origin, grid.spacing, (x, y, z)).labels
 
         work = self._grid_work(ours())
-        rival = (
-            partial(sample_dense, self._rival().logits, grid.origin, grid.spacing, (x, y, z)) if self.rival else None
-        )
-        return self._stage(f"labels, {x} x {y} x {z}", work, ours, rival, once=True)
+
+        def straightforward() -> UInt8[np.ndarray, "x y z"]:
+            return sample_dense(self._rival().logits, grid.origin, grid.spacing, (x, y, z)).labels
+
+        return self._grid_stage(f"labels, {x} x {y} x {z}", work, ours, straightforward)
 
     def surfaces(self) -> Stage:
         """Times of closed meshes of all segments, 128 cells along the longest side, the search for the box included."""
@@ -138,9 +145,11 @@ class Bench:
             return found.grid.labels
 
         box = locate(field, search)
-        dense = partial(extract_dense, resolution=128, names=model.names, colors=model.colors, nested=model.nested)
-        rival = (lambda: dense(self._rival().logits, box)) if self.rival else None
-        return self._stage("surfaces of all segments, 128", self._grid_work(ours()), ours, rival, once=True)
+
+        def straightforward() -> UInt8[np.ndarray, "x y z"]:
+            return extract_dense(self._rival().logits, box, 128, model.names, model.colors, model.nested).grid.labels
+
+        return self._grid_stage("surfaces of all segments, 128", self._grid_work(ours()), ours, straightforward)
 
     # --- parts ---------------------------------------------------------------------------------------------------
 
@@ -188,6 +197,20 @@ class Bench:
         weights = sum(parameter.nbytes for parameter in self.model.inference.parameters())
         return self._stage(name, Work(count_operations(counted or ours), float(weights)), ours, rival)
 
+    def _grid_stage(
+        self,
+        name: str,
+        work: Work,
+        ours: Callable[[], UInt8[np.ndarray, "x y z"]],
+        straightforward: Callable[[], UInt8[np.ndarray, "x y z"]],
+    ) -> Stage:
+        """Stage that labels a grid; the rival does so once, and its labels are compared."""
+        if not self.rival:
+            return self._stage(name, work, ours)
+        theirs: list[UInt8[np.ndarray, "x y z"]] = []
+        stage = self._stage(name, work, ours, lambda: theirs.append(straightforward()), once=True)
+        return replace(stage, differing=_differing(ours(), theirs[0]))
+
     def _stage(
         self,
         name: str,
@@ -219,6 +242,11 @@ class Bench:
         wrong = int((ours.argmax(axis=1) != theirs.argmax(axis=1))[clear].sum())
         if wrong:
             raise RuntimeError(f"{wrong} of {len(ours)} labels differ between the model and the rival; they must agree")
+
+
+def _differing(ours: UInt8[np.ndarray, "x y z"], theirs: UInt8[np.ndarray, "u v w"]) -> float | None:
+    """Share of nodes with other labels; None for grids of other sizes, as where a box has grown."""
+    return float((ours != theirs).mean()) if ours.shape == theirs.shape else None
 
 
 def random_points(view: SampleView, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.radii import Radii
 from mereo.io.atomic_files import write_json
 from mereo.io.config import FilesConfig, Format
 from mereo.io.writers.glb import write_segments_glb
@@ -19,6 +21,9 @@ from mereo.io.writers.ply import write_points_ply, write_segments_ply
 from mereo.io.writers.points import write_points_npz
 from mereo.io.writers.stl import write_segments_stl
 from mereo.io.writers.volumes import write_labels_npz, write_labels_vti
+
+SURE = "radius95.glb"
+"""Name of the file beside the segments' GLB whose colours say how sure each place of the surfaces is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +37,7 @@ class Results:
         unit_m: metres per unit of the input.
         factor: of positions in files that have no unit of their own.
         summary: what the JSON file holds.
+        radii: how sure the surfaces and what is inside them are, in the input's frame and unit; None where not known.
     """
 
     surfaces: SegmentedMesh
@@ -41,6 +47,7 @@ class Results:
     unit_m: float
     factor: float
     summary: Mapping[str, Any] = field(default_factory=dict)
+    radii: Radii | None = None
 
     @classmethod
     def of(
@@ -51,15 +58,26 @@ class Results:
         frame_rotation: Float[np.ndarray, "3 3"],
         files: FilesConfig,
         unit_m: float = 1.0,
+        radii: Radii | None = None,
     ) -> "Results":
         """Results in the unit that ``files`` asks for; the arguments are the attributes of the same names."""
         factor = MM_PER_M * unit_m if files.millimetres else 1.0
-        return cls(surfaces, labels, observed, frame_rotation, unit_m, factor)
+        return cls(surfaces, labels, observed, frame_rotation, unit_m, factor, radii=radii)
 
     @property
     def scaled_surfaces(self) -> SegmentedMesh:
         """Surfaces for files that have no unit of their own."""
         return self.surfaces.transformed(np.diag([self.factor] * 3 + [1.0]))
+
+    @property
+    def scaled_radii(self) -> Radii | None:
+        """Radii for files that have no unit of their own."""
+        return None if self.radii is None else self.radii.scaled(self.factor)
+
+    @cached_property
+    def radii_on_grid(self) -> Float32[np.ndarray, "x y z"] | None:
+        """Radii at the voxels of ``labels``, in the input's unit."""
+        return None if self.radii is None else self.radii.on_grid(self.labels)
 
     @property
     def scaled_labels(self) -> LabelGrid:
@@ -83,12 +101,22 @@ class Writer:
 
 
 def _glb(path: Path, results: Results) -> None:
-    write_segments_glb(path, results.surfaces, results.frame_rotation, results.unit_m)
+    write_segments_glb(path, results.surfaces, results.frame_rotation, results.unit_m, results.radii)
+    if results.radii is not None:
+        write_segments_glb(
+            path.with_name(SURE), results.surfaces, results.frame_rotation, results.unit_m, results.radii, colored=True
+        )
 
 
 def _npz(path: Path, results: Results) -> None:
     grid = results.labels
-    write_labels_npz(path, grid.labels, grid.origin, grid.spacing, grid.names)
+    write_labels_npz(path, grid.labels, grid.origin, grid.spacing, grid.names, results.radii_on_grid)
+
+
+def _vti(path: Path, results: Results) -> None:
+    radii = results.radii_on_grid
+    scaled = None if radii is None else radii * np.float32(results.factor)
+    write_labels_vti(path, results.scaled_labels, results.surfaces.colors, scaled)
 
 
 def _points(path: Path, results: Results) -> None:
@@ -101,11 +129,11 @@ def _points(path: Path, results: Results) -> None:
 
 WRITERS: dict[Format, Writer] = {
     "glb": Writer("segments.glb", _glb),
-    "ply": Writer("segments.ply", lambda path, r: write_segments_ply(path, r.scaled_surfaces)),
+    "ply": Writer("segments.ply", lambda path, r: write_segments_ply(path, r.scaled_surfaces, r.scaled_radii)),
     "obj": Writer("segments.obj", lambda path, r: write_segments_obj(path, r.scaled_surfaces)),
     "stl": Writer("stl", lambda path, r: write_segments_stl(path, r.scaled_surfaces)),
     "npz": Writer("labels.npz", _npz),
-    "vti": Writer("labels.vti", lambda path, r: write_labels_vti(path, r.scaled_labels, r.surfaces.colors)),
+    "vti": Writer("labels.vti", _vti),
     "nifti": Writer(
         "labels.nii.gz", lambda path, r: write_labels_nifti(path, r.labels, r.surfaces.colors, r.unit_m), nibabel
     ),

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
+from mereo.geometry.radii import STOPS, Radii
 from mereo.io.atomic_files import atomic_file
 from mereo.io.mesh_formats import VIEWER_ROOT
 from mereo.io.writers.segment_table import with_faces
@@ -32,6 +33,8 @@ def write_segments_glb(
     surfaces: SegmentedMesh,
     frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
     unit_m: float = 1.0,
+    radii: Radii | None = None,
+    colored: bool = False,
 ) -> None:
     """Write a GLB file: one named, coloured node per segment, below a root node that turns the frame for viewers.
 
@@ -43,10 +46,13 @@ def write_segments_glb(
         surfaces: segments in the input's frame and units.
         frame_rotation: rotation of the root node, from the input's frame to glTF's (y up).
         unit_m: metres per unit of the input, the scale of the root node, because glTF is in metres.
+        radii: how sure the surfaces are: the vertex attribute ``_RADIUS95``, in the unit of the vertices, of which
+            ``extras`` of the meshes say the metres.
+        colored: colour the vertices by these, and not by their segments.
 
     Raises ``ValueError`` where no segment has faces.
     """
-    document, binary = _gltf_document(surfaces, frame_rotation, unit_m)
+    document, binary = _gltf_document(surfaces, frame_rotation, unit_m, radii, colored)
     text = json.dumps(document, ensure_ascii=False).encode()
     text += b" " * (-len(text) % 4)
     with atomic_file(path) as partial, partial.open("wb") as file:
@@ -69,7 +75,11 @@ def write_segments_gltf(
 
 
 def _gltf_document(
-    surfaces: SegmentedMesh, frame_rotation: Float[np.ndarray, "3 3"], unit_m: float
+    surfaces: SegmentedMesh,
+    frame_rotation: Float[np.ndarray, "3 3"],
+    unit_m: float,
+    radii: Radii | None = None,
+    colored: bool = False,
 ) -> tuple[dict[str, Any], bytes]:
     """Document and its one buffer."""
     solid = with_faces(surfaces)
@@ -79,6 +89,9 @@ def _gltf_document(
         _add_array(document, chunks, segment.vertices.astype("<f4"), "VEC3", 34962)
         _add_array(document, chunks, _unit_normals(segment).astype("<f4"), "VEC3", 34962)
         _add_array(document, chunks, segment.faces.astype("<u4").reshape(-1, 1), "SCALAR", 34963)
+    for index, (label, segment) in enumerate(solid if radii is not None else ()):
+        assert radii is not None
+        _add_radii(document, chunks, index, radii, radii.at(segment.vertices, label), unit_m, colored)
     binary = b"".join(chunks)
     document["buffers"] = [{"byteLength": len(binary)}]
     return document, binary
@@ -116,12 +129,40 @@ def _gltf_mesh(index: int, label: int, segment: Segment) -> dict[str, Any]:
 
 def _gltf_material(segment: Segment, opaque: bool) -> dict[str, Any]:
     """Material of a segment's colour; glTF's factors are linear light, ours are sRGB (glTF 2.0, section 3.9.2)."""
-    srgb = np.asarray(segment.color) / 255.0
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    color = [*linear.round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
+    color = [*_linear(np.array(segment.color, dtype=np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
     surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
     return material if opaque else {**material, "alphaMode": "BLEND"}
+
+
+def _add_radii(
+    document: dict[str, Any],
+    chunks: list[bytes],
+    index: int,
+    radii: Radii,
+    values: Float[np.ndarray, " v"],
+    unit_m: float,
+    colored: bool,
+) -> None:
+    """Attribute of a mesh's radii, and with ``colored`` their colours in place of the segment's."""
+    mesh = document["meshes"][index]
+    attributes = mesh["primitives"][0]["attributes"]
+    attributes["_RADIUS95"] = len(document["accessors"])
+    _add_array(document, chunks, values.astype("<f4").reshape(-1, 1), "SCALAR", 34962)
+    mesh["extras"]["radius95"] = {"unit_m": unit_m, "calibrated": radii.calibrated}
+    if colored:
+        attributes["COLOR_0"] = len(document["accessors"])
+        _add_array(document, chunks, _linear(radii.colors(values)).astype("<f4"), "VEC3", 34962)
+        mesh["extras"]["radius95"] |= {"color_0_at": 0.0, "color_1_at": radii.high, "stops": [list(c) for c in STOPS]}
+        surface = document["materials"][index]["pbrMetallicRoughness"]
+        surface["baseColorFactor"] = [1.0, 1.0, 1.0, surface["baseColorFactor"][3]]
+
+
+def _linear(srgb: UInt8[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Linear light of screen colours (glTF 2.0, section 3.9.2)."""
+    share = srgb / 255.0
+    linear: np.ndarray = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return linear
 
 
 def _unit_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
@@ -139,7 +180,7 @@ def _add_array(document: dict[str, Any], chunks: list[bytes], array: np.ndarray,
     document["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
     accessor = {
         "bufferView": view,
-        "componentType": 5126 if kind == "VEC3" else 5125,
+        "componentType": 5126 if array.dtype.kind == "f" else 5125,
         "count": len(array),
         "type": kind,
     }

@@ -6,10 +6,11 @@ PLY has no unit. Labels are a property called ``label``; their names are in the 
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Integer, UInt8
+from jaxtyping import Bool, Float, Integer, UInt8
 
 from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.radii import Radii
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.segment_table import comment_lines, with_faces
 
@@ -17,10 +18,11 @@ TYPES = {"u1": "uchar", "i4": "int", "f4": "float"}
 """Name that PLY has for each type of numpy."""
 
 
-def write_segments_ply(path: str | Path, surfaces: SegmentedMesh) -> None:
+def write_segments_ply(path: str | Path, surfaces: SegmentedMesh, radii: Radii | None = None) -> None:
     """Write all surfaces as one mesh whose vertices and faces have ``label``, ``red``, ``green``, ``blue`` (uchar).
 
-    Segments share no vertices, so each vertex has one label; positions are float32, in the mesh's frame and unit.
+    Segments share no vertices, so each vertex has one label; positions are float32, in the mesh's frame and unit. With
+    ``radii`` of the same unit each vertex has ``radius95``, float32.
     Raises ``ValueError`` where no segment has faces.
     """
     with_faces(surfaces)
@@ -28,9 +30,12 @@ def write_segments_ply(path: str | Path, surfaces: SegmentedMesh) -> None:
     colors = np.array(surfaces.colors, dtype=np.uint8)
     vertex_owner = np.repeat(np.arange(len(colors)), [len(segment.vertices) for segment in surfaces.segments])
     corners = {"count": ("u1", np.full(len(faces), 3)), "vertex_indices": ("i4", faces)}
-    vertices = _records(_positions(positions) | _colors(colors[vertex_owner]) | _label(vertex_owner + 1))
+    sure: Columns = {} if radii is None else {"radius95": ("f4", np.concatenate(radii.vertices))}
+    vertices = _records(_positions(positions) | _colors(colors[vertex_owner]) | _label(vertex_owner + 1) | sure)
     triangles = _records(corners | _colors(colors[owner]) | _label(owner + 1))
     header = comment_lines(surfaces.names, surfaces.colors)
+    if radii is not None:
+        header.append(f"radius95 is in the unit of x, y, z{'' if radii.calibrated else '; it is not calibrated'}")
     _write(path, header, {"vertex": vertices, "face": triangles})
 
 
@@ -43,6 +48,19 @@ def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
     sure = {"confidence": ("f4", cloud.confidence), "occupancy": ("f4", cloud.occupancy)}
     vertices = _records(_positions(cloud.points) | _colors(colors) | _label(cloud.labels) | sure)
     _write(path, comment_lines(cloud.names, cloud.colors), {"vertex": vertices})
+
+
+def write_explained_ply(
+    path: str | Path,
+    points: Float[np.ndarray, "n 3"],
+    colors: UInt8[np.ndarray, "n 3"],
+    unexplained: Bool[np.ndarray, " n"],
+    comment: str,
+) -> None:
+    """Write observed points coloured by how much they decide a place, with ``unexplained`` (uchar, 1 or 0)."""
+    lost: Columns = {"unexplained": ("u1", unexplained)}
+    plain = comment.encode("ascii", "replace").decode("ascii")
+    _write(path, [plain], {"vertex": _records(_positions(points) | _colors(colors) | lost)})
 
 
 def write_positions_ply(path: str | Path, points: Float[np.ndarray, "n 3"], comment: str = "") -> None:

@@ -9,9 +9,10 @@ import struct
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
@@ -29,11 +30,14 @@ compressor="vtkZLibDataCompressor">
     <Piece Extent="{extent}">
       <PointData Scalars="label">
         <DataArray type="UInt8" Name="label" format="binary">{labels}</DataArray>
-      </PointData>
+{radii}      </PointData>
     </Piece>
   </ImageData>
 </VTKFile>
 """
+
+RADII = '        <DataArray type="Float32" Name="radius95" format="binary">{}</DataArray>\n'
+"""Second array of the VTI, in the unit of its coordinates."""
 
 
 def write_labels_npz(
@@ -42,29 +46,39 @@ def write_labels_npz(
     origin: Float[np.ndarray, "3"],
     spacing: Float[np.ndarray, "3"],
     names: Sequence[str],
+    radii: Float32[np.ndarray, "x y z"] | None = None,
 ) -> None:
     """Write a label grid for numpy: the arrays ``labels``, ``origin``, ``spacing`` and ``names``.
 
     Voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units. ``names[k]`` is the
-    segment of label k + 1; label 0 is empty space. Raises ``ValueError`` for a label without a name.
+    segment of label k + 1; label 0 is empty space. Where ``radii`` are known, ``radius95`` is the radius around each
+    voxel that holds the true place of what is there with probability 0.95, in the input's unit, NaN in empty space.
+    Raises ``ValueError`` for a label without a name.
     """
     if labels.size and int(labels.max()) > len(names):
         raise ValueError(f"label {int(labels.max())} has no name among {len(names)}; name every segment")
+    arrays: dict[str, Any] = {
+        "labels": labels,
+        "origin": np.asarray(origin, dtype=np.float64),
+        "spacing": np.asarray(spacing, dtype=np.float64),
+        "names": np.asarray(names),
+    }
+    if radii is not None:
+        arrays["radius95"] = radii
     with atomic_file(path) as partial:
-        np.savez_compressed(
-            partial,
-            labels=labels,
-            origin=np.asarray(origin, dtype=np.float64),
-            spacing=np.asarray(spacing, dtype=np.float64),
-            names=np.asarray(names),
-        )
+        np.savez_compressed(partial, **arrays)
 
 
-def write_labels_vti(path: str | Path, grid: LabelGrid, colors: Sequence[Color]) -> None:
+def write_labels_vti(
+    path: str | Path,
+    grid: LabelGrid,
+    colors: Sequence[Color],
+    radii: Float32[np.ndarray, "x y z"] | None = None,
+) -> None:
     """Write VTK image data: the array ``label`` at voxel centres; field data ``segment_names``, ``segment_colors``.
 
     ``segment_names[k]`` is the segment of label k + 1; label 0 is empty space. Coordinates are in the grid's frame and
-    unit.
+    unit, and so are ``radii``, which become the array ``radius95``.
     """
     codes = (str(code) for name in grid.names for code in (*name.encode("utf-8"), 0))
     text = VTI.format(
@@ -75,6 +89,7 @@ def write_labels_vti(path: str | Path, grid: LabelGrid, colors: Sequence[Color])
         names=" ".join(codes),
         colors=" ".join(str(value) for color in colors for value in color),
         labels=_compressed(grid.labels),
+        radii="" if radii is None else RADII.format(_compressed(radii.astype("<f4"))),
     )
     with atomic_file(path) as partial:
         partial.write_text(text, "utf-8")
@@ -84,8 +99,11 @@ def _numbers(values: Float[np.ndarray, "3"]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _compressed(labels: UInt8[np.ndarray, "x y z"]) -> str:
-    """Labels as one zlib block, x running fastest; the head: blocks, bytes of each, of a partial one, packed bytes."""
-    packed = zlib.compress(labels.tobytes(order="F"))
-    head = struct.pack("<4Q", 1, labels.size, 0, len(packed))
+def _compressed(values: np.ndarray) -> str:
+    """Values of voxels as one zlib block, x running fastest.
+
+    The head has the number of blocks, the bytes of each and of a partial one, and those that are packed.
+    """
+    packed = zlib.compress(values.tobytes(order="F"))
+    head = struct.pack("<4Q", 1, values.nbytes, 0, len(packed))
     return base64.b64encode(head).decode() + base64.b64encode(packed).decode()

@@ -8,12 +8,22 @@ from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import PointCloud
 from mereo.visualization.units import UNKNOWN, Unit
-from mereo.visualization.vertex_colors import CONFIDENCE, confidence, distance_scale, observed_distance
+from mereo.visualization.vertex_colors import (
+    CONFIDENCE,
+    ColorScale,
+    confidence,
+    distance_scale,
+    observed_distance,
+    radius_scale,
+)
 from mereo.visualization.viewer import html
 from mereo.visualization.viewer.display import CLOUD_COLOR, Display, SegmentControls, SegmentLayer, point_size
 from mereo.visualization.viewer.probe import Inspection, first_hit
+from mereo.visualization.viewer.why import WhyLayer
 
 EMPTY_COLOR = (150, 156, 168)
+SURE = "how sure"
+"""Colouring by the radius within which the true place of each vertex lies."""
 
 
 class FramePage:
@@ -56,7 +66,8 @@ class FramePage:
     def _colorings(self) -> tuple[str, ...]:
         """What surfaces can be coloured by: confidence is the network's, distance needs what was seen."""
         has_code, has_cloud = self.inspection.code is not None, self.inspection.cloud is not None
-        return ("segment", *(["confidence"] if has_code else []), *(["distance"] if has_cloud else []))
+        sure = [SURE] if self.inspection.here is not None else []
+        return ("segment", *(["confidence"] if has_code else []), *(["distance"] if has_cloud else []), *sure)
 
     def _build_cloud(self, seen: PointCloud) -> None:
         gui = self.server.gui
@@ -77,6 +88,7 @@ class FramePage:
         with gui.add_folder("Probe"):
             self.probing = gui.add_checkbox("ask at a point", False)
             self.told = gui.add_html(html.message("Click a surface, or drag the arrows of the probe."))
+            self.why = WhyLayer.of(gui, self.stage, self.inspection)
         self.gizmo = self.server.scene.add_transform_controls(
             "/probe", scale=0.35, disable_rotations=True, depth_test=False, visible=False
         )
@@ -104,6 +116,8 @@ class FramePage:
         if mode not in self._painted:
             if mode == "confidence":
                 values, scale = confidence(self.mesh, self.inspection.network), CONFIDENCE
+            elif mode == SURE:
+                values, scale = self._radii()
             else:
                 assert self.inspection.cloud is not None
                 found = observed_distance(self.mesh, self.inspection.cloud.points)
@@ -111,6 +125,13 @@ class FramePage:
                 scale = distance_scale(values, f" {self.unit.length_name}")
             self._painted[mode] = [scale.colors(value) for value in values], html.color_bar(scale)
         return self._painted[mode]
+
+    def _radii(self) -> tuple[list[Float[np.ndarray, " _"]], ColorScale]:
+        """Radius of 95 % at each vertex, in the unit of the page, and its scale."""
+        here = self.inspection.here
+        assert here is not None and here.uncertainty is not None
+        radii = here.uncertainty.radii(here.material).scaled(self.unit.length_factor)
+        return list(radii.vertices), radius_scale(radii, f" {self.unit.length_name}")
 
     def _turn(self, name: str) -> None:
         side = np.array([1.0, 0.0, 0.0])
@@ -145,6 +166,8 @@ class FramePage:
         answer = self.inspection.ask(place[None])
         colors = (EMPTY_COLOR, *self.inspection.colors)
         self.told.content = html.answer(answer, self.inspection.names, colors, place, self.unit)
+        if self.why is not None:
+            self.why.show(place)
         distance, direction = float(answer.distance[0]), answer.direction[0]
         if np.isnan(distance) or np.isnan(direction).any():
             return

@@ -1,11 +1,13 @@
 """Probe of an answer, in the input's frame: what is known of a place, and which place a look meets."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.fitting.answer import Answer as FrameAnswer
+from mereo.fitting.recognition import Recognition, recognize
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
@@ -25,6 +27,8 @@ class Probed:
         direction: unit vector towards it; NaN where that is not known.
         probability: of empty space and each segment, by the network; None where no frame was given to it.
         rest: where the point was at rest, scene units; None where no model is registered.
+        radius95: radius around the point that holds the true place of what is registered there with probability 0.95;
+            None where that is not known.
     """
 
     label: UInt8[np.ndarray, " n"]
@@ -32,6 +36,7 @@ class Probed:
     direction: Float[np.ndarray, "n 3"]
     probability: Float[np.ndarray, "n c"] | None
     rest: Float[np.ndarray, "n 3"] | None
+    radius95: Float[np.ndarray, " n"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +89,7 @@ class Inspection:
             surfaces=registration.mesh.transformed(inverse_rigid(T_camera_input)),
             T_camera_input=T_camera_input,
             model=model,
-            source=explained(registration),
+            source=explained(registration, recognize(registration, model.calibration)),
             cloud=cloud,
             code=None if seen is None else model.encode(seen),
             registration=registration,
@@ -111,11 +116,20 @@ class Inspection:
         """Facts about points of the input's frame: those of the registered model where it is the answer."""
         told = None if self.code is None else self.network(points)
         if self.registration is not None:
-            found = self.registration.query(transform_points(self.T_camera_input, points))
+            seen = transform_points(self.T_camera_input, points)
+            found = self.registration.query(seen)
             chances = None if told is None else told.probability
-            return Probed(found.label, found.distance, self._turned(found.direction), chances, found.rest)
+            radius = self.registration.radius95(seen, at="camera")
+            return Probed(found.label, found.distance, self._turned(found.direction), chances, found.rest, radius)
         told = self.network(points) if told is None else told
         return Probed(told.label, told.distance, told.direction, told.probability, None)
+
+    @cached_property
+    def here(self) -> Registration | None:
+        """The registration in the input's frame, where it can say how sure it is."""
+        if self.registration is None or self.registration.uncertainty is None:
+            return None
+        return self.registration.moved(inverse_rigid(self.T_camera_input))
 
     def _turned(self, direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Directions of the camera frame in the input's."""
@@ -126,13 +140,15 @@ def source_of(found: FrameAnswer, registrar: Registrar | None) -> str:
     """Where an answer comes from, in a phrase for people."""
     if registrar is None:
         return "network alone: the weights carry no statistical model"
-    return explained(found.registration) if found.registration is not None and found.taken else found.source
+    if found.registration is not None and found.taken:
+        return explained(found.registration, found.recognition)
+    told = None if found.registration is None else found.recognition.told
+    return found.source if told is None else f"{found.source}; {told}"
 
 
-def explained(registration: Registration) -> str:
-    """How well a registration explains its frame, in a phrase for people."""
-    told = registration.told
-    return told if registration.doubt is None or not registration.accepted else f"{told}; {registration.doubt}"
+def explained(registration: Registration, recognition: Recognition) -> str:
+    """How well a registration explains its frame, and whether that shows the object, in a phrase for people."""
+    return registration.told if recognition.told is None else f"{registration.told}; {recognition.told}"
 
 
 def first_hit(

@@ -1,0 +1,172 @@
+"""Calibrated probabilities: scaling finds what made them wrong, labels stay, and the file keeps everything else."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from analytic import AnalyticModel, ball, logits_of, untrained
+from safetensors import safe_open
+
+from mereo import __main__ as command_line
+from mereo.evaluation.calibrate import calibrate
+from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.probability_scaling import GOOD_ENOUGH, Scaling, fit_scaling
+from mereo.evaluation.reliability import BINS, AskedCells, Reliability
+from mereo.models.calibration import Calibration
+from mereo.models.model import Model
+from mereo.models.weights import load_model, save_model, with_calibration
+from mereo.reconstruction.segment_statistics import segment_points
+from mereo.scenes.registry import load_scene
+
+NAMES = ("one", "two")
+FAVOUR = np.array([0.0, 2.0, -1.0])
+SCALED = Calibration(seed=7, views=8, temperature=2.0, biases=(0.0, -1.0, 0.5))
+
+
+def drawn(logits: np.ndarray) -> np.ndarray:
+    """Labels as likely as the logits say."""
+    rng = np.random.default_rng(0)
+    return (logits + rng.gumbel(size=logits.shape)).argmax(axis=1).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def logits() -> np.ndarray:
+    return np.random.default_rng(1).normal(scale=3.0, size=(40_000, 3))
+
+
+# --- the calibration error --------------------------------------------------------------------------------------------
+
+
+def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
+    """Nine of ten right at 0.6: 0.3; and half of the answers without any error halve it."""
+    counted = Reliability()
+    counted.add(np.full(10, 0.6), np.arange(10) > 0)
+    assert counted.ece == pytest.approx(0.3)
+    counted.add(np.full(10, 1.0), np.ones(10, dtype=bool))
+    assert counted.ece == pytest.approx(0.15)
+    assert [bin["share"] for bin in counted.facts()] == [0.5, 0.5] and len(counted.count) == BINS
+    assert np.isnan(Reliability().ece)
+
+
+def test_answers_that_are_as_likely_as_they_say_have_none(logits: np.ndarray) -> None:
+    assert Scaling().ece(logits, drawn(logits)) < 0.01
+
+
+def test_scaling_finds_what_made_the_probabilities_wrong(logits: np.ndarray) -> None:
+    """Logits that are sharper, and favour a class, by known amounts; labels come from the true ones."""
+    truth = drawn(logits)
+    sharper = fit_scaling(2.5 * logits, truth)
+    assert sharper.biases is None and sharper.temperature == pytest.approx(2.5, rel=0.03)
+    favoured = fit_scaling(2.5 * (logits + FAVOUR), truth)
+    assert favoured.biases is not None and favoured.temperature == pytest.approx(2.5, rel=0.03)
+    np.testing.assert_allclose(favoured.biases, [0.0, -2.0, 1.0], atol=0.08)
+    before = Scaling().ece(2.5 * (logits + FAVOUR), truth)
+    assert favoured.ece(2.5 * (logits + FAVOUR), truth) < GOOD_ENOUGH / 2 < before / 5
+
+
+def test_cells_are_drawn_among_those_that_count_and_are_the_same_every_time() -> None:
+    truth = truth_grid(load_scene("rope").rest, 24)
+    cells = AskedCells.of(truth, 500)
+    index = np.rint((cells.points - truth.grid.origin) / truth.grid.spacing).astype(int)
+    assert len(cells.points) == 500 and truth.kept[tuple(index.T)].all()
+    np.testing.assert_array_equal(truth.grid.labels[tuple(index.T)], cells.truth)
+    np.testing.assert_array_equal(AskedCells.of(truth, 500).points, cells.points)
+
+
+# --- the model --------------------------------------------------------------------------------------------------------
+
+
+def test_labels_stay_and_probabilities_are_scaled() -> None:
+    plain = untrained(NAMES)
+    scaled = replace(plain, calibration=SCALED)
+    points = np.random.default_rng(2).normal(size=(300, 3)) + np.array([0.0, 0.0, 5.0])
+    before, after = (model.query(model.encode(points), points) for model in (plain, scaled))
+    np.testing.assert_array_equal(before.label, after.label)
+    logits = plain.logits(plain.encode(points), points).astype(np.float64)
+    expected = np.exp(logits / 2.0 + [0.0, -1.0, 0.5])
+    np.testing.assert_allclose(after.probability, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
+    assert scaled.calibrates and not plain.calibrates
+    own = torch.tensor([[1.0, 2.0, 3.0]])
+    assert Calibration(seed=0, views=8).scaled(own) is own
+
+
+def test_observed_points_have_the_calibrated_probability_of_their_own_segment() -> None:
+    logits = np.log(np.array([[0.5, 0.4, 0.1], [0.2, 0.3, 0.5]], dtype=np.float32))
+    plain = segment_points(logits, np.zeros((2, 3)), NAMES, ((0, 0, 0), (9, 9, 9)))
+    halved = segment_points(
+        logits, np.zeros((2, 3)), NAMES, plain.colors, Calibration(seed=0, views=8, temperature=0.5)
+    )
+    np.testing.assert_array_equal(plain.labels, halved.labels)
+    np.testing.assert_allclose(halved.confidence, [16 / 17, 25 / 34], rtol=1e-5)
+    given = segment_points(logits, np.zeros((2, 3)), NAMES, plain.colors, labels=np.array([2, 2], dtype=np.uint8))
+    np.testing.assert_allclose(given.confidence, [0.2, 5 / 8], rtol=1e-5)
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+
+
+def tensors(path: Path) -> dict[str, bytes]:
+    with safe_open(path, framework="pt") as file:
+        return {key: file.get_tensor(key).numpy().tobytes() for key in file.keys()}  # noqa: SIM118 (not a mapping)
+
+
+def test_all_else_of_a_file_stays(tmp_path: Path) -> None:
+    path, calibrated = tmp_path / "plain.safetensors", tmp_path / "calibrated.safetensors"
+    save_model(untrained(NAMES), path, torch.float16)
+    calibrated.write_bytes(with_calibration(path, SCALED))
+    assert tensors(path) == tensors(calibrated)
+    assert load_model(calibrated).calibration == SCALED and load_model(path).calibration is None
+
+
+def test_biases_of_other_classes_are_refused(tmp_path: Path) -> None:
+    path, wrong = tmp_path / "plain.safetensors", tmp_path / "wrong.safetensors"
+    save_model(untrained(NAMES), path)
+    wrong.write_bytes(with_calibration(path, SCALED.model_copy(update={"biases": (0.0, 1.0)})))
+    with pytest.raises(ValueError, match="a calibration with 2 biases, and 3 classes; calibrate it again"):
+        load_model(wrong)
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_weights_are_not_replaced_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "plain.safetensors"
+    save_model(untrained(load_scene("rope").rest.names), path)
+    before = path.read_bytes()
+    assert command_line.main(["calibrate", str(path)]) == 2
+    assert "exists; it is not overwritten" in capsys.readouterr().err and path.read_bytes() == before
+
+
+def test_the_command_writes_what_was_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A network that knows nothing: its probabilities become those of the classes' shares."""
+    path, output = tmp_path / "plain.safetensors", tmp_path / "calibrated.safetensors"
+    save_model(untrained(load_scene("rope").rest.names), path)
+    assert command_line.main(["calibrate", str(path), "--output", str(output), "--views", "8"]) == 0
+    told = capsys.readouterr().out
+    assert "8 views of the training seed 900000" in told and f"wrote {output}" in told
+    found = load_model(output).calibration
+    assert found is not None and found.temperature is not None and found.recognizing is None
+    assert found.ece is not None and found.ece[1] < min(0.05, found.ece[0])
+    assert command_line.main(["weights", "show", str(output), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["calibration"]["views"] == 8
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"seed": 1_000_000}, "the seed is 1000000; calibration is part of training: take one below 1000000"),
+        ({"views": 7}, "7 views are asked for; at least 8 tell anything"),
+    ],
+)
+def test_test_seeds_and_too_few_views_are_refused(options: dict[str, int], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        calibrate(untrained(load_scene("rope").rest.names), **options)
+
+
+def test_an_analytic_field_answers_as_before() -> None:
+    """The tests' closed-form model has no calibration and says so."""
+    model: Model = AnalyticModel.of(logits_of(ball((0.0, 0.0, 5.0), 1.0)), ("one",))
+    assert not model.calibrates

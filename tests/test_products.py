@@ -1,0 +1,79 @@
+"""Products of layers by oneDNN: the same numbers, where nothing but numbers is asked for."""
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from mereo.experiments.speed.roofline import count_operations
+from mereo.models.ops import products
+from mereo.models.ops.products import ROWS, linear, onednn_gain
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many rows oneDNN was asked for, as if it were faster here."""
+    rows_of_each: list[int] = []
+    onednn = products._by_onednn
+
+    def by_onednn(rows: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+        rows_of_each.append(rows.numel() // rows.shape[-1])
+        return onednn(rows, weight, bias)
+
+    monkeypatch.setattr(products, "_by_onednn", by_onednn)
+    monkeypatch.setattr(products, "onednn_gain", lambda: 2.0)
+    return rows_of_each
+
+
+def layer(inputs: int = 70, outputs: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
+    numbers = torch.Generator().manual_seed(0)
+    return torch.randn(outputs, inputs, generator=numbers), torch.randn(outputs, generator=numbers)
+
+
+def rows(count: int, inputs: int = 70) -> torch.Tensor:
+    return torch.randn(1, count, inputs, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("biased", [True, False])
+def test_products_are_torchs_own(asked: list[int], biased: bool) -> None:
+    weight, bias = layer()
+    with torch.inference_mode():
+        for count in (ROWS, 2 * ROWS):
+            found = linear(rows(count), weight, bias if biased else None)
+            exact = F.linear(rows(count).double(), weight.double(), bias.double() if biased else None)
+            torch.testing.assert_close(found.double(), exact, rtol=0, atol=1e-4)
+    assert asked == [ROWS, 2 * ROWS]
+
+
+def test_other_sizes_precisions_and_trainings_are_torchs(asked: list[int]) -> None:
+    weight, bias = layer()
+    with torch.inference_mode():
+        assert torch.equal(linear(rows(ROWS + 1), weight, bias), F.linear(rows(ROWS + 1), weight, bias))
+        linear(rows(ROWS).double(), weight.double())
+        linear(rows(0), weight)
+        with torch.autocast("cpu", torch.bfloat16):
+            assert linear(rows(ROWS), weight).dtype == torch.bfloat16
+    weight.requires_grad_()
+    linear(rows(ROWS), weight, bias).sum().backward()
+    assert weight.grad is not None and not asked
+
+
+def test_a_torch_without_the_operator_does_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(*_: object) -> torch.Tensor:
+        raise AttributeError("'_OpNamespace' 'mkldnn' object has no attribute '_linear_pointwise'")
+
+    monkeypatch.setattr(products, "_by_onednn", gone)
+    onednn_gain.cache_clear()
+    try:
+        assert onednn_gain() == 0.0
+        with torch.inference_mode():
+            weight, bias = layer()
+            assert torch.equal(linear(rows(ROWS), weight, bias), F.linear(rows(ROWS), weight, bias))
+    finally:
+        onednn_gain.cache_clear()
+
+
+def test_its_operations_are_counted(asked: list[int]) -> None:
+    weight, _ = layer()
+    with torch.inference_mode():
+        assert count_operations(lambda: linear(rows(ROWS), weight)) == 2 * ROWS * 70 * 40
+    assert asked == [ROWS]

@@ -1,0 +1,226 @@
+"""Is it my object, in a state that I know: each sign has its say, together they decide, and one gives the reason."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy_scene import Shear, toy_scene
+
+from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
+from mereo.evaluation.recognition_gauge import RecognitionGauge, usual_of
+from mereo.evaluation.sample_views import load_view
+from mereo.fitting.answer import answer
+from mereo.fitting.noise import ACCEPTED
+from mereo.fitting.recognition import CONSERVATIVE, MOST, NOT_ASKED, Recognition, Signs, recognize, strangeness
+from mereo.fitting.register import Registrar
+from mereo.fitting.registration import Registration
+from mereo.geometry.camera import PointCloud
+from mereo.models.calibration import Calibration, Recognizing, Usual
+from mereo.models.weights import load_model
+from mereo.scenes.farther_states import FartherDraws, with_farther_states
+from mereo.scenes.random_states import scene_model
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+
+SCENE = toy_scene()
+
+
+@pytest.fixture(scope="module")
+def registration() -> Registration:
+    """A registration that nothing speaks against: the mean state."""
+    model = scene_model(SCENE, count=100)
+    return Registration(
+        model=model,
+        material=model.mean + np.array([0.0, 0.0, 100.0]),
+        method="modes",
+        z=np.full(model.count, 0.5),
+        scene_unit=1.0,
+        unit_known=False,
+        explained=1.0,
+        accepted=True,
+        seconds=0.1,
+        residual=0.05,
+        ruled_out=0.0,
+    )
+
+
+# --- what is said -----------------------------------------------------------------------------------------------------
+
+
+def test_the_object_in_a_learned_state_is_known(registration: Registration) -> None:
+    said = recognize(registration, displaced=0.03, stated_unit=1.01)
+    assert said.known is True and said.reason is None and said.told is None and not said.calibrated
+    assert said.strangeness < 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "sentence"),
+    [
+        ({"explained": 0.2}, {}, "only 20% of the points can be the model's: this is probably another object"),
+        ({"explained": 0.6}, {}, "40% of the points are not the model's: look at the result"),
+        ({"ruled_out": 0.4}, {}, "40% of the model's surface lies where the frame shows none of it"),
+        ({"z": 10.0}, {}, "scene units outside those that were learned, and rigid parts may be bent"),
+        ({}, {"displaced": 0.9}, "have the same places of the object 90% of half its length apart"),
+        ({}, {"stated_unit": 25.4}, "its size differs by a factor of 25.4 from the object's in the frame's unit"),
+        ({}, {"stated_unit": 0.001}, "a factor of 1e+03 "),
+    ],
+)
+def test_each_sign_has_its_say(
+    registration: Registration, change: dict[str, float], options: dict[str, float], sentence: str
+) -> None:
+    changes: dict[str, object] = {**change}
+    if "z" in change:
+        changes["z"] = registration.z + change["z"]
+    said = recognize(replace(registration, **changes), **options)
+    assert said.known is not True and said.reason is not None and sentence in said.reason
+    assert said.told is not None and said.told.endswith(said.reason)
+
+
+def test_the_more_is_wrong_the_less_is_known(registration: Registration) -> None:
+    """Known, unsure, refused; and strangeness never falls."""
+    said = [recognize(replace(registration, explained=share)) for share in (1.0, 0.98, 0.9, 0.8, 0.5, 0.1, 0.0)]
+    each = [one.strangeness for one in said]
+    assert each == sorted(each) and [said[0].known, said[-1].known] == [True, False]
+    assert "unsure" in [one.known for one in said]
+    order = [{True: 0, "unsure": 1, False: 2}[one.known] for one in said]
+    assert order == sorted(order)
+
+
+def test_a_noisy_frame_may_leave_more_unexplained(registration: Registration) -> None:
+    clean, noisy = (replace(registration, explained=0.88, needed=needed) for needed in (0.95, ACCEPTED))
+    assert recognize(noisy).strangeness < recognize(clean).strangeness
+    assert recognize(noisy).known is True
+
+
+def test_the_object_at_rest_is_known_whatever_was_learned(registration: Registration) -> None:
+    odd = replace(registration, z=registration.z + 10.0)
+    assert recognize(odd).known is False and recognize(replace(odd, method="rest")).known is True
+
+
+def test_what_was_not_found_is_not_the_object_and_what_was_not_asked_is_unsure() -> None:
+    assert recognize(None) is NOT_ASKED and NOT_ASKED.known == "unsure"
+    said = recognize(None, refusal="the network finds only 3 points of the object")
+    assert said.known is False and said.strangeness == MOST and said.reason is not None and "3 points" in said.reason
+
+
+def test_calibrated_weights_have_their_own_limits(registration: Registration) -> None:
+    """The same signs, twice as usual: nothing to say. And of weights that never saw such: refused."""
+    odd = replace(registration, explained=0.8)
+    usual = {"unexplained": Usual(mean=np.log(4.1), std=0.3)}
+    lenient = Recognizing(clean=usual, noisy=usual, unsure=3.0, refused=6.0)
+    said = recognize(odd, Calibration(seed=1, views=8, recognizing=lenient))
+    assert said.known is True and said.calibrated
+    strict = lenient.model_copy(update={"clean": {"unexplained": Usual(mean=np.log(0.1), std=0.2)}})
+    assert recognize(odd, Calibration(seed=1, views=8, recognizing=strict)).known is False
+
+
+def test_signs_add_up() -> None:
+    """Two signs of three standard deviations are stranger than one, by the root of two; what is usual adds none."""
+    usual = {name: Usual(mean=0.0, std=1.0) for name in ("unusual", "displaced", "beyond")}
+    one, two = (Signs(unusual=np.exp(3.0), displaced=d, beyond=0.01) for d in (0.01, np.exp(3.0)))
+    assert strangeness(two.strange(usual)) == pytest.approx(np.sqrt(2) * strangeness(one.strange(usual)), rel=1e-3)
+
+
+def test_limits_in_the_wrong_order_are_refused() -> None:
+    with pytest.raises(ValueError, match="the limits are 5 and 4; the first must be the smaller"):
+        Recognizing(clean={}, noisy={}, unsure=5.0, refused=4.0)
+
+
+def test_facts_are_what_programs_read(registration: Registration) -> None:
+    facts = recognize(registration).facts()
+    assert facts["known"] is True and facts["reason"] is None and facts["signs"]["unexplained"] == 0.0
+    assert Recognition("unsure", "because", 4.5).facts()["signs"] is None
+
+
+# --- how limits are measured ------------------------------------------------------------------------------------------
+
+
+def signs(rng: np.random.Generator, factor: float = 1.0) -> Signs:
+    own = factor * np.exp(rng.normal(scale=0.3, size=5))
+    return Signs(None, 0.2 * own[0], 0.01 * own[1], 0.05 * own[2], 0.5 * own[3], 0.05 * own[4])
+
+
+def test_limits_lie_between_the_object_and_other_things() -> None:
+    rng, gauge = np.random.default_rng(0), RecognitionGauge()
+    gauge.clean = [signs(rng) for _ in range(24)]
+    gauge.noisy = [signs(rng, 2.0) for _ in range(12)]
+    gauge.strange = [(signs(rng, 12.0), False) for _ in range(20)]
+    found = gauge.fields()["recognizing"]
+    own = [strangeness(signs(rng).strange(found.clean)) for _ in range(200)]
+    noisy = [strangeness(signs(rng, 2.0).strange(found.noisy)) for _ in range(200)]
+    others = [strangeness(signs(rng, 12.0).strange(found.clean)) for _ in range(200)]
+    assert np.mean(np.array(own) > found.unsure) < 0.05 and max(own + noisy) < found.refused < np.quantile(others, 0.2)
+
+
+def test_a_view_that_was_not_understood_moves_no_limit() -> None:
+    rng = np.random.default_rng(1)
+    views = [signs(rng) for _ in range(24)]
+    usual, spoiled = usual_of(views), usual_of([*views, signs(rng, 1e4)])
+    assert all(abs(usual[name].mean - spoiled[name].mean) < 0.15 for name in usual)
+
+
+def test_without_views_nothing_is_measured() -> None:
+    assert RecognitionGauge().fields() == {}
+    few = RecognitionGauge()
+    few.clean = [signs(np.random.default_rng(2)) for _ in range(8)]
+    assert few.fields()["recognizing"].noisy == dict(CONSERVATIVE.noisy)
+
+
+# --- what is seen -----------------------------------------------------------------------------------------------------
+
+
+def test_states_beyond_have_their_draws_beyond_their_bounds() -> None:
+    """Two-sided intervals on the drawn side, one-sided ones away from zero; choices and full turns stay."""
+    far = FartherDraws(3, 1.5)
+    assert set(np.round(far.uniform(-2.0, 2.0, 50), 9)) == {-3.0, 3.0}
+    assert far.uniform(2.0, 6.0) == 7.0 and far.uniform(-6.0, -2.0) == -7.0 and far.triangular(0.0, 1.0, 3.0) == 4.0
+    assert 0 <= far.uniform(0.0, 2 * np.pi) <= 2 * np.pi and far.integers(5) in range(5)
+    assert far.normal(10.0, 2.0, 4000).std() == pytest.approx(3.0, rel=0.05)
+    assert far.standard_normal(4000).std() == pytest.approx(1.5, rel=0.05)
+    shear = with_farther_states(SCENE, 1.5).sample_deformations(np.random.default_rng(0))[0]
+    assert isinstance(shear, Shear) and np.abs([shear.a, shear.b, shear.c]) == pytest.approx([4.5, 0.45, 0.3])
+
+
+def test_a_scene_that_refuses_has_no_frames_beyond() -> None:
+    def never(rng: np.random.Generator) -> tuple[object, ...]:
+        raise ValueError("no")
+
+    refusing = replace(SCENE, sample_deformations=never)
+    assert list(frames_beyond(refusing, 2, 710_000)) == []
+
+
+def test_views_are_clean_and_noisy_in_turn_and_the_same_every_time() -> None:
+    views: list[CalibrationView] = list(own_views(SCENE, 5, 710_000))
+    assert [view.camera for view in views[:4]] == ["paper", "structured-light", "paper", "time-of-flight"]
+    assert [view.scene_unit for view in views] == [1.0] * 4 + [None]
+    again = next(own_views(SCENE, 1, 710_000))
+    np.testing.assert_array_equal(views[0].seen.points, again.seen.points)
+
+
+def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mereo.evaluation.calibration_views.SCENES", ("rope", "robot", "liver", "tumor"))
+    rope: Scene = load_scene("rope")
+    assert other_objects(rope) == ["robot", "liver"] and "tumor" not in other_objects(load_scene("liver"))
+    monkeypatch.setattr("mereo.evaluation.calibration_views.SCENES", ("rope", "robot"))
+    frames = list(strange_frames(rope, 1, 710_000))
+    assert [frame.kind for frame in frames] == ["other object"] + ["plane or clutter"] * 8
+    low, high = rope.rest.bounds
+    assert all(len(frame.cloud) > 10 for frame in frames)
+    assert all(np.ptp(frame.cloud.points, axis=0).max() < 2 * (high - low).max() for frame in frames[1:])
+
+
+# --- the whole way ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_shipped_weights_tell_their_object_from_another_and_from_a_wrong_unit() -> None:
+    rope = load_model("rope")
+    own, other = (load_view(name).depth.to_points() for name in ("rope", "robot"))
+    registrar = Registrar.of(rope, "modes")
+    assert answer(own, rope, registrar, 24, stated_unit=1.0).recognition.known is True
+    found = answer(other, rope, "auto", 24)
+    assert found.recognition.known is False and not found.taken
+    inches = answer(PointCloud(own.points / 25.4), rope, registrar, 24, stated_unit=1.0).recognition
+    assert inches.known is False and inches.reason is not None and "a factor of" in inches.reason
+    assumed = answer(PointCloud(own.points / 25.4), rope, registrar, 24, stated_unit=1.0, unit_assumed=True)
+    assert assumed.recognition.known is True

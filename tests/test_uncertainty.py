@@ -1,0 +1,295 @@
+"""Uncertainty of registrations: theorems on the posterior, and what users are told in units."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from toy_scene import Lift, Shear, toy_scene
+
+from mereo.evaluation.coverage import RadiusRatios, seen_points
+from mereo.fitting.correspondences import Correspondences
+from mereo.fitting.fit import fit_correspondences
+from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.posterior import Posterior, covariance_factor, radius95
+from mereo.fitting.registration import Registration
+from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.moments import owned_centroids, owned_gradients
+from mereo.geometry.transforms import rigid, transform_points
+from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.synthesis.depth_rendering import render_depth
+
+SCENE = toy_scene()
+IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matrix(), np.array([1.0, 2.0, 120.0]))
+"""``T_camera_world`` of an object around the world's origin."""
+
+
+@pytest.fixture(scope="module")
+def model() -> StatisticalModel:
+    return scene_model(SCENE, count=200)
+
+
+@pytest.fixture(scope="module")
+def material(model: StatisticalModel) -> np.ndarray:
+    shear = Shear(1.5, 0.15, 0.1)
+    state = SCENE.deform((shear, shear, shear, Lift(1.0, shear)))
+    return transform_points(IN_FRONT, state_points(state, model.nodes, model.node_labels))
+
+
+def seen(mesh: SegmentedMesh) -> np.ndarray:
+    """Cloud of a noiseless depth image, from the origin along z."""
+    return render_depth(mesh, Camera.from_fov(96, 96, 0.6)).to_points().points
+
+
+def said(model: StatisticalModel, material: np.ndarray) -> Correspondences:
+    """What a network might say of a state."""
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(model.labels), 200, replace=False)
+    rest = model.rest_points[chosen] + rng.normal(scale=0.5, size=(200, 3))
+    return Correspondences(material[chosen], rest, model.labels[chosen], np.ones(200), np.arange(200) < 100)
+
+
+@pytest.fixture(scope="module")
+def found(model: StatisticalModel, material: np.ndarray) -> Registration:
+    registration = fit_correspondences(seen(model.mesh(material)), said(model, material), model, 1.0)
+    assert registration.method == "modes" and registration.explained > 0.95
+    return registration
+
+
+def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
+    """Exact for one direction and for three alike; between, by draws."""
+    one, three = np.diag([4.0, 0.0, 0.0]), 4.0 * np.eye(3)
+    np.testing.assert_allclose(radius95(np.stack([one, three])), 2.0 * np.sqrt(chi2.ppf(0.95, [1, 3])), rtol=1e-9)
+    rng = np.random.default_rng(0)
+    for spread in ([1.0, 0.5, 0.1], [1.0, 1.0, 0.0], [1.0, 0.2, 0.2]):
+        turn = Rotation.random(random_state=1).as_matrix()
+        points = rng.normal(size=(200_000, 3)) * spread @ turn.T
+        radius = radius95((turn @ np.diag(np.square(spread)) @ turn.T)[None])[0]
+        assert (np.linalg.norm(points, axis=1) <= radius).mean() == pytest.approx(0.95, abs=0.005)
+
+
+def test_more_spread_in_any_direction_never_makes_the_radius_smaller() -> None:
+    """Adding any covariance to any other, down to none."""
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(2000, 3, 3)) * rng.random((2000, 1, 3)) ** 4
+    more = rng.normal(size=(2000, 3, 1)) * rng.random((2000, 1, 1)) ** 4
+    less = factor @ factor.transpose(0, 2, 1)
+    assert (radius95(less + more @ more.transpose(0, 2, 1)) >= radius95(less) * (1 - 1e-9)).all()
+
+
+def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
+    """Points with one coefficient, each measured in space: Bayes' rule for a Gaussian, by hand and by the factor.
+
+    The pose is held. With a prior N(0, 1) and measurements ``m_i z + noise``, the variance of z is
+    ``1 / (1 + sum |m_i|^2 / sigma^2)``.
+    """
+    rng = np.random.default_rng(0)
+    modes, sigma = rng.normal(size=(7, 3, 1)).astype(np.float32), 0.3
+    held = NormalEquations.prior(np.zeros(1), np.zeros(1), np.eye(1), 0.0, 1e-6)
+    matrix = held.matrix + np.diag([1e12] * 6 + [0.0, 0.0])
+    jacobian = np.zeros((21, POSE + 1))
+    jacobian[:, POSE] = modes.ravel()
+    normal = NormalEquations(matrix, held.gradient).add(jacobian, np.zeros(21), np.full(21, sigma**-2))
+    turn = Rotation.random(random_state=2).as_matrix()
+    posed = Posed(turn, np.array([3.0, -2.0, 50.0]), np.zeros(1))
+    posterior = Posterior.of(normal, posed, rng.normal(size=(7, 3)), modes)
+    variance = 1.0 / (1.0 + float((modes.astype(float) ** 2).sum()) / sigma**2)
+    lengths = np.linalg.norm(modes[..., 0], axis=1)
+    np.testing.assert_allclose(posterior.radii(), lengths * np.sqrt(variance * chi2.ppf(0.95, 1)), rtol=1e-3)
+
+
+def test_the_factor_is_that_of_the_inverse() -> None:
+    """Of parameters whose units differ by a factor of a million."""
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(40, 8)) * np.logspace(-3, 3, 8)
+    factor = covariance_factor(half.T @ half)
+    np.testing.assert_allclose(factor @ factor.T @ (half.T @ half), np.eye(8), atol=1e-6)
+
+
+def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
+    """Of a box with a ball in it, which takes its volume away."""
+    mesh = SCENE.rest
+    nested = SegmentedMesh((mesh.segments[3], replace(mesh.segments[0], name="around")), (("ball", "around"),))
+    rng = np.random.default_rng(0)
+    gradients = owned_gradients(nested)
+    for _ in range(3):
+        change = rng.normal(size=gradients.shape[2:])
+        ends = [len(nested.segments[0].vertices)]
+
+        def at(step: float, change: np.ndarray = change, ends: list[int] = ends) -> tuple[np.ndarray, np.ndarray]:
+            moves = np.split(step * change, ends)
+            parts = [s.vertices + move for s, move in zip(nested.segments, moves, strict=True)]
+            moved = nested.with_vertices(parts)
+            return moved.owned_volumes, owned_centroids(moved)
+
+        (more, center), (less, other) = at(1e-5), at(-1e-5)
+        said = np.einsum("sqvi,vi->sq", gradients, change)
+        np.testing.assert_allclose(said[:, 0], (more - less) / 2e-5, rtol=1e-5)
+        np.testing.assert_allclose(said[:, 1:], (center - other) / 2e-5, rtol=1e-3, atol=1e-5)
+
+
+def test_more_noise_never_makes_a_radius_smaller(found: Registration) -> None:
+    """The same optimum, with the same partners at a greater standard deviation."""
+    optimum, before = found.optimum, np.zeros(len(found.material))
+    assert optimum is not None
+    for sigma in (0.2, 0.3, 0.5, 1.0):
+        problem = replace(optimum.problem, config=replace(optimum.problem.config, cloud_sigma=sigma))
+        jacobian, residual, weight = optimum.terms.cloud
+        terms = replace(optimum.terms, cloud=(jacobian, residual, weight * (0.2 / sigma) ** 2))
+        posterior = optimum.posterior
+        radii = Posterior.of(terms.total, optimum.posed, posterior.material, posterior.modes).radii()
+        assert problem.config.cloud_sigma == sigma
+        assert (radii >= before * (1 - 1e-4)).all()
+        before = radii
+
+
+def test_hidden_points_have_larger_radii_than_seen_ones(found: Registration, material: np.ndarray) -> None:
+    assert found.uncertainty is not None
+    radii = found.uncertainty.material
+    shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
+    assert np.median(radii[~shown]) > 1.2 * np.median(radii[shown])
+    assert (radii > 0).all()
+
+
+def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: np.ndarray, found: Registration) -> None:
+    """The same frame in millimetres and in metres, and turned about the camera."""
+    assert found.uncertainty is not None
+    turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
+    points, network = seen(model.mesh(material)), said(model, material)
+    for unit in (0.001, 25.0):
+        other = replace(network, points=unit * network.points @ turn.T)
+        again = fit_correspondences(unit * points @ turn.T, other, model, unit)
+        assert again.uncertainty is not None
+        np.testing.assert_allclose(again.uncertainty.material, unit * found.uncertainty.material, rtol=0.02)
+        for one, first in zip(again.uncertainty.segments, found.uncertainty.segments, strict=True):
+            assert one.centroid_radius95 == pytest.approx(unit * first.centroid_radius95, rel=0.02)
+            assert one.volume95 == pytest.approx([unit**3 * value for value in first.volume95], rel=0.02)
+
+
+def test_another_frame_changes_no_radius(found: Registration) -> None:
+    """A registration that is moved, and the points that are asked with it."""
+    T = rigid(Rotation.from_euler("xyz", [40, 10, 80], degrees=True).as_matrix(), np.array([5.0, 1.0, -3.0]))
+    asked = found.material[::50]
+    here, there = found.radius95(asked, at="camera"), found.moved(T).radius95(transform_points(T, asked), at="camera")
+    assert here is not None and there is not None
+    np.testing.assert_allclose(here, there, rtol=1e-3)
+
+
+def test_points_are_as_sure_as_the_vertices_that_they_are(found: Registration) -> None:
+    """A vertex asked as a point follows its neighbours, which move much as it does."""
+    assert found.uncertainty is not None
+    rows = np.arange(0, sum(found.model.vertex_counts), 7)
+    labels = found.model.labels[rows]
+    asked = found.radius95(found.model.rest_points[rows], labels, at="rest")
+    assert asked is not None
+    np.testing.assert_allclose(asked, found.uncertainty.material[rows], rtol=0.1)
+    assert [len(part) for part in found.uncertainty.vertices] == list(found.model.vertex_counts)
+
+
+def test_a_calibration_scales_radii_and_intervals(found: Registration) -> None:
+    assert found.uncertainty is not None and not found.uncertainty.calibrated
+    wide = replace(found, radius_scale=3.0).uncertainty
+    assert wide is not None and wide.calibrated
+    np.testing.assert_allclose(wide.material, 3.0 * found.uncertainty.material)
+    for one, other in zip(wide.segments, found.uncertainty.segments, strict=True):
+        assert one.centroid_radius95 == pytest.approx(3.0 * other.centroid_radius95)
+        assert np.ptp(one.volume95) == pytest.approx(3.0 * np.ptp(other.volume95), rel=1e-6)
+    assert wide.summary()["calibrated"] and wide.summary()["median"] == pytest.approx(
+        3 * found.uncertainty.summary()["median"]
+    )
+
+
+def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
+    found: Registration, material: np.ndarray
+) -> None:
+    """The true one may be outside once in twenty times, but not by as much again."""
+    assert found.uncertainty is not None
+    here, truth = found.mesh.owned_volumes, found.model.mesh(material).owned_volumes
+    for told, volume, true in zip(found.uncertainty.segments, here, truth, strict=True):
+        low, high = told.volume95
+        assert (low + high) / 2 == pytest.approx(volume, rel=1e-5)
+        assert 0 < high - low < 0.2 * true and abs(true - volume) < high - low
+
+
+def test_the_scale_is_that_which_holds_95_percent(found: Registration, material: np.ndarray) -> None:
+    """Ratios of radii that are too small by a known factor, and what is said of them with it."""
+    shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
+    one = RadiusRatios.of(found, material, shown)
+    assert len(one.seen) == shown.sum() and len(one.all) == len(material)
+    calibrated = RadiusRatios.of(replace(found, radius_scale=7.0), material, shown)
+    np.testing.assert_allclose(calibrated.all, one.all)
+    both = RadiusRatios.together([one, calibrated])
+    scale = both.scale()
+    said = both.by(scale).summary(unit_mm=2.0)
+    assert said["all"] == pytest.approx(0.95, abs=1e-3)
+    assert both.by(None).summary()["all"] == pytest.approx((one.all <= 1).mean())
+    assert said["radius_seen"] == pytest.approx(scale * np.median(one.radii_seen))
+    assert said["radius_hidden_mm"] == pytest.approx(2.0 * scale * np.median(one.radii_hidden))
+
+
+def test_a_registration_from_a_file_has_no_radii(found: Registration, material: np.ndarray) -> None:
+    read = replace(found, optimum=None)
+    assert read.uncertainty is None and read.radius95([[0.0, 0.0, 0.0]], at="rest") is None
+    with pytest.raises(ValueError, match="fit its frame again"):
+        RadiusRatios.of(read, material, np.ones(len(material), dtype=bool))
+
+
+def test_the_shares_of_all_evidence_sum_to_one(found: Registration) -> None:
+    """And a hidden point is unsure by what was known of the states, not by the points' noise, more than a seen one."""
+    shown = seen_points(found.material, PointCloud(seen(found.model.mesh(found.material))), 1.0)
+    shares = []
+    for row in (int(np.flatnonzero(shown)[5]), int(np.flatnonzero(~shown)[5])):
+        one = found.explain(found.model.rest_points[row], at="rest")
+        assert one is not None
+        assert sum(one.shares.values()) == pytest.approx(1.0, abs=1e-3) and min(one.shares.values()) > -1e-6
+        assert one.weights.sum() == pytest.approx(1.0) and (one.weights >= 0).all()
+        shares.append(one.shares["states"])
+    assert shares[1] > shares[0]
+
+
+def test_an_influence_is_how_far_a_moved_point_moves_the_place(found: Registration) -> None:
+    """By the normal equations: one point's residual changed, and their step from there."""
+    optimum = found.optimum
+    assert optimum is not None
+    row = 40
+    one = found.explain(found.material[row])
+    assert one is not None
+    best = int(one.weights.argmax())
+    jacobian, residual, weight = optimum.terms.cloud
+    change = np.zeros(len(residual))
+    change[best] = -1e-3  # the observed point moves outward, so that the model is farther inside
+    total = optimum.terms.total
+    step = np.linalg.solve(total.matrix, -(jacobian * weight[:, None]).T.astype(float) @ change)
+    moved = optimum.posed.moved(step)
+    posterior = optimum.posterior
+    before, after = posterior.material[row], moved.place(found.model.material(moved.z))[row]
+    np.testing.assert_allclose((after - before) / 1e-3, one.influence[best], rtol=0.05, atol=1e-3)
+
+
+def test_what_is_near_a_seen_point_decides_it(found: Registration) -> None:
+    """More than what is far; and of a frame that is turned the same is said, turned."""
+    row = int(np.flatnonzero(seen_points(found.material, PointCloud(seen(found.model.mesh(found.material))), 1.0))[20])
+    one = found.explain(found.material[row])
+    assert one is not None and len(one.unexplained) == 0
+    away = np.linalg.norm(one.points - one.place, axis=1)
+    assert one.weights[away < 4].mean() > 2 * one.weights[away > 12].mean()
+    T = rigid(Rotation.from_euler("xyz", [40, 10, 80], degrees=True).as_matrix(), np.array([5.0, 1.0, -3.0]))
+    turned = found.moved(T).explain(transform_points(T, found.material[[row]])[0])
+    assert turned is not None
+    np.testing.assert_allclose(turned.points, transform_points(T, one.points), atol=1e-6)
+    np.testing.assert_allclose(turned.influence, one.influence @ T[:3, :3].T, atol=1e-4)
+
+
+def test_segments_are_explained_by_name(found: Registration) -> None:
+    name = found.model.rest.names[0]
+    one = found.explain(name)
+    assert one is not None
+    np.testing.assert_allclose(one.place, owned_centroids(found.mesh)[0])
+    with pytest.raises(ValueError, match=r"there is no segment 'nose'; the segments are box_0, .*: name one of them"):
+        found.explain("nose")
+    with pytest.raises(ValueError, match="x, y, z"):
+        found.explain([1.0, 2.0])
+    assert replace(found, optimum=None).explain(name) is None

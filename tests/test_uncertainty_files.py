@@ -1,0 +1,296 @@
+"""How sure a registered model is, where people and programs read it: files, summary, report, stream, viewer."""
+
+import base64
+import json
+import re
+import zlib
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from mereo.cli.explain import explain, wish_of
+from mereo.cli.reconstruct import FrameJob
+from mereo.cli.stream import line
+from mereo.cli.stream_answers import FrameAnswer
+from mereo.evaluation.sample_views import load_view
+from mereo.fitting.answer import Answer, answer
+from mereo.fitting.register import Registrar
+from mereo.fitting.tracker import Tracker
+from mereo.geometry.camera import PointCloud
+from mereo.io.config import FilesConfig
+from mereo.models.calibration import Calibration
+from mereo.models.model import Model
+from mereo.models.weights import load_model
+from mereo.reconstruction.stream import Outcome
+from mereo.visualization.result_files import write_files, write_one
+from mereo.visualization.sure_colors import MOST, UNEXPLAINED, point_marks, sure_colors
+from mereo.visualization.units import Unit
+
+needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return load_model("liver")
+
+
+@pytest.fixture(scope="module")
+def cloud() -> PointCloud:
+    return load_view("liver").depth.to_points()
+
+
+@pytest.fixture(scope="module")
+def found(model: Model, cloud: PointCloud) -> Answer:
+    result = answer(cloud, model, Registrar.of(model, "modes"), 24)
+    assert result.registered is not None and result.registered.uncertainty is not None
+    return result
+
+
+@pytest.fixture(scope="module")
+def folder(found: Answer, cloud: PointCloud, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sure")
+    files = FilesConfig(("glb", "ply", "npz", "vti", "json"), millimetres=True)
+    write_files(
+        path, found.reconstruction, cloud, "camera", files, 0.5, {}, unit=Unit(0.5), registered=found.registered
+    )
+    return path
+
+
+def radii_of(found: Answer) -> np.ndarray:
+    assert found.registered is not None and found.registered.uncertainty is not None
+    return np.concatenate(found.registered.uncertainty.vertices)
+
+
+def test_what_is_hidden_is_less_sure_than_what_is_seen(found: Answer, cloud: PointCloud) -> None:
+    """On a real shape, in a frame whose truth nobody needs."""
+    assert found.registered is not None and found.registered.uncertainty is not None
+    away = cKDTree(cloud.points).query(found.registered.material)[0] / found.registered.scene_unit
+    radii = found.registered.uncertainty.material
+    assert np.median(radii[away > 3.0]) > 1.5 * np.median(radii[away < 1.0])
+
+
+def test_a_ply_has_the_radius_of_each_vertex_in_its_unit(found: Answer, folder: Path) -> None:
+    """With --millimetres, of a frame whose unit is half a metre."""
+    data = (folder / "segments.ply").read_bytes()
+    head, body = data.split(b"end_header\n", 1)
+    assert b"property uchar label\nproperty float radius95\n" in head
+    assert b"comment radius95 is in the unit of x, y, z; it is not calibrated\n" in head
+    kinds = [*((axis, "<f4") for axis in "xyz"), ("color", "u1", 3), ("label", "u1"), ("radius95", "<f4")]
+    vertices = np.frombuffer(body, np.dtype(kinds), count=len(radii_of(found)))
+    np.testing.assert_allclose(vertices["radius95"], 500.0 * radii_of(found), rtol=1e-5)
+    assert found.registered is not None
+    np.testing.assert_allclose(vertices["x"], 500.0 * found.registered.material[: len(vertices), 0], rtol=1e-4)
+
+
+def glb(path: Path) -> tuple[dict[str, Any], bytes]:
+    data = path.read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def accessor(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
+    view = document["bufferViews"][document["accessors"][index]["bufferView"]]
+    part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    return np.frombuffer(part, "<f4").reshape(document["accessors"][index]["count"], -1)
+
+
+def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(found: Answer, folder: Path) -> None:
+    assert found.registered is not None and found.registered.uncertainty is not None
+    document, binary = glb(folder / "segments.glb")
+    rows = np.split(np.arange(len(radii_of(found))), np.cumsum(found.registered.model.vertex_counts)[:-1])
+    for mesh, part in zip(document["meshes"], rows, strict=True):
+        attributes = mesh["primitives"][0]["attributes"]
+        assert mesh["extras"]["radius95"] == {"unit_m": 0.5, "calibrated": False} and "COLOR_0" not in attributes
+        told, place = (accessor(document, binary, attributes[name]) for name in ("_RADIUS95", "POSITION"))
+        away, same = cKDTree(found.registered.material[part]).query(
+            place
+        )  # vertices that are one place are written once
+        assert away.max() < 1e-4 and len(place) > 0.99 * len(part)
+        np.testing.assert_allclose(told[:, 0], radii_of(found)[part][same], rtol=1e-3)
+
+
+def test_a_second_glb_is_coloured_by_the_radius(found: Answer, folder: Path) -> None:
+    """Pale where sure, dark red where not; other programs read it."""
+    document, binary = glb(folder / "radius95.glb")
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    radii, colors = (accessor(document, binary, attributes[name]) for name in ("_RADIUS95", "COLOR_0"))
+    light = colors.sum(axis=1)
+    assert light[radii[:, 0].argmin()] > light[radii[:, 0].argmax()] and colors.min() >= 0 and colors.max() <= 1
+    assert document["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"][:3] == [1.0, 1.0, 1.0]
+    read = trimesh.load(folder / "radius95.glb", file_type="glb")
+    assert len(read.geometry["liver"].vertices) == len(radii)
+
+
+def test_label_volumes_have_the_radius_of_each_voxel(found: Answer, folder: Path) -> None:
+    with np.load(folder / "labels.npz") as values:
+        labels, radii = values["labels"], values["radius95"]
+    assert radii.shape == labels.shape and radii.dtype == np.float32
+    np.testing.assert_array_equal(np.isfinite(radii), labels > 0)
+    everywhere = radii_of(found)
+    assert everywhere.min() * 0.9 < np.nanmedian(radii) < everywhere.max()
+    text = (folder / "labels.vti").read_text()
+    array = re.search(r'Name="radius95" format="binary">([^<]+)<', text)
+    assert array is not None and 'type="Float32"' in text
+    packed = base64.b64decode(array[1][44:])  # after the head of 32 bytes
+    told = np.frombuffer(zlib.decompress(packed), "<f4").reshape(labels.shape, order="F")
+    np.testing.assert_allclose(told, 500.0 * radii, rtol=1e-5)
+
+
+def test_the_summary_tells_centroids_volumes_and_the_whole(found: Answer, folder: Path) -> None:
+    assert found.registered is not None and found.registered.uncertainty is not None
+    summary = json.loads((folder / "summary.json").read_text())
+    told = summary["radius95"]
+    assert told == {
+        "median": pytest.approx(np.median(radii_of(found))),
+        "max": pytest.approx(radii_of(found).max()),
+        "calibrated": False,
+        "unit_m": 0.5,
+    }
+    for row, one in zip(summary["segments"], found.registered.uncertainty.segments, strict=True):
+        assert row["centroid_radius95"] == pytest.approx(one.centroid_radius95)
+        assert row["volume95"] == pytest.approx(list(one.volume95))
+        assert row["volume95"][0] < row["volume"] < row["volume95"][1]
+
+
+def test_the_report_says_and_shows_it(found: Answer, folder: Path, cloud: PointCloud) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r"const DATA = (.*);\n", page)[1])  # type: ignore[index]
+    assert data["words"]["heads"][1:3] == ["centre x, y, z, ± 95 % (mm)", "volume and 95 % of it (cm³)"]
+    assert "±" in data["words"]["rows"][0][0] and " to " in data["words"]["rows"][0][1]
+    assert any("(95 %, not calibrated)" in fact and " mm in the median" in fact for fact in data["words"]["facts"])
+    for shown in data["segments"]:
+        sure = np.frombuffer(base64.b64decode(shown["sure"]), np.uint8)
+        assert len(sure) == len(base64.b64decode(shown["positions"])) / 6 and (sure.max() == 255) == (
+            shown["name"] == "liver"
+        )
+    for one in data["sure"]["centroids"]:
+        marks = np.frombuffer(base64.b64decode(one["marks"]), np.uint8)
+        assert len(marks) == data["cloud"]["shown"] and marks.max() >= MOST
+    assert [one["name"] for one in data["sure"]["centroids"]] == [one["name"] for one in data["segments"]]
+
+
+def test_results_of_the_network_say_nothing_of_it(found: Answer, cloud: PointCloud, tmp_path: Path) -> None:
+    assert replace(found, taken=False).registered is None
+    write_one(tmp_path / "r.html", ".html", found.reconstruction, cloud, "camera", FilesConfig(), 1.0, {})
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert '"sure": null' in page and "±" not in page.split("</script>")[0].split("const DATA")[1].split("\n")[0]
+
+
+def test_points_that_the_model_does_not_explain_are_red(model: Model, cloud: PointCloud) -> None:
+    """A lump beside the object, taken for it."""
+    lump = cloud.points[:40] - [0.0, 0.0, 3.0 * load_unit(model, cloud)]
+    points = np.concatenate([cloud.points, lump])
+    registration = answer(points, model, Registrar.of(model, "modes"), 16, keep_all=True).registered
+    assert registration is not None
+    one = registration.explain("liver")
+    assert one is not None and len(one.unexplained)
+    marks = point_marks(one, points)
+    assert (marks[-40:] == UNEXPLAINED).mean() > 0.8 and (marks[:-40] == UNEXPLAINED).mean() < 0.1
+    colors = sure_colors(registration, Unit(None))
+    assert colors is not None and len(colors.of_points(points)) == len(model.names)
+
+
+def load_unit(model: Model, cloud: PointCloud) -> float:
+    """Scene units in the cloud's unit, about: the object is 25 of them long."""
+    return float(np.ptp(cloud.points, axis=0).max()) / 25
+
+
+def test_a_stream_says_it_where_it_is_asked_to(model: Model, cloud: PointCloud) -> None:
+    tracker = Tracker.of(model, "modes")
+    followed = [tracker.follow(cloud, 0.05 * number) for number in range(2)]
+    assert followed[1].tracked
+    silent, told = FrameAnswer.of_registration(followed[1]), FrameAnswer.of_registration(followed[1], True)
+    words = line(Outcome("frame", 0.0, told, "", 0.0, 0.0, 0))
+    assert "radius95" not in line(Outcome("frame", 0.0, silent, "", 0.0, 0.0, 0))
+    assert set(words["radius95"]) == {"median", "max", "calibrated"} and words["radius95"]["median"] > 0
+    for name in model.names:
+        assert "volume95" not in silent.segments[name]
+        low, high = told.segments[name]["volume95"]
+        assert low < told.segments[name]["volume"] < high and told.segments[name]["centroid_radius95"] > 0
+
+
+def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -> None:
+    known = replace(model, calibration=Calibration(seed=1, views=2, radius_scale=2.5))
+    registrar = Registrar.of(known, "modes")
+    registration = registrar.fit_modes(cloud).registration()
+    assert registration.uncertainty is not None and registration.uncertainty.scale == 2.5
+    tracker = Tracker(registrar)
+    followed = [tracker.follow(cloud, 0.05 * number).registration for number in range(2)]
+    assert all(one is not None and one.radius_scale == 2.5 for one in followed)
+
+
+@pytest.fixture
+def server() -> Iterator[object]:
+    from mereo.visualization.viewer import display
+
+    started = display.start_server(0, "mereo")
+    yield started
+    started.stop()
+
+
+@needs_viser
+def test_the_viewer_colours_it_and_says_it_of_a_place_and_shows_why(
+    found: Answer, model: Model, server: object
+) -> None:
+    from mereo.visualization.viewer.frame_page import SURE, FramePage
+    from mereo.visualization.viewer.probe import Inspection
+
+    page = FramePage(server, Inspection.of_answer(found, model, None), "liver", "", Unit(1.0))
+    assert SURE in page.coloring.options and page.why is not None
+    colors, legend = page._colors(SURE)
+    assert [len(part) for part in colors] == [len(s.vertices) for s in page.mesh.segments] and "mm" in legend
+    place = page.mesh.segments[0].vertices[0]
+    page.probe(place)
+    assert re.search(r"± [\d.]+ mm \(95 %\)", page.told.content) and not page.why.told.visible
+    page.why.box.value = True
+    page.probe(place)
+    assert "what leaves it unsure" in page.why.told.content and page.why._points is not None
+    page.why.box.value = False
+    page.probe(place)
+    assert page.why._points is None
+
+
+def test_a_state_without_its_frame_has_no_such_colours(found: Answer, model: Model) -> None:
+    from mereo.visualization.viewer.probe import Inspection
+
+    assert found.registration is not None
+    read = replace(found.registration, optimum=None)
+    inspection = Inspection.of_registration(read, model, np.eye(4))
+    assert inspection.here is None and inspection.ask(read.material[:1]).radius95 is None
+
+
+def test_the_command_explains_segments_and_places(
+    found: Answer, cloud: PointCloud, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert found.registered is not None
+    place = found.registered.material[7]
+    wishes = [wish_of(text, ("liver", "gallbladder")) for text in ("gallbladder", ",".join(map(str, place)))]
+    explain(found.registered, wishes, tmp_path, cloud.points, 10.0, Unit(1.0))
+    lines = capsys.readouterr().out.splitlines()
+    assert re.match(r"the centre of gallbladder is at .* ± [\d.,]+ mm \(95 %, not calibrated\); what leaves", lines[0])
+    assert re.match(r"the object's point is at .* ± [\d.,]+ mm \(95 %, not calibrated\); what leaves", lines[1])
+    head, body = (tmp_path / "explained" / "2.ply").read_bytes().split(b"end_header\n", 1)
+    kinds = [*((axis, "<f4") for axis in "xyz"), ("color", "u1", 3), ("unexplained", "u1")]
+    points = np.frombuffer(body, np.dtype(kinds))
+    np.testing.assert_allclose(points["x"], 10.0 * cloud.points[:, 0], rtol=1e-5)
+    assert points["unexplained"].max() == 0 and b"property uchar unexplained\n" in head
+    brightest = cloud.points[points["color"].sum(axis=1).argmax()]
+    assert np.linalg.norm(brightest - place) < np.median(np.linalg.norm(cloud.points - place, axis=1))
+
+
+def test_what_cannot_be_explained_is_said_in_one_sentence(cloud: PointCloud, tmp_path: Path) -> None:
+    for text in ("nose", "1,2", "1,2,nan", "1,2,x"):
+        with pytest.raises(ValueError, match=r"it must be a segment \(liver, gallbladder\) or a place x,y,z"):
+            wish_of(text, ("liver", "gallbladder"))
+    with pytest.raises(ValueError, match="--explain needs a registration, whose fit is explained"):
+        explain(None, ["liver"], tmp_path, cloud.points, 1.0, Unit(1.0))
+    with pytest.raises(ValueError, match="--fit is off, but --explain needs a registration"):
+        FrameJob("liver", choice="off", explain=("liver",)).check()
+    assert not any(tmp_path.iterdir())
