@@ -32,7 +32,7 @@ def measure(encoder: Encoder) -> None:
     )
     parts = [sum(p.numel() for p in part.parameters()) / 1e6 for part in (network.encoder, network.decoder)]
     if isinstance(network.encoder, Autodecoder):
-        network.encoder.add_codes(BATCH)
+        network.encoder.add_codes(BATCH, length=1.0)
     cloud = torch.nn.functional.normalize(torch.randn(BATCH, network.config.points, 3), dim=-1)
     viewpoint = torch.tensor([[0.0, 0.0, -8.0]])
     queries, index = torch.randn(BATCH, QUERIES, 3), torch.arange(BATCH)

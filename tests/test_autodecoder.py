@@ -196,6 +196,30 @@ def test_gradient_reaches_every_parameter(data: Dataset) -> None:
     assert (network.encoder.codes.grad.abs().amax(dim=1) > 1e-7).all()
 
 
+def test_codes_begin_as_long_as_the_recipe_says(data: Dataset) -> None:
+    for length in (1.0, 0.1):
+        network = start_network(replace(SMALL, code_length=length, holdout=2), data)
+        codes = network.encoder.codes.detach()
+        assert codes.shape == (10, 32)
+        assert codes.square().sum(dim=1).mean().sqrt().item() == pytest.approx(length, rel=0.15)
+    assert torch.allclose(codes * 10, start_network(replace(SMALL, holdout=2), data).encoder.codes, atol=1e-6)
+
+
+def test_a_search_in_the_codes_spread_stays_among_codes_like_them() -> None:
+    """Codes on a line: the axes have its length, every other direction none, and so nothing found leaves it."""
+    encoder = Autodecoder(AutodecoderConfig(spread_penalty=1e-3, search_rate=0.1), latent=4)
+    line, middle = torch.tensor([2.0, 0.0, 1.0, 0.0]), torch.tensor([0.5, 1.0, 0.0, -1.0])
+    encoder.codes = torch.nn.Parameter(middle + torch.linspace(-1, 1, 21)[:, None] * line)
+    encoder.update_distribution()
+    assert torch.allclose(encoder.mean, middle, atol=1e-6)
+    spread = torch.linspace(-1, 1, 21).std(correction=0) * line.norm()
+    assert torch.allclose(encoder.axes.norm(dim=1).sort().values, torch.tensor([0.0, 0.0, 0.0, spread]), atol=1e-5)
+    wish = middle + 0.5 * line + torch.tensor([0.0, 3.0, 0.0, 3.0])
+    found = encoder.search(lambda code: code - wish, 2)
+    assert torch.allclose(found, (middle + 0.5 * line).expand(2, 4), atol=0.1)
+    assert torch.allclose(found[:, 1], torch.tensor(1.0)) and torch.allclose(found[:, 3], torch.tensor(-1.0))
+
+
 def test_the_prior_is_the_codes_squared_length() -> None:
     encoder = Autodecoder(AutodecoderConfig(code_penalty=0.5), latent=4)
     assert torch.equal(
@@ -229,14 +253,6 @@ def test_the_curve_shows_a_few_held_out_examples(data: Dataset, monkeypatch: pyt
     assert validation.held_out(data, config) == range(7, 9)
     assert validation.held_out(data, replace(config, network=NetworkConfig())) == range(7, 12)
     assert validation.held_out(data, replace(config, holdout=1)) == range(11, 12)
-
-
-def test_the_papers_recipe() -> None:
-    recipe, paper = PRESETS["paper-autodecoder"], PRESETS["paper"]
-    assert (recipe.batch, recipe.learning_rate, recipe.code_rate, recipe.epochs) == (64, 5e-4, 1e-3, 1000)
-    assert recipe.network.decoder.dropout == 0.2 and recipe.network.autodecoder == AutodecoderConfig(75, 1e-3)
-    network = recipe.network.changed(encoder="pointnet2", dropout=0.0)
-    assert replace(recipe, batch=40, epochs=300.0, network=network) == paper
 
 
 def test_what_cannot_train_an_autodecoder_is_refused(data: Dataset, dataset: Path, tmp_path: Path) -> None:

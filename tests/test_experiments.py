@@ -18,6 +18,7 @@ from mereo.experiments.paper.scales import SCALES
 from mereo.experiments.paper.store import Score, Store, content_key, read_score
 from mereo.geometry.camera import PointCloud
 from mereo.synthesis.config import GenerateConfig
+from mereo.training.config import PRESETS
 from mereo.visualization.error_maps import comparison_picture
 
 NAN = float("nan")
@@ -121,15 +122,18 @@ def test_unknown_names_are_refused(name: str, scale: str, tmp_path: Path) -> Non
 
 
 def test_an_encoder_is_compared_like_for_like_or_the_table_says_what_it_lacks() -> None:
-    cpu = SCALES["cpu"].recipe
+    cpu = SCALES["cpu"]
     assert [lacks(cpu, encoder, "ce+l1") for encoder in ("pointnet2", "point-transformer")] == ["", ""]
     missing = lacks(cpu, "autodecoder", "ce+l1")
-    assert missing.startswith("local features, lines of sight, augmentation, ")
+    assert missing == "local features, lines of sight, augmentation, weight decay"
     for encoder in ENCODERS:
-        assert lacks(SCALES["paper"].recipe, encoder, "ce+l1") == "", "as published none has what is ours"
+        assert lacks(SCALES["paper"], encoder, "ce+l1") == "", "as published none has what is ours"
         for scale in SCALES.values():
-            config = recipe(scale.recipe, encoder, "ce+l1")
+            config = recipe(scale, encoder, "ce+l1")
             assert config is not None and config.learned_box == scale.recipe.learned_box
+            assert config.network.encoder == encoder and config.loss == "ce+l1"
+    assert all(recipe(scale, "autodecoder", "ce") is None for scale in SCALES.values())
+    assert recipe(SCALES["paper"], "autodecoder", "ce+l1") == PRESETS["paper-autodecoder"]
 
 
 def test_costs_are_those_of_what_experiments_do() -> None:

@@ -55,7 +55,7 @@ def said(text: str, capsys: pytest.CaptureFixture[str]) -> str:
         (f"{RECONSTRUCT} --fit mods", "--fit is 'mods' (did you mean modes?); it must be one of off, auto, modes, "
          "full; see `mereo reconstruct --help`"),
         ("train data --output run --preset huge", "--preset is 'huge'; it must be one of paper, paper-autodecoder, "
-         "base, large, tiny; see `mereo train --help`"),
+         "base, large, tiny, tiny-autodecoder; see `mereo train --help`"),
         ("export bunny --output", "--output has no value; it must be a path; see `mereo export --help`"),
         ("generate rope --output o --examples " + "9" * 99 + "x", "--examples is '" + "9" * 60 + "'...; it must be a "
          "whole number, at least 1; see `mereo generate --help`"),

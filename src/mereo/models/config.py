@@ -1,9 +1,7 @@
 """Settings of networks, of what a loss teaches them, and of where and how exactly they answer.
 
-Light, so that the command line may import them.
-
-Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise. What it
-does not say, such as the sizes of its encoders, is chosen as docs/paper-notes.md tells.
+Light, so that the command line may import them. Defaults are the paper's (Henrich et al., WACV 2024, section 3 and
+appendix B) unless a comment says otherwise; what it leaves open is chosen as docs/paper-notes.md tells.
 """
 
 from collections.abc import Mapping
@@ -139,12 +137,15 @@ class AutodecoderConfig:
     Attributes:
         search_steps: steps of the autodecoder's search for a cloud's code.
         search_rate: learning rate of that search.
-        code_penalty: weight of a code's squared length in it, beside the L1 distance.
+        code_penalty: weight of a code's squared length in it, beside L1.
+        spread_penalty: in its place where above 0: the search is then in units of the trained codes' spread, and so is
+            its rate.
     """
 
     search_steps: Count = 75
     search_rate: Positive = 1e-3
     code_penalty: NotNegative = 1e-4
+    spread_penalty: NotNegative = 0.0
 
     def __post_init__(self) -> None:
         check_bounds(self, "network.")

@@ -40,7 +40,7 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
 
     All is read as float32.
 
-    An autodecoder's codes of training examples are left out: using a network needs their mean only.
+    An autodecoder's codes of training examples are left out: using a network needs their mean, and at most their axes.
     """
     with atomic_file(path) as partial:
         partial.write_bytes(weights_bytes(model, dtype))

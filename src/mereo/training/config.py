@@ -6,7 +6,7 @@ Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) u
 does not say, such as the optimizer, is chosen as docs/paper-notes.md tells.
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from mereo.io.bounds import (
@@ -68,6 +68,8 @@ class TrainConfig:
         epochs: passes over the dataset.
         learning_rate: peak rate.
         code_rate: peak rate of an autodecoder's codes.
+        code_length: root mean square length of these codes at the start: 1 as in DeepSDF's code; short ones learn first
+            what examples have in common.
         weight_decay: decoupled (AdamW); at 0 the optimizer is Adam. The paper names none.
         schedule: constant, or linear warm-up followed by a half cosine to zero.
         warmup: fraction of all steps spent warming up.
@@ -92,6 +94,7 @@ class TrainConfig:
     epochs: Positive = 300.0
     learning_rate: Positive = 5e-4
     code_rate: Positive = 1e-3
+    code_length: Positive = 1.0
     weight_decay: NotNegative = 0.0
     schedule: Literal["constant", "cosine"] = "constant"
     warmup: BelowOne = 0.0
@@ -125,7 +128,7 @@ class TrainConfig:
         return asdict(self) | {"network": self.network.to_dict(), "augment": augment}
 
 
-PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
+PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny", "tiny-autodecoder"]
 """Recipes to start from.
 
     paper              as published, as far as it is (docs/paper-notes.md)
@@ -134,6 +137,7 @@ PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny"]
                        the query, a modern schedule, and many small steps (docs/design/0002-learning.md)
     large              the same with the widths of `paper` and larger steps, for a GPU
     tiny               two minutes on two CPU cores: for tests; objects of one's own are learnt by `mereo learn`
+    tiny-autodecoder   the paper's autodecoder, as small and in a modern schedule (docs/design/0009-encoders.md)
 """
 
 Table = dict[str, tuple[Any, ...]]
@@ -192,4 +196,30 @@ def _preset(column: int) -> TrainConfig:
     return TrainConfig(network=NetworkConfig.from_dict(network), augment=AugmentConfig(**augment), **recipe)
 
 
-PRESETS: dict[str, TrainConfig] = {name: _preset(column) for column, name in enumerate(get_args(PresetName))}
+def _tiny_autodecoder() -> TrainConfig:
+    """The published autodecoder with the widths and the schedule of `tiny`, and what else lets it learn in minutes.
+
+    Low frequencies, so that codes in between mean shapes in between; few queries, so that each code is met often; codes
+    that begin short, and a search among codes like the trained ones (docs/design/0009-encoders.md).
+    """
+    tiny = PRESETS["tiny"]
+    bare = {"local_neighbors": 0, "sight_neighbors": 0, "align_points": 0, "rest_template": False}
+    return replace(
+        tiny,
+        network=tiny.network.changed(
+            encoder="autodecoder", search_rate=0.1, spread_penalty=1e-3, highest_exponent=1, **bare
+        ),
+        loss="ce+l1",
+        queries=64,
+        epochs=160,
+        code_rate=1e-2,
+        code_length=0.16,
+        weight_decay=0.0,
+        offset_examples=64,
+        augment=AugmentConfig(),
+        holdout=16,
+    )
+
+
+PRESETS: dict[str, TrainConfig] = {name: _preset(column) for column, name in enumerate(get_args(PresetName)[:-1])}
+PRESETS["tiny-autodecoder"] = _tiny_autodecoder()

@@ -71,7 +71,7 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
             given = _without_segments(given, network)
         network.load_state_dict(network.state_dict() | given)
     if isinstance(network.encoder, Autodecoder):
-        network.encoder.add_codes(len(data) - config.holdout)
+        network.encoder.add_codes(len(data) - config.holdout, config.code_length)
     lookup = network.decoder.lookup
     if lookup is not None:
         if data.template is None:

@@ -274,7 +274,7 @@ class Trainer:
 
     def _update_codes(self) -> None:
         if isinstance(self.average.encoder, Autodecoder):
-            self.average.encoder.update_mean()
+            self.average.encoder.update_distribution()
 
     def resume(self) -> bool:
         """Load the checkpoint when there is one; returns whether there was."""

@@ -25,13 +25,13 @@ def run(store: Store, scale: ExperimentScale) -> Result:
         views.append([])
         dataset = store.dataset(scene, GenerateConfig(), scale.examples)
         for encoder in ENCODERS:
-            config = recipe(scale.recipe, encoder, LOSS)
+            config = recipe(scale, encoder, LOSS)
             assert config is not None, "every encoder learns from distances"
             weights = store.run(dataset, config)
             score = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
             scores[scene, encoder] = score
             paper = published()["encoders-losses"][scene][encoder][LOSS]
-            rows.append(Row(scene, encoder, score, paper, lacks(scale.recipe, encoder, LOSS)))
+            rows.append(Row(scene, encoder, score, paper, lacks(scale, encoder, LOSS)))
             views[-1].append(store.view(weights, GenerateConfig(), scale.cells))
     claim = Claim(
         "PointNet++ is better than Point Transformer and the autodecoder.",

@@ -7,7 +7,7 @@ from mereo.experiments.paper.scales import ExperimentScale
 from mereo.experiments.paper.store import Score, Store
 from mereo.models.config import Encoder, Loss
 from mereo.synthesis.config import GenerateConfig
-from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
+from mereo.training.config import AugmentConfig, TrainConfig
 
 QUESTION = "Which encoder and which loss are best?"
 
@@ -18,38 +18,19 @@ ENCODERS: tuple[Encoder, ...] = ("pointnet2", "point-transformer", "autodecoder"
 LOSSES: tuple[Loss, ...] = ("ce", "l1", "ce+l1", "ce+l1+cd")
 
 
-OWN_RECIPE = "The autodecoder has its own recipe, the paper's: batch, rates, dropout, and 1000 / 300 times the passes."
+OWN_RECIPE = "The autodecoder has its own recipe, as in the paper: batch, rates, passes."
 """Note below tables with more than one encoder."""
 
 
-def recipe(base: TrainConfig, encoder: Encoder, loss: Loss) -> TrainConfig | None:
-    """Recipe with another encoder and loss; None where the two do not go together.
+def recipe(scale: ExperimentScale, encoder: Encoder, loss: Loss) -> TrainConfig | None:
+    """Recipe of a scale with another encoder and loss; None where the two do not go together.
 
     The autodecoder searches its code by distances: a loss without them leaves nothing to search by. It has a recipe of
-    its own in the paper (batch, rates, dropout; its passes are 1000 / 300 times as many), and no local features.
+    its own, and no local features.
     """
     if encoder != "autodecoder":
-        return replace(base, loss=loss, network=replace(base.network, encoder=encoder))
-    if loss == "ce":
-        return None
-    own = PRESETS["paper-autodecoder"]
-    network = base.network.changed(
-        encoder=encoder,
-        dropout=own.network.decoder.dropout,
-        local_neighbors=0,
-        sight_neighbors=0,
-        align_points=0,
-        rest_template=False,
-    )
-    return replace(
-        own,
-        network=network,
-        loss=loss,
-        epochs=base.epochs * own.epochs / PRESETS["paper"].epochs,
-        queries=base.queries,
-        holdout=base.holdout,
-        learned_box=base.learned_box,
-    )
+        return replace(scale.recipe, loss=loss, network=replace(scale.recipe.network, encoder=encoder))
+    return None if loss == "ce" else replace(scale.autodecoder, loss=loss)
 
 
 def features(config: TrainConfig) -> tuple[str, ...]:
@@ -70,9 +51,9 @@ def features(config: TrainConfig) -> tuple[str, ...]:
     return tuple(name for name, is_there in added.items() if is_there)
 
 
-def lacks(base: TrainConfig, encoder: Encoder, loss: Loss) -> str:
+def lacks(scale: ExperimentScale, encoder: Encoder, loss: Loss) -> str:
     """Words for what an encoder's recipe lacks of those that another encoder's has; empty where all are alike."""
-    each = {name: recipe(base, name, loss) for name in ENCODERS}
+    each = {name: recipe(scale, name, loss) for name in ENCODERS}
     own, others = each[encoder], [found for name, found in each.items() if found is not None and name != encoder]
     assert own is not None, "nothing is asked of encoder and loss that do not go together"
     everything = dict.fromkeys(name for config in others for name in features(config))
@@ -88,14 +69,14 @@ def run(store: Store, scale: ExperimentScale) -> Result:
         dataset = store.dataset(scene, GenerateConfig(), scale.examples)
         for encoder in ENCODERS:
             for loss in LOSSES:
-                config = recipe(scale.recipe, encoder, loss)
+                config = recipe(scale, encoder, loss)
                 if config is None:
                     continue
                 weights = store.run(dataset, config)
                 score = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
                 scores[scene, encoder, loss] = score
                 paper = published()["encoders-losses"].get(scene, {}).get(encoder, {}).get(loss)
-                rows.append(Row(scene, f"{encoder}, {loss}", score, paper, lacks(scale.recipe, encoder, loss)))
+                rows.append(Row(scene, f"{encoder}, {loss}", score, paper, lacks(scale, encoder, loss)))
     notes = (
         "L1 alone knows no segments and has no mIoU; cross-entropy alone leaves the autodecoder nothing to search by.",
         OWN_RECIPE,

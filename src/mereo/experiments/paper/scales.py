@@ -21,6 +21,7 @@ class ExperimentScale:
     Attributes:
         name: name of the budget.
         recipe: training settings, from which an experiment changes what it compares.
+        autodecoder: those of the autodecoder, which has a recipe of its own in the paper too.
         rival: a second recipe to report beside it where an experiment compares whole recipes; None for one only.
         examples: number of examples of each dataset.
         test_examples: number of test views of each evaluation.
@@ -33,6 +34,7 @@ class ExperimentScale:
 
     name: ScaleName
     recipe: TrainConfig
+    autodecoder: TrainConfig
     rival: TrainConfig | None
     examples: int
     test_examples: int
@@ -63,10 +65,26 @@ _SHORT = replace(
     _TINY, network=_TINY.network.changed(points=512, align_points=0, rest_template=False), epochs=8, holdout=32
 )
 
+# As published it is for millions of examples: it says "empty" everywhere after any number that fits (experiments 10).
+_AUTODECODER = PRESETS["tiny-autodecoder"]
+
 _ALL = (
-    ExperimentScale("smoke", replace(_TINY, epochs=1, holdout=4), None, 64, 2, 24, 1, downloads=False, decides=False),
-    ExperimentScale("cpu", _SHORT, None, 1536, 32, 64, 2, downloads=True),
-    ExperimentScale("paper", _PAPER, PRESETS["large"], 28_800, 128, 100, None, downloads=True),
+    ExperimentScale(
+        name="smoke",
+        recipe=replace(_TINY, epochs=1, holdout=4),
+        autodecoder=replace(_AUTODECODER, epochs=4, holdout=4),
+        rival=None,
+        examples=64,
+        test_examples=2,
+        cells=24,
+        objects=1,
+        downloads=False,
+        decides=False,
+    ),
+    ExperimentScale("cpu", _SHORT, _AUTODECODER, None, 1536, 32, 64, 2, downloads=True),
+    ExperimentScale(
+        "paper", _PAPER, PRESETS["paper-autodecoder"], PRESETS["large"], 28_800, 128, 100, None, downloads=True
+    ),
 )
 
 SCALES = {str(scale.name): scale for scale in _ALL}

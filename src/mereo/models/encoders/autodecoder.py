@@ -26,6 +26,8 @@ class Autodecoder(nn.Module):
     Attributes:
         codes: of the training examples; None in a network that is only used.
         mean: their mean, from which a search starts.
+        axes: their principal axes, each as long as their standard deviation along it; None where the search does not
+            use them.
     """
 
     def __init__(self, config: AutodecoderConfig, latent: int) -> None:
@@ -35,17 +37,25 @@ class Autodecoder(nn.Module):
         self.register_parameter("codes", None)
         self.mean: Tensor
         self.register_buffer("mean", torch.zeros(latent))
+        self.spread_penalty = config.spread_penalty
+        self.axes: Tensor | None
+        self.register_buffer("axes", torch.zeros(latent, latent) if config.spread_penalty else None)
 
-    def add_codes(self, examples: int) -> None:
-        """Make random codes for training, about one away from the mean (which is zero in a new network)."""
+    def add_codes(self, examples: int, length: float) -> None:
+        """Make random codes for training, about ``length`` away from the mean (which is zero in a new network)."""
         width = len(self.mean)
-        self.codes = nn.Parameter(self.mean + torch.randn(examples, width) / math.sqrt(width))
+        self.codes = nn.Parameter(self.mean + length * torch.randn(examples, width) / math.sqrt(width))
 
     @torch.no_grad()
-    def update_mean(self) -> None:
-        """Take the mean of the codes as they are now."""
-        if self.codes is not None:
-            self.mean.copy_(self.codes.mean(dim=0))
+    def update_distribution(self) -> None:
+        """Take mean and axes of the codes as they are now."""
+        if self.codes is None:
+            return
+        self.mean.copy_(self.codes.mean(dim=0))
+        if self.axes is not None:
+            centered = (self.codes - self.mean).double()
+            variance, axes = torch.linalg.eigh(centered.T @ centered / len(centered))
+            self.axes.copy_((variance.clamp(min=0).sqrt() * axes).T)
 
     def code(self, index: Int[Tensor, " b"]) -> Float[Tensor, "b z"]:
         """Trained codes of training examples."""
@@ -64,11 +74,25 @@ class Autodecoder(nn.Module):
         ``distance`` answers with the signed distance at each cloud's observed points. Deterministic, and the clouds of
         a batch do not influence each other. Gradients are taken for the codes only, whatever the caller's mode.
         """
-        code = self.mean.repeat(clouds, 1).requires_grad_()
-        optimizer = torch.optim.Adam([code], lr=self.rate)
+        place = self._start(clouds).requires_grad_()
+        optimizer = torch.optim.Adam([place], lr=self.rate)
         for _ in range(self.steps):
             with torch.enable_grad():
-                error = distance(code).abs().mean(dim=1) + self.length_penalty(code)
-                (code.grad,) = torch.autograd.grad(error.sum(), code)
+                error = distance(self._code_at(place)).abs().mean(dim=1) + self._prior(place)
+                (place.grad,) = torch.autograd.grad(error.sum(), place)
             optimizer.step()
-        return code.detach()
+        return self._code_at(place).detach()
+
+    def _start(self, clouds: int) -> Float[Tensor, "b z"]:
+        """Place of the mean code, in the coordinates of the search."""
+        start = self.mean if self.axes is None else torch.zeros_like(self.mean)
+        return start.repeat(clouds, 1)
+
+    def _code_at(self, place: Float[Tensor, "b z"]) -> Float[Tensor, "b z"]:
+        """Codes at these places: themselves, or so many standard deviations from the mean along each axis."""
+        return place if self.axes is None else self.mean + place @ self.axes
+
+    def _prior(self, place: Float[Tensor, "b z"]) -> Float[Tensor, " b"]:
+        if self.axes is None:
+            return self.length_penalty(place)
+        return self.spread_penalty * place.square().sum(dim=1)
