@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from mereo.cli.weights import calibration_rows
 from mereo.evaluation.calibrate import calibrate
 from mereo.io.atomic_files import atomic_file
+from mereo.models.calibration import calibration_rows
 from mereo.models.weights import find_weights, load_model, with_calibration
 from mereo.scenes.registry import files_of
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.io.atomic_files import to_json
-from mereo.models.calibration import Calibration
+from mereo.models.calibration import calibration_rows
 from mereo.models.weights import SHIPPED, shipped_names
 from mereo.models.weights_facts import WeightsFacts, read_facts
 from mereo.training.examples_seen import seen_in_all, told
@@ -156,23 +156,6 @@ def _registration(facts: WeightsFacts) -> str:
         f"mesh at rest ({states.vertices:,} vertices) and {states.modes} modes of {states.states:,} states, which "
         f"leave {states.residue:.2g} scene units of an unseen state"
     )
-
-
-def calibration_rows(found: Calibration | None) -> list[tuple[str, str]]:
-    """Calibration in words, each with its title."""
-    if found is None:
-        return [("calibration", "none: confidences are not calibrated, recognition has conservative limits")]
-    rows = [("calibration", f"{found.views} views of the training seed {found.seed}")]
-    if found.temperature is not None:
-        kind = "a temperature" if found.biases is None else "a temperature and a bias for each class"
-        error = "" if found.ece is None else f"; calibration error {found.ece[0]:.3f}, with it {found.ece[1]:.3f}"
-        rows.append(("probabilities", f"{kind} ({found.temperature:.2f}){error}"))
-    if found.radius_scale is not None:
-        rows.append(("radii", f"the posterior's times {found.radius_scale:.2f}, of fits of the modes"))
-    if found.recognizing is not None:
-        limits = found.recognizing
-        rows.append(("recognition", f"unsure above a strangeness of {limits.unsure:.2g}, no from {limits.refused:.2g}"))
-    return rows
 
 
 def _training(made: dict[str, Any]) -> str:

@@ -255,7 +255,8 @@ def fit_frame(
         return _asked(network, model, network.encode(PointCloud(points)))
 
     fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask)
-    scale = None if network.calibration is None else network.calibration.radius_scale
+    known = network.calibration
+    scale = None if known is None else known.noisy_radius_scale if fitted.problem.noisy else known.radius_scale
     return replace(fitted, seconds=fitted.seconds + asked, radius_scale=scale)
 
 

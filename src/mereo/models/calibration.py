@@ -53,7 +53,8 @@ class Calibration(BaseModel, frozen=True):
         seed: of the views.
         views: how many of them.
         radius_scale: factor between the radius that a fit's posterior gives for 95 % and the one that held 95 % of the
-            true positions.
+            true positions, in frames without noise beyond the paper's.
+        noisy_radius_scale: the same of simulated depth cameras' frames.
         temperature: by which logits are divided before they become probabilities (temperature scaling; Guo et al.,
             ICML 2017).
         biases: added to the divided logits of empty space and each segment (with the temperature: vector scaling, but
@@ -65,6 +66,7 @@ class Calibration(BaseModel, frozen=True):
     seed: Annotated[int, Field(ge=0)]
     views: Annotated[int, Field(ge=1)]
     radius_scale: Positive | None = None
+    noisy_radius_scale: Positive | None = None
     temperature: Positive | None = None
     biases: tuple[FiniteFloat, ...] | None = None
     ece: tuple[Share, Share] | None = None
@@ -90,3 +92,21 @@ class Calibration(BaseModel, frozen=True):
 def _on_device(biases: tuple[float, ...], device: torch.device) -> Float[Tensor, " c"]:
     """Biases, made once: an upload for every chunk of queries would wait for the device."""
     return torch.tensor(biases, device=device)
+
+
+def calibration_rows(found: Calibration | None) -> list[tuple[str, str]]:
+    """Calibration in words, each with its title."""
+    if found is None:
+        return [("calibration", "none: confidences are not calibrated, recognition has conservative limits")]
+    rows = [("calibration", f"{found.views} views of the training seed {found.seed}")]
+    if found.temperature is not None:
+        kind = "a temperature" if found.biases is None else "a temperature and a bias for each class"
+        error = "" if found.ece is None else f"; calibration error {found.ece[0]:.3f}, with it {found.ece[1]:.3f}"
+        rows.append(("probabilities", f"{kind} ({found.temperature:.2f}){error}"))
+    if found.radius_scale is not None:
+        noisy = "" if found.noisy_radius_scale is None else f", of noisy frames {found.noisy_radius_scale:.2f}"
+        rows.append(("radii", f"the posterior's times {found.radius_scale:.2f}{noisy}, of fits of the modes"))
+    if found.recognizing is not None:
+        limits = found.recognizing
+        rows.append(("recognition", f"unsure above a strangeness of {limits.unsure:.2g}, no from {limits.refused:.2g}"))
+    return rows

@@ -16,6 +16,7 @@ import torch
 from mereo.evaluation.metrics import format_score
 from mereo.evaluation.tables import read_metrics
 from mereo.io.output_folders import new_directory
+from mereo.models.calibration import calibration_rows
 from mereo.models.config import NetworkConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model, weights_bytes
@@ -71,6 +72,7 @@ def card(name: str, model: Model, tests: Sequence[dict[str, Any]], content: byte
         f"`{name}.safetensors`, {size}, float16, SHA-256 `{digest}`. Written by `mereo release`.\n",
         _object(model),
         _training(model.provenance),
+        _calibration(model),
         "## Results\n",
         "IoU takes all segments as one, mIoU is the mean over segments; 100^3 cells of the joint box, one confusion\n"
         "matrix over the set.\n",
@@ -118,6 +120,11 @@ def _training(provenance: dict[str, object]) -> str:
     if recipe:
         lines.append(f"- recipe, nearest preset `{nearest_preset(recipe)}`: `{json.dumps(recipe)}`")
     return "\n".join([*lines, ""])
+
+
+def _calibration(model: Model) -> str:
+    rows = (f"- {title}: {text}" for title, text in calibration_rows(model.calibration))
+    return "\n".join(["## Calibration\n", *rows, ""])
 
 
 def _observations(provenance: dict[str, Any]) -> list[str]:
