@@ -179,7 +179,7 @@ def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> N
 
 
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
-    stretched = view.depth.to_points().points * np.array([1.0, 1.6, 1.0])
+    stretched = view.depth.to_points().points * np.array([1.0, 2.5, 1.0])
     without_scene = replace(model, provenance={"scene": "mine"})
     found = answer(stretched, model, Registrar.of(without_scene), 32)
     assert found.registration is not None and not found.registration.accepted and not found.taken

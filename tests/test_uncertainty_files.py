@@ -38,7 +38,7 @@ needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extr
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return load_model("liver")
+    return replace(load_model("liver"), calibration=None)
 
 
 @pytest.fixture(scope="module")

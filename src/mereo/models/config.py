@@ -268,11 +268,11 @@ class NetworkConfig:
         return self.pointnet2.mlp1[-1], self.pointnet2.mlp2[-1]
 
     def to_dict(self) -> dict[str, Any]:
-        """All settings by name, those of all parts side by side, as files hold them."""
+        """All settings by name, those of all parts side by side, as files hold them, which leave out an unused one."""
         settings: dict[str, Any] = {}
         for name, value in asdict(self).items():
             settings |= value if isinstance(value, dict) else {name: value}
-        return settings
+        return {name: value for name, value in settings.items() if value or name != "spread_penalty"}
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> "NetworkConfig":

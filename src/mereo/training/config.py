@@ -121,11 +121,14 @@ class TrainConfig:
         return Supervision.of(self.loss)
 
     def to_dict(self) -> dict[str, Any]:
-        """All settings as files hold them: the network's side by side, and of observations only where they are seen."""
+        """All settings as files hold them: the network's side by side, those of observations and codes where there are any."""
         augment = asdict(self.augment)
         if not self.augment.observations:
             del augment["observations"]
-        return asdict(self) | {"network": self.network.to_dict(), "augment": augment}
+        settings = asdict(self) | {"network": self.network.to_dict(), "augment": augment}
+        if self.network.encoder != "autodecoder":
+            del settings["code_length"]
+        return settings
 
 
 PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny", "tiny-autodecoder"]

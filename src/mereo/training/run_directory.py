@@ -136,7 +136,7 @@ def _check_architecture(start: NetworkConfig, config: TrainConfig) -> None:
     free = {name for name in COUNTS if given[name] and ours[name]}
     if ours["rest_template"]:
         free.add("rest_template")
-    odd = [name for name, value in ours.items() if value != given[name] and name not in free]
+    odd = [name for name, value in ours.items() if value != given.get(name) and name not in free]
     if odd:
         raise ValueError(
             f"the weights {config.init} have another network setting {odd[0]}; continuing needs the same "
