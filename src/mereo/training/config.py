@@ -121,7 +121,7 @@ class TrainConfig:
         return Supervision.of(self.loss)
 
     def to_dict(self) -> dict[str, Any]:
-        """All settings as files hold them, the network's side by side; of observations and codes where there are any."""
+        """All settings as files hold them, the network's side by side; of observations and codes where they are."""
         augment = asdict(self.augment)
         if not self.augment.observations:
             del augment["observations"]
