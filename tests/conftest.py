@@ -4,7 +4,7 @@ Files that are not in the repository are found, or the test that needs them is s
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -91,3 +91,13 @@ def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
     from mereo.training import metrics_log
 
     monkeypatch.setattr(metrics_log, "draw_curves", lambda rows, path: path.write_bytes(b""))
+
+
+@pytest.fixture
+def server() -> Iterator[object]:
+    """A viewer's server on a free port, without pages."""
+    from mereo.visualization.viewer import display
+
+    started = display.start_server(0, "mereo")
+    yield started
+    display.stop_server(started)

@@ -4,7 +4,6 @@ import base64
 import json
 import re
 import zlib
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -224,15 +223,6 @@ def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -
     tracker = Tracker(registrar)
     followed = [tracker.follow(cloud, 0.05 * number).registration for number in range(2)]
     assert all(one is not None and one.radius_scale == 2.5 for one in followed)
-
-
-@pytest.fixture
-def server() -> Iterator[object]:
-    from mereo.visualization.viewer import display
-
-    started = display.start_server(0, "mereo")
-    yield started
-    started.stop()
 
 
 @needs_viser

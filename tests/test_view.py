@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import urllib.request
-from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -51,13 +50,6 @@ def toy_inspection() -> Told:
     cloud = PointCloud(points[points[:, 2] <= 162.0])
     model = Model(Network(PRESETS["tiny"].network, 4).eval(), mesh.names, mesh.colors)
     return Told(mesh, np.eye(4), model, "closed form, of course", cloud, model.encode(cloud))
-
-
-@pytest.fixture
-def server() -> Iterator[object]:
-    started = display.start_server(0, "mereo")
-    yield started
-    started.stop()
 
 
 @needs_viser

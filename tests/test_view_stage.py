@@ -1,6 +1,6 @@
 """What lies on the stage of the viewer's pages: points as large as their spacing allows, names, colours in sight."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -14,7 +14,6 @@ from mereo.models.weights import load_model
 from mereo.scenes.parameters import Parameter, random_state
 from mereo.scenes.registry import load_scene
 from mereo.visualization.units import Unit
-from mereo.visualization.viewer import display
 from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, SegmentControls, point_size
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.lab_page import LabPage
@@ -22,13 +21,6 @@ from mereo.visualization.viewer.lab_stage import ASIDE, LabStage, Moment
 from mereo.visualization.viewer.laboratory import Laboratory
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
-
-
-@pytest.fixture
-def server() -> Iterator[object]:
-    started = display.start_server(0, "mereo")
-    yield started
-    display.stop_server(started)
 
 
 def grid(count: int, spacing: float) -> np.ndarray:

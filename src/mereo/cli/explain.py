@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.fitting.registration import Registration
+from mereo.geometry.radii import level_told
 from mereo.io.writers.ply import write_explained_ply
 from mereo.visualization.sure_colors import UNEXPLAINED, mark_colors, point_marks, shares_told
 from mereo.visualization.units import Unit, rounded
@@ -40,8 +41,8 @@ def print_sure(registered: Registration | None, unit: Unit) -> None:
         return
     told = registered.uncertainty.summary()
     middle, most = (f"{rounded(told[key] * unit.length_factor)} {unit.length_name}" for key in ("median", "max"))
-    how = "" if registered.uncertainty.calibrated else ", not calibrated"
-    print(f"true places are within {middle} of its own in the median, within {most} where it is least sure (95 %{how})")
+    level = level_told(registered.uncertainty.calibrated)
+    print(f"true places are within {middle} of its own in the median, within {most} where it is least sure ({level})")
 
 
 def explain(
@@ -71,9 +72,9 @@ def explain(
         found, radius = registered.explain(wish), _radius(registered, wish)
         assert found is not None
         named = f"the centre of {wish}" if isinstance(wish, str) else "the object's point"
-        how = "" if registered.uncertainty.calibrated else ", not calibrated"
+        level = level_told(registered.uncertainty.calibrated)
         said = f"{named} is at {unit.place(found.place)} ± {rounded(radius * unit.length_factor)} {unit.length_name}"
-        told = f"{said} (95 %{how}); what leaves it unsure: {shares_told(found)}"
+        told = f"{said} ({level}); what leaves it unsure: {shares_told(found)}"
         lost = len(found.unexplained)
         print(f"{told}; {lost} points are not the model's" if lost else told)
         marks = point_marks(found, points)

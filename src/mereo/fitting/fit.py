@@ -4,13 +4,11 @@ code -correspondences-> pose and state of the model -deform-> SegmentedMesh, and
 """
 
 import time
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences, find_correspondences
@@ -31,15 +29,11 @@ from mereo.fitting.scene_unit import agree, estimate_unit
 from mereo.fitting.turned_camera import with_turns
 from mereo.fitting.understood import Ask, as_noisy
 from mereo.geometry.camera import PointCloud
+from mereo.io.cores import one_blas_thread
 from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.statistical_model import StatisticalModel
 
 KNOWN_SCALE_STD = 1e-6
-
-
-def one_thread() -> AbstractContextManager[object]:
-    """Hold BLAS to one thread: products this small are slower on two, 20 times on busy cores."""
-    return threadpool_limits(1, "blas")
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +93,7 @@ class ModesFit:
             assert ask is not None
             return ask(seen * unit).scaled(1 / unit)
 
-        with one_thread():
+        with one_blas_thread():
             evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit)
             problem = Problem.of(model, found, evidence, scale_std, config)
             understood = problem, found, fit_modes(problem)
@@ -143,7 +137,7 @@ class ModesFit:
         if self.rest is not None:
             return self.registration()
         started = time.perf_counter()
-        with one_thread():
+        with one_blas_thread():
             problem = DrawsProblem.of(self.problem, states, self.found)
             drawn = fit_draws(problem, self.posed)
             taken = drawn is not None and is_drawn(problem, drawn, self.posed)

@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32
-from threadpoolctl import threadpool_limits
 
 from mereo.fitting.draws_problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws_problem import terms as terms_of_draws
@@ -17,6 +16,7 @@ from mereo.fitting.posterior import Observed, Posterior, Terms
 from mereo.fitting.priors import Prior
 from mereo.fitting.problem import Problem
 from mereo.fitting.residuals import Surface, add_witnesses
+from mereo.io.cores import one_blas_thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class ModesOptimum:
         """Terms under the prior of all states; that of the states near the answer is too sure (design note 22)."""
         problem, posed, config = self.problem, self.posed, self.problem.config
         nothing = NormalEquations.nothing(POSE + len(posed.z))
-        with threadpool_limits(1, "blas"):
+        with one_blas_thread():
             samples = problem.samples.posed(posed).few(config.witnesses)
             return Terms(
                 known=problem.known(posed, Prior.whole(problem.model), 0.0),
@@ -91,7 +91,7 @@ class DrawsOptimum:
     @cached_property
     def terms(self) -> Terms:
         """Terms of the neighbourhood in which the scene is linear in its draws."""
-        with threadpool_limits(1, "blas"):
+        with one_blas_thread():
             return terms_of_draws(self.problem, self.fit, self._motion, self.problem.base.config.cloud_sigma)
 
     @property

@@ -115,10 +115,13 @@ class Problem:
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
         return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
 
+    def noise_beside(self, surface: Surface) -> float:
+        """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
+        return noise_of(surface.offsets(self.evidence.points), self.evidence.around)
+
     def as_noisy_as(self, surface: Surface) -> "Problem | None":
         """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that."""
-        offset = surface.offsets(self.evidence.points)
-        config = constants_for(noise_of(offset, self.evidence.around), self.config)
+        config = constants_for(self.noise_beside(surface), self.config)
         if config is self.config:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_partners, noisy=True)
@@ -127,8 +130,7 @@ class Problem:
         """Whether a misfit of the cloud, much greater than its noise, says that the fit is likely wrong."""
         if cloud < UNEXPLAINED:
             return False
-        noise = noise_of(surface.offsets(self.evidence.points), self.evidence.around)
-        return cloud > TAILS * (noise / self.config.cloud_sigma) ** 2
+        return cloud > TAILS * (self.noise_beside(surface) / self.config.cloud_sigma) ** 2
 
     def with_network(self, found: Correspondences) -> "Problem":
         """The problem with other correspondences."""

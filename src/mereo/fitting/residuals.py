@@ -24,7 +24,6 @@ ROBUST = 2.5
 """Residuals beyond this many sigma count for little."""
 
 MOST_VIOLATIONS = 400
-
 WITNESS_WEIGHT = 0.2
 
 

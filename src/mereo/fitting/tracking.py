@@ -19,14 +19,15 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences
 from mereo.fitting.evidence import Evidence
-from mereo.fitting.fit import KNOWN_SCALE_STD, ModesFit, one_thread
+from mereo.fitting.fit import KNOWN_SCALE_STD, ModesFit
 from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed, in_space
-from mereo.fitting.noise import constants_for, noise_of
+from mereo.fitting.noise import constants_for
 from mereo.fitting.priors import Prior
 from mereo.fitting.problem import Problem
 from mereo.fitting.residuals import NetworkTerm
 from mereo.fitting.track_config import TrackConfig
 from mereo.geometry.downsampling import means_along_sight
+from mereo.io.cores import one_blas_thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ class Track:
         scale_std = KNOWN_SCALE_STD if base.scale_std == KNOWN_SCALE_STD else config.scale_std
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
         share_surfaces(base, problem)
-        still, noise = np.zeros(POSE + model.count), noise_in(fitted)
+        still, noise = np.zeros(POSE + model.count), fitted.problem.noise_beside(fitted.surface)
         unit, unsure = fitted.unit * scale, config.first_speed
         return cls(problem, unit, posed, time_s, still, unsure, noise, clean, fitted.radius_scale)
 
@@ -135,7 +136,7 @@ def next_fit(
         config: constants.
     """
     started = time.perf_counter()
-    with one_thread():
+    with one_blas_thread():
         few = means_along_sight(points / track.unit, config.points)
         problem = replace(track.problem, evidence=Evidence.of(few, doubtful / track.unit, config.partners))
         share_surfaces(track.problem, problem)
@@ -153,16 +154,10 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     passed = max(time_s - track.time_s, 1e-3)
     velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
     unsure = track.unsure * (1 - config.smoothing)
-    noise = track.noise + config.smoothing * (noise_in(fitted) - track.noise)
+    noise = track.noise + config.smoothing * (fitted.problem.noise_beside(fitted.surface) - track.noise)
     problem = replace(fitted.problem, config=constants_for(noise, track.clean))
     share_surfaces(fitted.problem, problem)
     return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise, track.clean, track.radius_scale)
-
-
-def noise_in(fitted: ModesFit) -> float:
-    """Noise of a fitted frame, in scene units."""
-    evidence = fitted.problem.evidence
-    return noise_of(fitted.surface.offsets(evidence.points), evidence.around)
 
 
 def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.geometry.color_stops import between_stops
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
 
@@ -51,9 +52,7 @@ class Radii:
 
     def colors(self, values: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
         """Colours (red, green, blue) of radii."""
-        places = np.clip(values / max(self.high, 1e-30), 0.0, 1.0) * (len(STOPS) - 1)
-        mixed = [np.interp(places, np.arange(len(STOPS)), np.array(STOPS, dtype=float)[:, k]) for k in range(3)]
-        return np.stack(mixed, axis=1).round().astype(np.uint8)
+        return between_stops(values / max(self.high, 1e-30), STOPS).round().astype(np.uint8)
 
     def scaled(self, factor: float) -> "Radii":
         """The same in another unit."""
@@ -80,6 +79,11 @@ class Radii:
             if len(index):
                 result[tuple(index.T)] = rounded_to(self.at(grid.positions(index), label), DIGITS)
         return result
+
+
+def level_told(calibrated: bool) -> str:
+    """Words for the probability with which a place lies within its radius, and on whose word that is."""
+    return "95 %" if calibrated else "95 %, not calibrated"
 
 
 def rounded_to(values: Float[np.ndarray, " n"], digits: int) -> Float[np.ndarray, " n"]:

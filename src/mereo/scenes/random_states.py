@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
-from threadpoolctl import threadpool_limits
 
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
+from mereo.io.cores import one_blas_thread
 from mereo.io.progress import tracked
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.principal_components import build_model
@@ -104,6 +104,6 @@ def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED, *, q
     frame, scene = scene.source_frame, scene.for_seed(seed)
     nodes, labels = interior_nodes(scene.rest)
     states = sample_states(scene, nodes, labels, count, seed, quiet)
-    with threadpool_limits(1, "blas"):  # threads add in another order
+    with one_blas_thread():
         model = build_model(scene.rest, nodes, labels, states)
     return replace(model, source_frame=frame)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mereo.fitting.recognition import told_of
+from mereo.geometry.radii import level_told
 from mereo.visualization.units import Unit, rounded
 
 STAGES = {
@@ -107,8 +108,8 @@ def _facts(summary: Mapping[str, Any], unit: Unit) -> list[str]:
 
 def _sure(radius95: Mapping[str, Any], unit: Unit) -> str:
     middle, most = (rounded(float(radius95[key]) * unit.length_factor) for key in ("median", "max"))
-    how = "" if radius95.get("calibrated") else ", not calibrated"
-    return f"surface within {middle} {unit.length_name} in the median, {most} at most (95 %{how})"
+    level = level_told(bool(radius95.get("calibrated")))
+    return f"surface within {middle} {unit.length_name} in the median, {most} at most ({level})"
 
 
 def _answer(registration: Mapping[str, Any]) -> str:

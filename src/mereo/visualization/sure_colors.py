@@ -13,8 +13,9 @@ from scipy.spatial import cKDTree
 
 from mereo.fitting.explanation import Explanation
 from mereo.fitting.registration import Registration
+from mereo.geometry.color_stops import between_stops
 from mereo.geometry.mesh import Color, Segment
-from mereo.geometry.radii import STOPS, Radii
+from mereo.geometry.radii import STOPS, Radii, level_told
 from mereo.visualization.units import Unit, rounded
 
 UNEXPLAINED = 255
@@ -61,13 +62,12 @@ class SureColors:
     def page_data(self, marks: list[UInt8[np.ndarray, " n"]] | None) -> dict[str, Any]:
         """What the page needs beside the bytes of the surfaces."""
         high = rounded(self.radii.high * self.unit.length_factor)
-        calibrated = "" if self.radii.calibrated else ", not calibrated"
         return {
             "stops": [list(color) for color in STOPS],
             "weights": [list(color) for color in WEIGHTS],
             "unexplained": list(RED),
             "ends": ["0", f"{high} {self.unit.length_name}"],
-            "title": f"the true place is so far away at most (95 %{calibrated})",
+            "title": f"the true place is so far away at most ({level_told(self.radii.calibrated)})",
             "centroids": [
                 {"name": name, "marks": _base64(one), "shares": shares_told(told)}
                 for name, one, told in zip(self.names, marks or (), self.centroids, strict=True)
@@ -91,9 +91,7 @@ def point_marks(one: Explanation, points: Float[np.ndarray, "n 3"]) -> UInt8[np.
 
 def mark_colors(marks: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
     """Colours (red, green, blue) of ``point_marks``."""
-    places = np.minimum(marks / MOST, 1.0) * (len(WEIGHTS) - 1)
-    stops = np.array(WEIGHTS, dtype=float)
-    mixed = np.stack([np.interp(places, np.arange(len(stops)), stops[:, k]) for k in range(3)], axis=1)
+    mixed = between_stops(marks / MOST, WEIGHTS)
     return np.where((marks == UNEXPLAINED)[:, None], RED, mixed).round().astype(np.uint8)
 
 

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.geometry.color_stops import between_stops
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
-from mereo.geometry.radii import STOPS, Radii
+from mereo.geometry.radii import STOPS, Radii, level_told
 from mereo.geometry.solids import Solids
 from mereo.models.model import Answer
 from mereo.visualization.error_maps import OVER, UNDER
@@ -43,9 +44,7 @@ class ColorScale:
 
     def colors(self, values: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
         """Colours (red, green, blue) of numbers, linear between the stops; NaN is grey."""
-        places = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0) * (len(self.stops) - 1)
-        stops = np.asarray(self.stops, dtype=float)
-        mixed = np.stack([np.interp(places, np.arange(len(stops)), stops[:, k]) for k in range(3)], axis=1)
+        mixed = between_stops((values - self.low) / (self.high - self.low), self.stops)
         return np.where(np.isnan(values)[:, None], 128.0, mixed).round().astype(np.uint8)
 
 
@@ -70,7 +69,7 @@ def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> Colo
 
 def radius_scale(radii: Radii, unit: str) -> ColorScale:
     """Scale for radii of 95 % in the unit that is named."""
-    title = "true places are within (95 %" + ("" if radii.calibrated else ", not calibrated") + ")"
+    title = f"true places are within ({level_told(radii.calibrated)})"
     return ColorScale(title, 0.0, max(radii.high, 1e-9), STOPS, (f"0{unit}, sure", f"{radii.high:.3g}{unit}"))
 
 
