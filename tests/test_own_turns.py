@@ -96,6 +96,11 @@ def test_of_a_wheel_of_six_sides_only_sixths_look_alike() -> None:
     assert np.isin([60, 120, 180, 240, 300], degrees).all() and not np.isin([30, 90, 150, 210, 270, 330], degrees).any()
 
 
+def test_an_object_without_states_is_at_rest() -> None:
+    model = model_of(free)
+    assert own_turns(model.around(model.mean, np.zeros((len(model.mean), 3, 0), dtype=np.float32))) == ()
+
+
 def test_turns_that_no_state_makes_by_themselves_do_not_count() -> None:
     assert own_turns(model_of(held)) == ()
     for turn in own_turns(model_of(coupled)):  # it may stand on its head

@@ -70,7 +70,9 @@ class OwnTurn:
 
 @lru_cache(maxsize=8)
 def own_turns(model: StatisticalModel) -> tuple[OwnTurn, ...]:
-    """All such turns of an object that its states make; found once for a model."""
+    """All such turns of an object that its states make, none of one without states; found once for a model."""
+    if model.count == 0:
+        return ()
     corners, found = corners_of(model), list[OwnTurn]()
     # from the rest pose, not from the mean, in which a part that spins is crushed
     states = positions(model, corners, model.library[:: max(1, len(model.library) // STATES)])
