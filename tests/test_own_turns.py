@@ -135,9 +135,9 @@ def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
     rest = model.rest_points[: sum(model.vertex_counts)][model.labels[: sum(model.vertex_counts)] == 2]
     on_peg = rest[:, 0] > 6.1
     assert on_peg.sum() > 3
-    shown, hidden = (left_open(model, material, vertices[rows], 0.2, 100.0) for rows in (on_peg, rest[:, 0] < 0.0))
+    shown, hidden = (left_open(model, material, vertices[rows], 0.2, 1500.0) for rows in (on_peg, rest[:, 0] < 0.0))
     farthest = [np.sqrt((motion**2).sum(axis=(1, 2))).max() for motion in (shown, hidden)]
-    assert farthest[0] < 0.05 and farthest[1] > 0.5
+    assert farthest[0] < 0.1 and farthest[1] > 2.0
 
 
 def test_radii_hold_what_is_left_open() -> None:

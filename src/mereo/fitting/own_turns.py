@@ -50,6 +50,12 @@ LEAST_PAIRS = 30
 """Pairs of states that are turned alike, at least, in the share that is turned otherwise."""
 
 
+COUNTED = 0.03
+"""Share of the loss of a turned segment that counts: it is turned stiffly here, and a fit from there takes most of that
+back. On training views of the shapes 78 % of the places lay within the radii with all of it, 91 % with a tenth, 96 %
+with this."""
+
+
 @dataclass(frozen=True, eq=False)
 class OwnTurn:
     """Turns of a segment about an axis of its own which hardly change its shape.
@@ -173,7 +179,7 @@ def left_open(
         center, axis = T[:3, :3] @ turn.center + T[:3, 3], T[:3, :3] @ turn.axis
         seen = partners[owner == turn.label]
         worse = _worse(model, material, turn, seen, center, axis, sigma) * worth / len(partners)
-        weight = np.append(turn.plausible * np.exp(-0.5 * np.maximum(worse, 0.0)), 1.0)
+        weight = np.append(turn.plausible * np.exp(-0.5 * COUNTED * np.maximum(worse, 0.0)), 1.0)
         angle = np.append(turn.angles, 0.0)
         steps = np.stack([np.sin(angle), 1.0 - np.cos(angle)])
         second = (steps * (weight / weight.sum())) @ steps.T
