@@ -200,7 +200,8 @@ class NoCredentialsError(Exception):
         (Answer("AccessDenied"), r"refuses the credentials that it was given \(AccessDenied\); check them, and what"),
         (Answer("SlowDown"), "the storage says An error occurred"),
         (NoCredentialsError(), "no credentials were found .*; set AWS_ACCESS_KEY_ID"),
-        (TimeoutError("timed out"), r"cannot be reached \(timed out\); check the network and AWS_ENDPOINT_URL"),
+        (TimeoutError("timed out"), r"cannot be reached \(timed out\); check the network, AWS_ENDPOINT_URL and"),
+        (OSError("no route to http://me:secret@host/x"), r"\(no route to http://\.\.\.@host/x\)"),
         (PermissionError("Forbidden"), r"refuses the credentials that it was given \(PermissionError\)"),
     ],
 )

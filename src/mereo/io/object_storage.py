@@ -26,8 +26,8 @@ URL = re.compile(r"(?P<protocol>[A-Za-z][A-Za-z0-9+.-]+)://(?P<rest>.*)", re.DOT
 MOST_BYTES = 900
 """Length of a folder's name in bytes that leaves room for its files' in the 1,024 that storages allow."""
 
-CONNECT_S, READ_S, ATTEMPTS = 3, 30, 2
-"""Seconds until a server must answer and go on, and attempts: a wrong address is known within ten seconds."""
+CONNECT_S, READ_S, ATTEMPTS = 3, 15, 2
+"""Seconds until a server must be there, and answer or go on, and attempts: a wrong address is known in ten seconds."""
 
 MISSING_BUCKET = ("NoSuchBucket", "InvalidBucketName")
 REFUSED = ("AccessDenied", "403", "Forbidden", "InvalidAccessKeyId", "SignatureDoesNotMatch", "ExpiredToken")
@@ -72,17 +72,24 @@ class ObjectPath:
 
     def names(self) -> list[str]:
         """Names of the objects in this folder, sorted; none where there is nothing."""
-        with self._explained("listed"):
-            system = self._system()
-            system.invalidate_cache()
-            found = system.find(self.url, maxdepth=1, withdirs=True)  # the folder itself may be among them
-            own = self.url.partition("://")[2] + "/"
-            return sorted({place.strip("/").removeprefix(own) for place in found if place.strip("/").startswith(own)})
+        own = self.url.partition("://")[2] + "/"
+        try:
+            with self._explained("listed"):
+                system = self._system()
+                system.invalidate_cache()
+                found = system.ls(self.url, detail=False)
+        except FileNotFoundError:
+            return []
+        # an object of the folder's own name is no content of it
+        return sorted({place.strip("/").removeprefix(own) for place in found if place.strip("/").startswith(own)})
 
     def exists(self) -> bool:
         """Whether there is this object; folders are none."""
-        with self._explained("read"):
-            return bool(self._system().isfile(self.url))
+        try:
+            with self._explained("read"):
+                return bool(self._system().info(self.url)["type"] == "file")  # isfile takes a lost network for a no
+        except FileNotFoundError:
+            return False
 
     is_file = exists
 
@@ -132,7 +139,8 @@ class ObjectPath:
             "read_timeout": READ_S,
             "retries": {"total_max_attempts": ATTEMPTS, "mode": "standard"},
         }
-        system = fsspec.filesystem("s3", use_listings_cache=False, config_kwargs=limits | given)
+        # one request at a time asks for no sizes before; a shard is smaller than what would be divided
+        system = fsspec.filesystem("s3", use_listings_cache=False, max_concurrency=1, config_kwargs=limits | given)
         system.retries = ATTEMPTS
         return system
 
@@ -154,7 +162,7 @@ class ObjectPath:
             return FileExistsError(f"{self} exists; it is not overwritten: choose another name")
         if isinstance(error, FileNotFoundError):
             return FileNotFoundError(f"{self} does not exist: check the URL")
-        kind = type(error).__name__
+        kind, why = type(error).__name__, re.sub(r"//[^/@\s]*@", "//...@", reason(error))
         if "Credential" in kind:
             return StorageError(
                 f"{self} cannot be {done}: no credentials were found ({kind}); set AWS_ACCESS_KEY_ID and "
@@ -166,12 +174,10 @@ class ObjectPath:
                 f"({code or kind}); check them, and what they may do with the bucket {bucket!r}"
             )
         if code:
-            return StorageError(
-                f"{self} cannot be {done}: the storage says {reason(error)}; correct that and try again"
-            )
+            return StorageError(f"{self} cannot be {done}: the storage says {why}; correct that and try again")
         return StorageError(
-            f"{self} cannot be {done}: the storage cannot be reached ({reason(error)}); check the network and "
-            "AWS_ENDPOINT_URL, then run the same command again"
+            f"{self} cannot be {done}: the storage cannot be reached ({why}); check the network, AWS_ENDPOINT_URL and "
+            "AWS_PROFILE, then run the same command again"
         )
 
 
