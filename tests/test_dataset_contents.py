@@ -165,6 +165,10 @@ def test_a_dataset_of_the_first_version_is_checked_as_far_as_can_be(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = write_toy_dataset(tmp_path / "data")
+    (data / "shard-00001.safetensors").rename(tmp_path / "shard")
+    assert main(["dataset", "check", str(data)]) == 2
+    assert "holds 32 of 64 examples; the `mereo generate` command" in capsys.readouterr().err, "it names no shards"
+    (tmp_path / "shard").rename(data / "shard-00001.safetensors")
     assert main(["dataset", "check", str(data), "--write"]) == 0
     assert "all 3 files are whole, 64 examples; wrote the SHA-256 of each" in capsys.readouterr().out, "no modes"
     (data / "shard-00001.safetensors").unlink()

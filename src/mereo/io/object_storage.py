@@ -31,7 +31,14 @@ CONNECT_S, READ_S, ATTEMPTS = 3, 15, 2
 
 MISSING_BUCKET = ("NoSuchBucket", "InvalidBucketName")
 REFUSED = ("AccessDenied", "403", "Forbidden", "InvalidAccessKeyId", "SignatureDoesNotMatch", "ExpiredToken")
+EXISTS = ("PreconditionFailed", "412", "ConditionalRequestConflict")
 """Codes of S3."""
+
+LOG_IN = {
+    "s3": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, or give this machine a role",
+    "gs": "log in with `gcloud auth application-default login`, or set GOOGLE_APPLICATION_CREDENTIALS",
+}
+"""What makes credentials known, of each protocol."""
 
 
 class StorageError(OSError):
@@ -156,28 +163,28 @@ class ObjectPath:
 
     def _sentence(self, error: Exception, done: str) -> Exception:
         code, bucket = _code(error), self.url.split("/")[2]
-        if code in MISSING_BUCKET or "bucket does not exist" in str(error):
-            return StorageError(f"{self} cannot be {done}: there is no bucket {bucket!r}; make it, or correct the URL")
-        if code in ("PreconditionFailed", "412", "ConditionalRequestConflict") or isinstance(error, FileExistsError):
-            return FileExistsError(f"{self} exists; it is not overwritten: choose another name")
-        if isinstance(error, FileNotFoundError):
-            return FileNotFoundError(f"{self} does not exist: check the URL")
         kind, why = type(error).__name__, re.sub(r"//[^/@\s]*@", "//...@", reason(error))
+        absent = isinstance(error, FileNotFoundError)
+        if code in MISSING_BUCKET or (absent and done == "written"):
+            return StorageError(f"{self} cannot be {done}: there is no bucket {bucket!r}; make it, or correct the URL")
+        if code in EXISTS or isinstance(error, FileExistsError):
+            return FileExistsError(f"{self} exists; it is not overwritten: choose another name")
+        if absent:
+            return FileNotFoundError(f"{self} does not exist: check the URL")
         if "Credential" in kind:
-            return StorageError(
-                f"{self} cannot be {done}: no credentials were found ({kind}); set AWS_ACCESS_KEY_ID and "
-                "AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, or give this machine a role"
-            )
-        if code in REFUSED or isinstance(error, PermissionError):
+            cure = LOG_IN.get(self._protocol, "log in")
+            return StorageError(f"{self} cannot be {done}: no credentials were found ({kind}); {cure}")
+        if code in REFUSED or isinstance(error, PermissionError) or why.startswith("Forbidden"):
             return StorageError(
                 f"{self} cannot be {done}: the storage refuses the credentials that it was given "
                 f"({code or kind}); check them, and what they may do with the bucket {bucket!r}"
             )
         if code:
             return StorageError(f"{self} cannot be {done}: the storage says {why}; correct that and try again")
+        settings = ", AWS_ENDPOINT_URL and AWS_PROFILE" if self._protocol == "s3" else ""
         return StorageError(
-            f"{self} cannot be {done}: the storage cannot be reached ({why}); check the network, AWS_ENDPOINT_URL and "
-            "AWS_PROFILE, then run the same command again"
+            f"{self} cannot be {done}: the storage cannot be reached ({why}); check the network{settings}, then run "
+            "the same command again"
         )
 
 

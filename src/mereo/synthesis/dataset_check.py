@@ -42,7 +42,9 @@ def check_dataset(folder: Place, write: bool = False) -> DatasetContents:
         raise ValueError(
             f"{folder}: {len(spare)} files are not of this dataset; move {'them' if spare[1:] else 'it'} away"
         )
-    examples = contents.manifest["examples"]
+    have, examples = sum(contents.examples.values()), contents.manifest["examples"]
+    if have != examples:  # a manifest of an early version does not say how many shards there are
+        raise ValueError(f"{folder} holds {have} of {examples} examples; {CURE}")
     print(f"{folder}: all {len(files)} files are whole, {examples} examples; {_hashes(contents, files, write)}")
     return contents
 

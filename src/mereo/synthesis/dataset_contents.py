@@ -45,6 +45,7 @@ class DatasetContents:
         there: names of its files at first.
         shard_size: examples of a whole shard; None for datasets of early versions, which do not say it.
         known: SHA-256 of the files that were read and found whole, or written, by their names.
+        examples: number of examples in each shard that was read.
     """
 
     folder: Place
@@ -52,6 +53,7 @@ class DatasetContents:
     there: frozenset[str]
     shard_size: int | None
     known: dict[str, str] = field(default_factory=dict)
+    examples: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, folder: Place, shard_size: int | None = None) -> "DatasetContents":
@@ -63,7 +65,7 @@ class DatasetContents:
     def expected(self) -> list[str]:
         """Names of the files that the dataset must have, but for its manifest."""
         if self.shard_size is None:
-            shards = sorted(name for name in self.there if SHARD_NAME.fullmatch(name))
+            shards = sorted(filter(SHARD_NAME.fullmatch, self.there.union(recorded_files(self.manifest))))
         else:
             shards = [shard_name(number) for number in range(-(-self.manifest["examples"] // self.shard_size))]
         # nothing is trained on a test set
@@ -77,7 +79,9 @@ class DatasetContents:
         recorded one, and ``StorageError`` where nothing is known of it.
         """
         content = read_content(self.folder / name)
-        self._reader(name)(content, recorded_files(self.manifest).get(name))
+        found = self._reader(name)(content, recorded_files(self.manifest).get(name))
+        if isinstance(found, dict):
+            self.examples[name] = len(found["cloud"])
         self.known[name] = sha256(content)
 
     def _reader(self, name: str) -> Callable[[bytes, str | None], object]:
