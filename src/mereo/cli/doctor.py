@@ -26,6 +26,7 @@ PURPOSES: dict[str, str] = {
     "hub": "weights on a model hub",
     "cluster": "data generation on several machines",
     "align": "ground truth from scans",
+    "serve": "answers over HTTP",
     "docs": "the documentation as pages",
     "dev": "tests and checks",
 }
