@@ -9,7 +9,7 @@ import signal
 import threading
 from dataclasses import replace
 from multiprocessing.connection import Connection
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from mereo.io.size_limits import LIMIT_VARIABLE
 from mereo.serving.messages import Begin, Finish, Ready, Setup
@@ -26,6 +26,7 @@ class WorkerDied(RuntimeError):
     """A process that answers has ended by itself, or was ended for taking too long."""
 
 
+@runtime_checkable
 class Worker(Protocol):
     """What answers messages, one at a time.
 
