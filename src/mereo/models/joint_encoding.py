@@ -1,6 +1,6 @@
 """Several clouds in one call of the encoder: what a GPU is made for, and a CPU gains next to nothing from.
 
-    clouds -normalize each-> one batch -encode-> Code of all -split-> EncodedCloud of each
+clouds -normalize each-> one batch -encode-> Code of all -split-> EncodedCloud of each
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Addresses of the server: frames in, figures or surfaces out; what is served; health and numbers.
 
-    POST /v1/{weights}/reconstruct -admit, take the body, submit-> Waiting -answer-> summary.json or segments.glb
+POST /v1/{weights}/reconstruct -admit, take the body, submit-> Waiting -answer-> summary.json or segments.glb
 """
 
 import asyncio
@@ -66,7 +66,9 @@ ANSWERS: dict[int | str, dict[str, Any]] = {
     408: {"description": "A body that has not come in time"},
     413: {"description": "A body, frame or point cloud that is too large"},
     415: {"description": "A format that is not read"},
-    422: {"description": "A frame that cannot be answered, or wrong parameters: `error` is the command line's sentence"},
+    422: {
+        "description": "A frame that cannot be answered, or wrong parameters: `error` is the command line's sentence"
+    },
     429: {"description": "As many frames wait as may; Retry-After says when to ask again"},
     500: {"description": "A fault of the server, which it has logged"},
     503: {"description": "The server is being stopped"},
@@ -104,7 +106,7 @@ class Service:
     async def answer(self, request: Request, weights: str, options: FrameOptions) -> Response:
         """Answer to a frame; raises ``Refused``."""
         if weights not in self.names:
-            raise Refused(404, f"no weights {weights[:60]!r} are served; there are {', '.join(self.names)}: name one")
+            raise Refused(404, f"no weights {weights[:60]!a} are served; there are {', '.join(self.names)}: name one")
         media = media_of(request.headers.get("accept", "*/*"))
         resolution = options.cells(self.resolution, max(self.config.max_resolution, self.resolution))
         isolation = options.isolation()
@@ -132,9 +134,7 @@ class Service:
         """Reply to a frame that waits, or what is said when its client or its time is gone."""
         gone = asyncio.create_task(_until_gone(request))
         try:
-            await asyncio.wait(
-                {gone, waiting.answer}, timeout=self.config.timeout, return_when=asyncio.FIRST_COMPLETED
-            )
+            await asyncio.wait({gone, waiting.answer}, timeout=self.config.timeout, return_when=asyncio.FIRST_COMPLETED)
         finally:
             left = gone.done()
             gone.cancel()
@@ -143,7 +143,9 @@ class Service:
         self.dispatcher.drop(waiting, "gone" if left else "timeout")
         if left:
             return Reply(GONE, b"")
-        return failed(504, f"the frame was not answered within {self.config.timeout:g} s: ask again, or for fewer cells")
+        return failed(
+            504, f"the frame was not answered within {self.config.timeout:g} s: ask again, or for fewer cells"
+        )
 
 
 def make_app(service: Service) -> Any:
@@ -157,7 +159,9 @@ def make_app(service: Service) -> Any:
 
     app = FastAPI(title="mereo", description=DESCRIPTION, docs_url=None, redoc_url=None, lifespan=lifespan)
 
-    @app.post("/v1/{weights}/reconstruct", response_class=Response, responses=ANSWERS, openapi_extra={"requestBody": BODY})
+    @app.post(
+        "/v1/{weights}/reconstruct", response_class=Response, responses=ANSWERS, openapi_extra={"requestBody": BODY}
+    )
     async def reconstruct(request: Request, weights: str, options: Annotated[FrameOptions, Query()]) -> Response:
         """All segments of the object in a frame, a depth image or point cloud, in the frame's own axes and unit."""
         return await service.answer(request, weights, options)
@@ -206,7 +210,7 @@ def _say_errors_in_sentences(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def nowhere(request: Request, error: HTTPException) -> Response:
-        said = f"{request.method} {request.url.path[:100]!r} is not known ({error.detail}); /docs lists what there is"
+        said = f"{request.method} {request.url.path[:100]!a} is not known ({error.detail}); /docs lists what there is"
         return response_of(failed(error.status_code, said, error.headers))
 
     @app.exception_handler(ClientDisconnect)
@@ -235,7 +239,7 @@ def media_of(accept: str) -> Media:
                 liked[media] = max(liked.get(media, 0.0), with_value)
     best = max(liked, key=lambda media: (liked[media], media == JSON), default=JSON)
     if not liked.get(best):
-        raise Refused(406, f"Accept is {accept[:60]!r}; an answer is {JSON} or {GLB}: ask for one of them")
+        raise Refused(406, f"Accept is {accept[:60]!a}; an answer is {JSON} or {GLB}: ask for one of them")
     return best
 
 

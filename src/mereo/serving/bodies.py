@@ -5,6 +5,7 @@ client calls a file only a known suffix counts, as the format; no name of a clie
 """
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -38,6 +39,8 @@ MEDIA = {
 
 MASKS, YAML = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"), (".yaml", ".yml")
 
+logging.getLogger("python_multipart").setLevel(logging.CRITICAL + 1)  # it tells the log what the client is told
+
 MOST_HEADER = 8192
 """Most bytes of the headers of a part."""
 
@@ -67,20 +70,19 @@ async def take(
     Raises ``Refused``: 400 for a body that is no such form, 408 for one that does not come, 413 for one that is too
     large, 415 for an unknown format and 422 for parts that are missing or unknown.
     """
-    media, options = parse_options_header(content_type)
-    kind = media.decode("latin-1").lower()
+    kind, options = header_options(content_type)
     stated = suffix_of(f"frame.{format.removeprefix('.')}") if format else ""
     if format and not stated:
-        raise unknown(f"format is {format!r}")
+        raise unknown(f"format is {format[:60]!a}")
     with ExitStack() as files:
         if kind == "multipart/form-data":
-            if not (boundary := options.get(b"boundary")):
+            if not (boundary := options.get("boundary")):
                 raise Refused(400, "the form has no boundary; its Content-Type must state one: let a library make it")
-            parts: _Parts | _Whole = _Parts(folder, stated, boundary, files)
+            parts: _Parts | _Whole = _Parts(folder, stated, boundary.encode("latin-1"), files)
         else:
             suffix = stated or MEDIA.get(kind, "")
             if not suffix:
-                raise unknown(f"the Content-Type is {kind!r}" if kind else "there is no Content-Type")
+                raise unknown(f"the Content-Type is {kind[:60]!a}" if kind else "there is no Content-Type")
             parts = _Whole(folder, suffix, files)
         try:
             async with asyncio.timeout(seconds):
@@ -97,6 +99,16 @@ async def take(
         except MultipartParseError as error:
             raise Refused(400, f"the form cannot be read ({error}): let a library make it") from None
         return parts.taken()
+
+
+def header_options(text: str) -> tuple[str, dict[str, str]]:
+    """Value and options of a header such as Content-Type, all latin-1; raises ``Refused`` (400) for nonsense."""
+    try:
+        value, options = parse_options_header(text)
+    except (ValueError, LookupError, TypeError):  # what the parser of mail, which is behind it, makes of it
+        raise Refused(400, f"the header {text[:60]!a} cannot be read: let a library make it") from None
+    read = {key.decode("latin-1").lower(): found.decode("latin-1") for key, found in options.items()}
+    return value.decode("latin-1").lower(), read
 
 
 def too_large(most: int) -> Refused:
@@ -141,7 +153,7 @@ class _Part:
 
     def headers(self) -> dict[str, str]:
         return {
-            name.decode("latin-1").lower(): value.decode("utf-8", "replace")
+            name.decode("latin-1").lower(): value.decode("latin-1")
             for name, value in zip(self.names, self.values, strict=True)
         }
 
@@ -189,19 +201,23 @@ class _Parts:
     def _header(self, texts: list[bytearray], piece: bytes) -> None:
         self._part.size += len(piece)
         if self._part.size > MOST_HEADER:
-            raise Refused(400, f"a part of the form has more than {MOST_HEADER} bytes of headers: let a library make it")
+            raise Refused(
+                400, f"a part of the form has more than {MOST_HEADER} bytes of headers: let a library make it"
+            )
         texts[-1] += piece
 
     def _place(self) -> None:
         """Open the file of a part, now that its headers are known."""
         headers = self._part.headers()
-        _, options = parse_options_header(headers.get("content-disposition", ""))
-        part = options.get(b"name", b"").decode("utf-8", "replace")
+        _, options = header_options(headers.get("content-disposition", ""))
+        part = options.get("name", "")
         if part not in ("frame", "mask", "intrinsics"):
-            raise Refused(422, f"the form has a part {part[:60]!r}; its parts are frame, mask, intrinsics: leave it out")
+            raise Refused(
+                422, f"the form has a part {part[:60]!a}; its parts are frame, mask, intrinsics: leave it out"
+            )
         if part in self._found:
             raise Refused(422, f"the form has two parts {part!r}; each comes once: leave one out")
-        given = options.get(b"filename", b"").decode("utf-8", "replace")
+        given = options.get("filename", "")
         kind = headers.get("content-type", "").partition(";")[0].strip().lower()
         name = f"{part}{self._suffix(part, given, kind)}"
         self._found[part] = name
@@ -215,7 +231,7 @@ class _Parts:
             return ".yaml" if end in YAML or kind.endswith("yaml") else ".json"
         suffix = self._stated or suffix_of(given) or MEDIA.get(kind, "")
         if not suffix:
-            raise unknown(f"the part 'frame' has the Content-Type {kind!r} and no file name of a known format")
+            raise unknown(f"the part 'frame' has the Content-Type {kind[:60]!a} and no file name of a known format")
         return suffix
 
     def _end(self) -> None:

@@ -73,7 +73,10 @@ class Gate:
         if self.entry.token and not any(map(self.entry.is_token, given)):
             if scope["path"] in PROBES:
                 return None
-            return 401, "there is no token, or another one; send that of the printed address: Authorization: Bearer TOKEN"
+            return (
+                401,
+                "there is no token, or another one; send that of the printed address: Authorization: Bearer TOKEN",
+            )
         reason = refusal(hosts, origins, self.entry, given)
         return (403, reason) if reason else None
 

@@ -21,19 +21,23 @@ class Metrics:
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)  # memory and time of the server's own process, on Linux
-        own = {"registry": self.registry}
-        self._requests = Counter("mereo_requests", "Requests that were answered.", ["endpoint", "code"], **own)
+        own = self.registry
+        self._requests = Counter("mereo_requests", "Requests that were answered.", ["endpoint", "code"], registry=own)
         self._request_seconds = Histogram(
-            "mereo_request_seconds", "Seconds from a request to its answer.", ["endpoint"], buckets=SECONDS, **own
+            "mereo_request_seconds",
+            "Seconds from a request to its answer.",
+            ["endpoint"],
+            buckets=SECONDS,
+            registry=own,
         )
         self._stages = Histogram(
-            "mereo_stage_seconds", "Seconds of each stage of an answered frame.", ["stage"], buckets=SECONDS, **own
+            "mereo_stage_seconds", "Seconds of each stage of a frame.", ["stage"], buckets=SECONDS, registry=own
         )
-        self._batch = Histogram("mereo_batch_frames", "Frames that were taken together.", buckets=SIZES, **own)
-        self._dropped = Counter("mereo_dropped_frames", "Frames that nobody waited for any more.", ["reason"], **own)
-        self._restarts = Counter("mereo_restarts", "Processes that answer which had to be started again.", **own)
-        self._waiting = Gauge("mereo_waiting_frames", "Frames that wait, their bodies included.", **own)
-        self._alive = Gauge("mereo_processes", "Processes that are ready to answer.", **own)
+        self._batch = Histogram("mereo_batch_frames", "Frames that were taken together.", buckets=SIZES, registry=own)
+        self._dropped = Counter("mereo_dropped_frames", "Frames nobody waited for any more.", ["reason"], registry=own)
+        self._restarts = Counter("mereo_restarts", "Processes that had to be started again.", registry=own)
+        self._waiting = Gauge("mereo_waiting_frames", "Frames that wait, their bodies included.", registry=own)
+        self._alive = Gauge("mereo_processes", "Processes that are ready to answer.", registry=own)
 
     def watch(self, waiting: Callable[[], int], alive: Callable[[], int]) -> None:
         """Read these whenever the numbers are asked for."""

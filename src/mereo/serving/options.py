@@ -78,7 +78,8 @@ class FrameOptions(BaseModel):
             return default
         if not 4 <= self.resolution <= most:
             raise Refused(
-                422, f"resolution is {self.resolution}; it must be a whole number, from 4 to {most}: give for example 128"
+                422,
+                f"resolution is {self.resolution}; it must be a whole number, from 4 to {most}: give for example 128",
             )
         return self.resolution
 
@@ -87,7 +88,9 @@ def _of(numbers: list[float] | None, count: int, name: str) -> Any:
     if numbers is None:
         return None
     if len(numbers) != count:
-        raise ValueError(f"{name} has {len(numbers)} numbers; it needs {count}: give for example {name}={EXAMPLES[name]}")
+        raise ValueError(
+            f"{name} has {len(numbers)} numbers; it needs {count}: give for example {name}={EXAMPLES[name]}"
+        )
     return tuple(numbers)
 
 
@@ -99,7 +102,7 @@ def sentence_of(error: ErrorDetails | dict[str, Any]) -> str:
     name = str(error["loc"][-1] if error["loc"][-1] != "query" else "query")
     if error["type"] == "extra_forbidden":
         known = ", ".join(field.alias or key for key, field in FrameOptions.model_fields.items())
-        return f"there is no parameter {name!r}; the parameters are {known}: correct the spelling"
+        return f"there is no parameter {_brief(name)}; the parameters are {known}: correct the spelling"
     # what a list is of is named before the number in it
     names = [str(part) for part in error["loc"] if part != "query" and not isinstance(part, int)]
     rule = str(error["msg"]).removeprefix("Input should be ").partition(",")[0]

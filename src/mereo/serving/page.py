@@ -1,6 +1,6 @@
 """The page ``/docs``: what can be asked, written out of the OpenAPI description, without anything from another host."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -59,7 +59,7 @@ def _kind(schema: Mapping[str, Any]) -> str:
     return ", ".join(words) + ("" if default is None else f" (default: {str(default).lower()})")
 
 
-def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def _table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     head = "".join(f"<th>{escape(word)}" for word in heads)
     body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}' for cell in row)}" for row in rows)
     return f"<table><tr>{head}{body}</table>"

@@ -9,7 +9,9 @@ FULL = "{queue} frames wait already, as many as may: ask again in as many second
 
 GOING = "the server is being stopped and takes no frames any more: ask another one, or again later"
 
-CRASHED = "the process that read this frame has ended over it, or took far too long: check the frame, or try another one"
+CRASHED = (
+    "the process that read this frame has ended over it, or took far too long: check the frame, or try another one"
+)
 
 FAULT = "the frame cannot be answered for a fault of the server, which has logged it: try another frame, or report it"
 """What a client is told of an error that is not its own; the log has the rest."""

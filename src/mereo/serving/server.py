@@ -68,7 +68,10 @@ def serve(
         service = Service(dispatcher, metrics, config, root, processes[0].ready.facts, resolution, entry)
         names = ", ".join(service.names)
         address = entry.address(socket.getsockname()[1])
-        print(f"serving {names} at {address} ({workers} process{'' if workers == 1 else 'es'}; /docs says how to ask); Ctrl-C ends", flush=True)
+        print(
+            f"serving {names} at {address} ({workers} process{'' if workers == 1 else 'es'}; /docs says how to ask); Ctrl-C ends",
+            flush=True,
+        )
         settings = uvicorn.Config(
             make_app(service),
             http="h11",
