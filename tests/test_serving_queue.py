@@ -37,6 +37,11 @@ def analytic(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo.serving.answering.load_for", balls)
 
 
+def moved(metres: float) -> np.ndarray:
+    """The cloud, farther away."""
+    return CLOUD + np.array([0.0, 0.0, metres])
+
+
 def held_up(server: Server) -> ThreadWorker:
     """Its only worker, which answers nothing until it is let go."""
     (worker,) = server.workers
@@ -50,7 +55,7 @@ def test_a_full_queue_refuses_and_goes_on(tmp_path: Path) -> None:
             worker = held_up(server)
             first = asyncio.create_task(server.post(npy()))
             await until(worker.begun.is_set)
-            waiting = [asyncio.create_task(server.post(npy(CLOUD + [0, 0, n]))) for n in range(2)]
+            waiting = [asyncio.create_task(server.post(npy(moved(n)))) for n in range(2)]
             await until(lambda: server.dispatcher.held == 2)
             refused = await server.post(npy())
             assert refused.status_code == 429 and 1 <= int(refused.headers["retry-after"]) <= 60
@@ -103,9 +108,15 @@ def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> None:
                 sent.append(message)
 
             headers = [(b"host", b"localhost"), (b"content-type", b"application/x-npy")]
-            scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST", "scheme": "http",
-                     "path": ADDRESS, "raw_path": ADDRESS.encode(), "root_path": "", "query_string": b"",
-                     "headers": headers, "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 8000)}  # fmt: skip
+            scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST"}
+            scope |= {
+                "scheme": "http",
+                "path": ADDRESS,
+                "raw_path": ADDRESS.encode(),
+                "root_path": "",
+                "query_string": b"",
+            }
+            scope |= {"headers": headers, "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 8000)}
             left = asyncio.create_task(server.app(scope, receive, send))
             await until(lambda: server.dispatcher.held == 1)
             told.set()
@@ -139,7 +150,7 @@ def test_a_frame_that_ends_its_process_costs_no_other(
             worker.go.clear()
             first = asyncio.create_task(server.post(npy()))
             await until(worker.begun.is_set)
-            bodies = [npy(CLOUD + [0, 0, 1]), deadly, npy(CLOUD + [0, 0, 2]), npy(CLOUD + [0, 0, 3])]
+            bodies = [npy(moved(1)), deadly, npy(moved(2)), npy(moved(3))]
             rest = [asyncio.create_task(server.post(body)) for body in bodies]
             await until(lambda: server.dispatcher.held == 4)
             worker.go.set()

@@ -23,6 +23,7 @@ from mereo.serving.config import ServeConfig
 PLY = {"Content-Type": "application/ply"}
 TEXT = {"Content-Type": "text/plain"}
 PNG = {"Content-Type": "image/png"}
+HOLES = np.where(CLOUD > 0.58, np.nan, CLOUD)[::2]
 
 
 @pytest.fixture(autouse=True)
@@ -38,36 +39,49 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "root"
 
 
+FORM = {"Content-Type": "multipart/form-data; boundary=b"}
+
+
+def form(**parts: Any) -> dict[str, Any]:
+    """Request with these parts beside a whole frame."""
+    return {"files": {"frame": ("a.npy", npy()), **parts}}
+
+
+def asked(query: str, **request: Any) -> dict[str, Any]:
+    """Request with these parameters."""
+    return {"address": f"{ADDRESS}?{query}", **(request or {"content": npy()})}
+
+
 REFUSED: dict[str, tuple[int, str, dict[str, Any]]] = {
     "a damaged cloud": (422, "frame.ply cannot be read as a point cloud (", {"content": b"x", "headers": PLY}),
     "an empty body": (422, "frame.ply is empty (0 bytes)", {"content": b"", "headers": PLY}),
     "too few points": (422, "the cloud has 3 points", {"content": b"0 0 1\n1 0 1\n0 1 1\n", "headers": TEXT}),
-    "missing points": (422, "leave them out with --drop-invalid", {"content": npy(np.where(CLOUD > 0.58, np.nan, CLOUD)[::2])}),
+    "missing points": (422, "leave them out with --drop-invalid", {"content": npy(HOLES)}),
     "no camera": (422, "frame.png is a depth image without intrinsics", {"content": b"x", "headers": PNG}),
-    "a recording": (415, "format is 'bag'; a frame is one of", {"address": f"{ADDRESS}?format=bag", "content": b"x"}),
+    "a recording": (415, "format is 'bag'; a frame is one of", asked("format=bag")),
     "no type": (415, "there is no Content-Type", {"content": b"x", "headers": {}}),
-    "a picture for an answer": (406, "Accept is 'image/png'", {"content": npy(), "headers": NPY | {"Accept": "image/png"}}),
-    "an unknown parameter": (422, "there is no parameter 'unitm'", {"address": f"{ADDRESS}?unitm=1", "content": npy()}),
-    "a word for a number": (422, "unit-m is 'mm'; it must be a valid number", {"address": f"{ADDRESS}?unit-m=mm", "content": npy()}),
-    "no number": (422, "unit-m is 'nan'; it must be", {"address": f"{ADDRESS}?unit-m=nan", "content": npy()}),
-    "a negative unit": (422, "the unit is -1.0 m; it must be positive", {"address": f"{ADDRESS}?unit-m=-1", "content": npy()}),
-    "half a range": (422, "depth-range has 1 numbers; it needs 2", {"address": f"{ADDRESS}?depth-range=1", "content": npy()}),
-    "a range backwards": (422, "the depth range is 0.9 0.4", {"address": f"{ADDRESS}?depth-range=0.9,0.4", "content": npy()}),
-    "a word in a box": (422, "box is 'a'; it must be", {"address": f"{ADDRESS}?box=a,b", "content": npy()}),
-    "too many cells": (422, "resolution is 9999; it must be a whole number, from 4 to 256", {"address": f"{ADDRESS}?resolution=9999", "content": npy()}),
-    "a mask for a cloud": (422, "is read as a point cloud; leave out", {"files": {"frame": ("a.npy", npy()), "mask": b"x"}}),
-    "two cameras": (422, "intrinsics are given twice", {"address": f"{ADDRESS}?intrinsics=1", "files": {"frame": ("a.npy", npy()), "intrinsics": b"x"}}),
-    "a part too many": (422, "the form has a part 'carry'", {"files": {"frame": ("a.npy", npy()), "carry": b"x"}}),
+    "a picture": (406, "Accept is 'image/png'", {"content": npy(), "headers": NPY | {"Accept": "image/png"}}),
+    "an unknown parameter": (422, "there is no parameter 'unitm'", asked("unitm=1")),
+    "a word for a number": (422, "unit-m is 'mm'; it must be a valid number", asked("unit-m=mm")),
+    "no number": (422, "unit-m is 'nan'; it must be", asked("unit-m=nan")),
+    "a negative unit": (422, "the unit is -1.0 m; it must be positive", asked("unit-m=-1")),
+    "half a range": (422, "depth-range has 1 numbers; it needs 2", asked("depth-range=1")),
+    "a range backwards": (422, "the depth range is 0.9 0.4", asked("depth-range=0.9,0.4")),
+    "a word in a box": (422, "box is 'a'; it must be", asked("box=a,b")),
+    "too many cells": (422, "resolution is 9999; it must be a whole number, from 4 to 256", asked("resolution=9999")),
+    "a mask for a cloud": (422, "is read as a point cloud; leave out", form(mask=b"x")),
+    "two cameras": (422, "intrinsics are given twice", asked("intrinsics=1", **form(intrinsics=b"x"))),
+    "a part too many": (422, "the form has a part 'carry'", form(carry=b"x")),
     "a part twice": (422, "the form has two parts 'frame'", {"files": [("frame", ("a.npy", npy()))] * 2}),
     "no frame": (422, "the form has no part 'frame'", {"files": {"mask": b"x"}}),
-    "a frame of no kind": (415, "the part 'frame' has the Content-Type", {"files": {"frame": ("a.exe", b"x")}}),
-    "half a form": (400, "the form is cut off", {"content": b"--b\r\n", "headers": {"Content-Type": "multipart/form-data; boundary=b"}}),
-    "no form": (400, "the form cannot be read", {"content": b"nonsense", "headers": {"Content-Type": "multipart/form-data; boundary=b"}}),
-    "no boundary": (400, "the form has no boundary", {"content": b"x", "headers": {"Content-Type": "multipart/form-data"}}),
-    "unknown weights": (404, "no weights 'cube' are served; there are balls", {"address": "/v1/cube/reconstruct", "content": npy()}),
-    "weights by a path": (404, "is not known", {"address": "/v1/..%2F..%2Fsecret/reconstruct", "content": npy()}),
+    "a frame of no kind": (415, "the part 'frame' has the Content-Type", form(frame=("a.exe", b"x"))),
+    "half a form": (400, "the form is cut off", {"content": b"--b\r\n", "headers": FORM}),
+    "no form": (400, "the form cannot be read", {"content": b"nonsense", "headers": FORM}),
+    "no boundary": (400, "no boundary", {"content": b"x", "headers": {"Content-Type": "multipart/form-data"}}),
+    "unknown weights": (404, "no weights 'cube' are served; there are balls", {"address": "/v1/cube/reconstruct"}),
+    "weights by a path": (404, "is not known", {"address": "/v1/..%2F..%2Fsecret/reconstruct"}),
     "too many points": (413, "frame.npy has 1200 points; at most 1000 are answered here", {"content": npy()}),
-}  # fmt: skip
+}
 
 
 def test_each_refusal_is_a_status_and_a_sentence(root: Path, tmp_path: Path) -> None:

@@ -38,7 +38,11 @@ DESCRIPTION = """Every part of a deformable object, hidden side included, from o
 frame to the weights of its object. Lengths are in the frame's unit, depth images are in metres, places are in the
 camera's frame: x right, y down, z forward."""
 
-PARTS = {"frame": {"format": "binary"}, "mask": {"format": "binary"}, "intrinsics": {"contentMediaType": JSON}}
+PARTS: dict[str, dict[str, str]] = {
+    "frame": {"format": "binary"},
+    "mask": {"format": "binary"},
+    "intrinsics": {"contentMediaType": JSON},
+}
 
 BODY = {
     "required": True,
@@ -57,7 +61,7 @@ BODY = {
 
 ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Figures as in summary.json of `mereo reconstruct`, or surfaces as in its segments.glb, by Accept",
+        "description": "By Accept: figures as in summary.json of `mereo reconstruct`, or surfaces as in segments.glb",
         "content": {JSON: {}, GLB: {}},
     },
     400: {"description": "A form that cannot be read"},
@@ -134,7 +138,8 @@ class Service:
         """Reply to a frame that waits, or what is said when its client or its time is gone."""
         gone = asyncio.create_task(_until_gone(request))
         try:
-            await asyncio.wait({gone, waiting.answer}, timeout=self.config.timeout, return_when=asyncio.FIRST_COMPLETED)
+            either: set[asyncio.Future[Any]] = {gone, waiting.answer}
+            await asyncio.wait(either, timeout=self.config.timeout, return_when=asyncio.FIRST_COMPLETED)
         finally:
             left = gone.done()
             gone.cancel()

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from python_multipart.exceptions import MultipartParseError
-from python_multipart.multipart import MultipartParser, parse_options_header
+from python_multipart.multipart import MultipartCallbacks, MultipartParser, parse_options_header
 
 from mereo.io.depth_formats import DEPTH_READERS
 from mereo.io.point_cloud_formats import CLOUD_READERS
@@ -166,18 +166,16 @@ class _Parts:
         self._part, self._file, self._ended = _Part(), None, False
         self._found: dict[str, str] = {}
         self._open: list[BinaryIO] = []
-        self._parser = MultipartParser(
-            boundary,
-            {
-                "on_part_begin": self._begin,
-                "on_header_begin": self._next_header,
-                "on_header_field": lambda data, start, end: self._header(self._part.names, data[start:end]),
-                "on_header_value": lambda data, start, end: self._header(self._part.values, data[start:end]),
-                "on_headers_finished": self._place,
-                "on_part_data": lambda data, start, end: self._open[-1].write(data[start:end]),
-                "on_end": self._end,
-            },
-        )
+        callbacks: MultipartCallbacks = {
+            "on_part_begin": self._begin,
+            "on_header_begin": self._next_header,
+            "on_header_field": self._header_field,
+            "on_header_value": self._header_value,
+            "on_headers_finished": self._place,
+            "on_part_data": self._data,
+            "on_end": self._end,
+        }
+        self._parser = MultipartParser(boundary, callbacks)
 
     def write(self, chunk: bytes) -> None:
         self._parser.write(chunk)
@@ -197,6 +195,15 @@ class _Parts:
     def _next_header(self) -> None:
         self._part.names.append(bytearray())
         self._part.values.append(bytearray())
+
+    def _header_field(self, data: bytes, start: int, end: int) -> None:
+        self._header(self._part.names, data[start:end])
+
+    def _header_value(self, data: bytes, start: int, end: int) -> None:
+        self._header(self._part.values, data[start:end])
+
+    def _data(self, data: bytes, start: int, end: int) -> None:
+        self._open[-1].write(data[start:end])
 
     def _header(self, texts: list[bytearray], piece: bytes) -> None:
         self._part.size += len(piece)

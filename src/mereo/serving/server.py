@@ -68,10 +68,8 @@ def serve(
         service = Service(dispatcher, metrics, config, root, processes[0].ready.facts, resolution, entry)
         names = ", ".join(service.names)
         address = entry.address(socket.getsockname()[1])
-        print(
-            f"serving {names} at {address} ({workers} process{'' if workers == 1 else 'es'}; /docs says how to ask); Ctrl-C ends",
-            flush=True,
-        )
+        many = "1 process" if workers == 1 else f"{workers} processes"
+        print(f"serving {names} at {address} ({many}; /docs says how to ask); Ctrl-C ends", flush=True)
         settings = uvicorn.Config(
             make_app(service),
             http="h11",
@@ -91,7 +89,8 @@ class GracefulServer(uvicorn.Server):
 
     def __init__(self, config: uvicorn.Config, dispatcher: Dispatcher) -> None:
         super().__init__(config)
-        self._dispatcher, self._loop = dispatcher, None
+        self._dispatcher = dispatcher
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     async def serve(self, sockets: Any = None) -> None:
         """Serve until a signal; a closed terminal (HUP) is one too, unless it is ignored (``nohup``)."""

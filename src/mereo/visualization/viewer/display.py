@@ -7,7 +7,6 @@ the input's unit, so that sizes of points, gizmos and clipping distances fit.
 import contextlib
 import io
 import logging
-import socket
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
