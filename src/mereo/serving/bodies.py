@@ -10,14 +10,17 @@ from collections.abc import AsyncIterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from python_multipart.exceptions import MultipartParseError
-from python_multipart.multipart import MultipartCallbacks, MultipartParser, parse_options_header
+from python_multipart.multipart import MultipartParser, parse_options_header
 
 from mereo.io.depth_formats import DEPTH_READERS
 from mereo.io.point_cloud_formats import CLOUD_READERS
 from mereo.serving.refusals import Refused
+
+if TYPE_CHECKING:
+    from python_multipart.multipart import MultipartCallbacks
 
 SUFFIXES = tuple(sorted({*CLOUD_READERS, *DEPTH_READERS}))
 """Suffixes of what can be a frame."""
@@ -166,7 +169,7 @@ class _Parts:
         self._part, self._file, self._ended = _Part(), None, False
         self._found: dict[str, str] = {}
         self._open: list[BinaryIO] = []
-        callbacks: MultipartCallbacks = {
+        callbacks: "MultipartCallbacks" = {
             "on_part_begin": self._begin,
             "on_header_begin": self._next_header,
             "on_header_field": self._header_field,

@@ -10,7 +10,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 def served_weights(weights: Sequence[str], scenes: Sequence[str] = ()) -> tuple[Served, ...]:
-    """Weights of ``bunny``, ``learned/weights.safetensors`` or ``liver=learned/weights.safetensors``, with their scenes.
+    """Weights of ``bunny``, ``learned/weights.safetensors`` or ``liver=learned/weights.safetensors``, with scenes.
 
     Without a name a file is called by its own, and one that is called weights by its folder.
 
