@@ -69,7 +69,7 @@ def serve(
         names = ", ".join(service.names)
         address = entry.address(socket.getsockname()[1])
         many = "1 process" if workers == 1 else f"{workers} processes"
-        print(f"serving {names} at {address} ({many}; /docs says how to ask); Ctrl-C ends", flush=True)
+        said = f"serving {names} at {address} ({many}; /docs says how to ask); Ctrl-C ends"
         settings = uvicorn.Config(
             make_app(service),
             http="h11",
@@ -81,21 +81,27 @@ def serve(
             server_header=False,
             limit_concurrency=config.queue + CONNECTIONS,
         )
-        GracefulServer(settings, dispatcher).run(sockets=[socket])
+        GracefulServer(settings, dispatcher, said).run(sockets=[socket])
 
 
 class GracefulServer(uvicorn.Server):
     """Server that refuses what waits as soon as it is asked to end, and answers what is begun."""
 
-    def __init__(self, config: uvicorn.Config, dispatcher: Dispatcher) -> None:
+    def __init__(self, config: uvicorn.Config, dispatcher: Dispatcher, said: str) -> None:
         super().__init__(config)
-        self._dispatcher = dispatcher
+        self._dispatcher, self._said = dispatcher, said
         self._loop: asyncio.AbstractEventLoop | None = None
 
     async def serve(self, sockets: Any = None) -> None:
         """Serve until a signal; a closed terminal (HUP) is one too, unless it is ignored (``nohup``)."""
         self._loop = asyncio.get_running_loop()
         await super().serve(sockets)
+
+    async def startup(self, sockets: Any = None) -> None:
+        """Listen, and only then say so."""
+        await super().startup(sockets)
+        if not self.should_exit:
+            print(self._said, flush=True)
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
