@@ -53,7 +53,7 @@ class ServeCommand:
         """Serve until a signal asks for the end."""
         if missing := [name for name in NEEDED if find_spec(name) is None]:
             raise ImportError(f"{missing[0]} is not installed; `mereo serve` needs it: run pip install 'mereo[serve]'")
-        from mereo.io.cores import FreeCores, use_free_cores
+        from mereo.io.cores import FreeCores, cores, threads_for
         from mereo.serving.server import serve
 
         serve(
@@ -63,7 +63,7 @@ class ServeCommand:
             resolution=self.resolution,
             host=self.host,
             port=self.port,
-            workers=self.workers or use_free_cores(FreeCores()),
+            workers=self.workers or threads_for(FreeCores().now(), cores()),
             config=self.limits,
             inference=self.inference,
         )

@@ -252,7 +252,7 @@ def taken_warnings(told: list[str], frame: FrameRequest) -> Iterator[None]:
         warnings.simplefilter("always")
         yield
     for one in recorded:
-        if one.category.__module__.startswith("mereo."):
+        if one.category.__module__.partition(".")[0] == __name__.partition(".")[0]:
             told.append(shown(str(one.message), frame))
         else:
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
