@@ -70,21 +70,21 @@ def figures(content: bytes) -> dict[str, Any]:
 
 def one_after_the_other(
     frames: Sequence[Frame], fit: Any, resolution: int, folder: Path
-) -> tuple[list[Frame], list[float]]:
-    """The frames with their answers, and the seconds of each, in a process like those of the server."""
+) -> tuple[list[Frame], list[tuple[float, float]]]:
+    """The frames with their answers, and seconds and processor seconds of each, in a process like the server's."""
     names = tuple(dict.fromkeys(frame.weights for frame in frames))
     setup = Setup(tuple(Served(name, name) for name in names), fit, InferenceConfig(precision="float32"))
-    worker, answered, seconds = WorkerProcess(setup), list[Frame](), list[float]()
+    worker, answered, seconds = WorkerProcess(setup), list[Frame](), list[tuple[float, float]]()
     worker.wait_until_ready()
     try:
         for frame in [*frames[:2], *frames]:  # the first ones load libraries
             (folder / "frame.npy").write_bytes(frame.content)
             reading, isolation = InputConfig(), IsolationConfig()
             request = FrameRequest(frame.weights, folder, "frame.npy", reading, isolation, resolution, JSON)
-            start = time.perf_counter()
+            start, had = time.perf_counter(), processor_s(worker.process.pid)
             refused = worker.ask(Begin((request,)))[0]
             reply: Reply = refused or worker.ask(Finish(0))
-            seconds.append(time.perf_counter() - start)
+            seconds.append((time.perf_counter() - start, processor_s(worker.process.pid) - had))
             assert reply.status == 200, reply.body
             answered.append(Frame(frame.weights, frame.content, figures(reply.body)))
     finally:
@@ -171,11 +171,22 @@ def load(
     return together
 
 
+def family(pid: int) -> list[int]:
+    """A process and its children."""
+    children = [word for file in Path(f"/proc/{pid}/task").glob("*/children") for word in file.read_text().split()]
+    return [pid, *map(int, children)]
+
+
 def resident_mb(pid: int) -> dict[int, float]:
     """Memory of a process and its children, in MB each."""
-    children = [word for file in Path(f"/proc/{pid}/task").glob("*/children") for word in file.read_text().split()]
-    pages = {one: int(Path(f"/proc/{one}/statm").read_text().split()[1]) for one in (pid, *map(int, children))}
+    pages = {one: int(Path(f"/proc/{one}/statm").read_text().split()[1]) for one in family(pid)}
     return {one: count * os.sysconf("SC_PAGE_SIZE") / 1e6 for one, count in pages.items()}
+
+
+def processor_s(pid: int) -> float:
+    """Processor time that a process and its children have had, which other work on the machine changes least."""
+    fields = [Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split() for one in family(pid)]
+    return sum(int(row[11]) + int(row[12]) for row in fields) / os.sysconf("SC_CLK_TCK")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
@@ -183,14 +194,15 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         frames = frames_of(options.weights, options.frames, folder)
-        answered, alone_s = one_after_the_other(frames, options.fit, options.resolution, folder)
+        answered, alone = one_after_the_other(frames, options.fit, options.resolution, folder)
+        alone_s, alone_processor_s = map(np.array, zip(*alone, strict=True))
         weights = [word for one in options.weights for word in ("--weights", one)]
         more = ("--fit", options.fit, "--workers", str(options.workers), "--batch", str(options.batch))
         memory: list[tuple[float, float]] = []
         with served(*weights, *more, "--resolution", str(options.resolution), scratch=folder) as (process, port):
             address = "/v1/{weights}/reconstruct"
             load(port, answered, options.clients, 5.0, address, lambda _: None)  # libraries, caches
-            start = time.monotonic()
+            start, had = time.monotonic(), processor_s(process.pid)
             seen = load(
                 port,
                 answered,
@@ -199,11 +211,11 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
                 address,
                 lambda seconds: memory.append((seconds, sum(resident_mb(process.pid).values()))),
             )
-            spent = time.monotonic() - start
+            spent, processor = time.monotonic() - start, processor_s(process.pid) - had
             each = resident_mb(process.pid)
     seconds, megabytes = map(np.array, zip(*memory, strict=True))
     late = seconds >= seconds[-1] / 2
-    rate, alone = len(seen.latencies) / spent, 1 / float(np.mean(alone_s))
+    rate, rival = len(seen.latencies) / spent, 1 / float(np.mean(alone_s))
     return {
         "clients": options.clients,
         "seconds": spent,
@@ -211,9 +223,11 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         "rate_hz": rate,
         "p50_ms": 1e3 * float(np.quantile(seen.latencies, 0.5)),
         "p99_ms": 1e3 * float(np.quantile(seen.latencies, 0.99)),
-        "rival_rate_hz": alone,
+        "processor_ms": 1e3 * processor / max(len(seen.latencies), 1),
+        "rival_rate_hz": rival,
         "rival_p50_ms": 1e3 * float(np.median(alone_s)),
-        "times_the_rival": rate / alone,
+        "rival_processor_ms": 1e3 * float(np.mean(alone_processor_s)),
+        "times_the_rival": rate / rival,
         "memory_mb": {
             "first": megabytes[0],
             "half": float(megabytes[late][0]),
@@ -230,13 +244,18 @@ def summary(found: dict[str, Any]) -> str:
     """Words for the figures."""
     memory = found["memory_mb"]
     counts = ", ".join(f"{count} {what}" for what, count in sorted(found["answers"].items()))
-    return (
-        f"{found['clients']} clients, {found['seconds']:.0f} s: {counts}; {found['rate_hz']:.2f} answers/s, p50 "
-        f"{found['p50_ms']:.0f} ms, p99 {found['p99_ms']:.0f} ms\none after the other, without HTTP: "
-        f"{found['rival_rate_hz']:.2f}/s, median {found['rival_p50_ms']:.0f} ms; it gives "
-        f"{found['times_the_rival']:.2f} times as many\nits processes: {memory['first']:.0f} MB at first, "
-        f"{memory['half']:.0f} MB after half of the time, {memory['last']:.0f} MB at the end, at most "
-        f"{memory['most']:.0f} MB ({memory['growth_mb_per_minute']:+.1f} MB a minute in the second half)"
+    return "\n".join(
+        (
+            f"{found['clients']} clients, {found['seconds']:.0f} s: {counts}",
+            f"{found['rate_hz']:.2f} answers/s, p50 {found['p50_ms']:.0f} ms, p99 {found['p99_ms']:.0f} ms, "
+            f"{found['processor_ms']:.0f} ms of processor time each",
+            f"one after the other, without HTTP: {found['rival_rate_hz']:.2f}/s, median {found['rival_p50_ms']:.0f} ms, "
+            f"{found['rival_processor_ms']:.0f} ms of processor time each",
+            f"the server gives {found['times_the_rival']:.2f} times as many",
+            f"memory of its processes: {memory['first']:.0f} MB at first, {memory['half']:.0f} MB after half of the time, "
+            f"{memory['last']:.0f} MB at the end, at most {memory['most']:.0f} MB "
+            f"({memory['growth_mb_per_minute']:+.1f} MB a minute in the second half)",
+        )
     )
 
 
