@@ -249,10 +249,10 @@ def summary(found: dict[str, Any]) -> str:
             f"{found['clients']} clients, {found['seconds']:.0f} s: {counts}",
             f"{found['rate_hz']:.2f} answers/s, p50 {found['p50_ms']:.0f} ms, p99 {found['p99_ms']:.0f} ms, "
             f"{found['processor_ms']:.0f} ms of processor time each",
-            f"one after the other, without HTTP: {found['rival_rate_hz']:.2f}/s, median {found['rival_p50_ms']:.0f} ms, "
+            f"one at a time, no HTTP: {found['rival_rate_hz']:.2f}/s, median {found['rival_p50_ms']:.0f} ms, "
             f"{found['rival_processor_ms']:.0f} ms of processor time each",
             f"the server gives {found['times_the_rival']:.2f} times as many",
-            f"memory of its processes: {memory['first']:.0f} MB at first, {memory['half']:.0f} MB after half of the time, "
+            f"memory: {memory['first']:.0f} MB at first, {memory['half']:.0f} MB after half of the time, "
             f"{memory['last']:.0f} MB at the end, at most {memory['most']:.0f} MB "
             f"({memory['growth_mb_per_minute']:+.1f} MB a minute in the second half)",
         )

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("fastapi", reason="fastapi (extra `serve`) is not installed")
+for module in ("fastapi", "uvicorn", "prometheus_client", "python_multipart"):
+    pytest.importorskip(module, reason=f"{module} (extra `serve`) is not installed")
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
