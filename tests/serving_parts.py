@@ -134,6 +134,6 @@ def run(work: Coroutine[Any, Any, Any]) -> Any:
 
 async def until(condition: Callable[[], bool]) -> None:
     """Wait for what other tasks and threads bring about."""
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         while not condition():
             await asyncio.sleep(0.002)

@@ -6,7 +6,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,10 +22,12 @@ from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.evaluation.sample_views import load_view
 from mereo.io.config import InputConfig
 from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
 from mereo.serving.config import ServeConfig
 from mereo.serving.messages import GLB, Served, Setup
+from mereo.visualization.answering import answer
 
 EXACT = InferenceConfig(precision="float32")
 
@@ -38,20 +39,14 @@ def analytic(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def rope_only(rope: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    for place in ("mereo.serving.answering.load_for", "mereo.cli.reconstruct.load_for"):
-        monkeypatch.setattr(place, lambda *_: replace(rope, precision="float32"))
-
-
-def by_command(frame: Path, output: Path, monkeypatch: pytest.MonkeyPatch, **job: Any) -> dict[str, Any]:
-    """What `mereo reconstruct` writes of a frame, but for clocks."""
-    reconstruct_file(frame, output, FrameJob(**{"weights": "any", "resolution": 12, "inference": EXACT, **job}))
-    return figures((output / "summary.json").read_bytes())
+    monkeypatch.setattr("mereo.serving.answering.load_for", lambda *_: rope)
 
 
 def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: replace(balls(), name="balls"))
     np.save(tmp_path / "frame.npy", CLOUD)
-    expected = by_command(tmp_path / "frame.npy", tmp_path / "out", monkeypatch, choice="off")
+    reconstruct_file(tmp_path / "frame.npy", tmp_path / "out", FrameJob("any", 12, inference=EXACT, choice="off"))
+    expected = figures((tmp_path / "out/summary.json").read_bytes())
 
     async def ask() -> None:
         async with running(tmp_path / "s") as server:
@@ -69,9 +64,7 @@ def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.M
     assert not list((tmp_path / "s").iterdir()), "what requests brought is removed"
 
 
-def test_a_depth_image_is_registered_as_by_the_command(
-    tmp_path: Path, rope_only: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model, rope_only: None) -> None:
     """Intrinsics as a part and in the address, and a mask; surfaces with how sure they are."""
     view = load_view("rope")
     frame, mask, camera = tmp_path / "frame.png", tmp_path / "mask.png", tmp_path / "intrinsics.json"
@@ -79,7 +72,8 @@ def test_a_depth_image_is_registered_as_by_the_command(
     Image.fromarray((view.depth.depth > 0).astype(np.uint8) * 255).save(mask)
     write_camera(camera, view.depth.camera)
     reading = InputConfig(intrinsics=camera, mask=mask, depth_scale=20_000)
-    expected = by_command(frame, tmp_path / "out", monkeypatch, choice="modes", reading=reading, weights="rope")
+    alone = answer(read_frame(frame, reading), rope, "modes", 12)
+    expected = figures(alone.save(tmp_path / "summary.json").read_bytes())
     files = {name: (path.name, path.read_bytes()) for name, path in (("frame", frame), ("mask", mask))}
     address = f"{ADDRESS}?depth-scale=20000"
 
@@ -98,7 +92,7 @@ def test_a_depth_image_is_registered_as_by_the_command(
                 address, params={"intrinsics": camera.read_text(), "depth-scale": 20_000}, files=files,
                 headers={"Accept": GLB},
             )  # fmt: skip
-            assert again.content == (tmp_path / "out/segments.glb").read_bytes()
+            assert again.content == alone.save(tmp_path / "segments.glb").read_bytes()
             (tmp_path / "served.glb").write_bytes(again.content)
 
     (tmp_path / "s").mkdir()
@@ -122,7 +116,7 @@ def clouds(count: int) -> Iterator[np.ndarray]:
 @pytest.mark.parametrize("workers, batch", [(2, 0), (1, 4)])
 def test_every_client_gets_the_answer_to_its_own_frame(workers: int, batch: int, tmp_path: Path) -> None:
     """One at a time and bit by bit; or encoded together, up to the rounding of the network's products."""
-    count = 12
+    count = 8
 
     async def ask() -> None:
         config = ServeConfig(batch=batch, batch_wait_ms=20)

@@ -20,7 +20,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from mereo.serving.bodies import MEDIA, take, too_large
+from mereo.serving.bodies import MEDIA, SUFFIXES, take, too_large
 from mereo.serving.config import ServeConfig
 from mereo.serving.dispatcher import Dispatcher, Waiting
 from mereo.serving.gate import Gate
@@ -174,7 +174,7 @@ def make_app(service: Service) -> Any:
     @app.get("/v1/weights")
     async def weights() -> JSONResponse:
         """What is served: names, segments, and what is known of how far the answers can be trusted."""
-        return JSONResponse({"weights": list(service.facts), "formats": sorted({*MEDIA.values()})})
+        return JSONResponse({"weights": list(service.facts), "formats": list(SUFFIXES)})
 
     @app.get("/healthz")
     async def healthz() -> JSONResponse:
