@@ -28,6 +28,7 @@ ROOMS = (
     "visualization",
     "learning",
     "experiments",
+    "serving",
     "cli",
 )
 """From the ground up: a room imports only from itself and from those before it."""

@@ -20,13 +20,15 @@ from tyro.conf import subcommand
 from mereo.cli import commands, dataset_commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
 from mereo.cli.calibrate import CalibrateCommand
 from mereo.cli.config_file import GivenOptions, defaults_from, read_options
-from mereo.cli.last_resort import is_foreseen, sentence
+from mereo.cli.last_resort import sentence
 from mereo.cli.learn import LearnCommand
 from mereo.cli.reconstruct_command import ReconstructCommand
+from mereo.cli.serve_command import ServeCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.cli.usage import noted_events, usage_sentence
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import FreeCores, use_free_cores, use_threads
+from mereo.io.foreseen import is_foreseen
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
@@ -229,6 +231,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         | Annotated[tool_commands.Align, subcommand("align")]
         | Annotated[tool_commands.ViewCommand, subcommand("view")]
         | Annotated[tool_commands.StreamCommand, subcommand("stream")]
+        | Annotated[ServeCommand, subcommand("serve")]
         | Annotated[commands.Export, subcommand("export")]
         | Annotated[tool_commands.Experiment, subcommand("experiment")]
         | Annotated[tool_commands.BenchCommand, subcommand("bench")]

@@ -28,6 +28,7 @@ PURPOSES: dict[str, str] = {
     "gcs": "datasets in Google Cloud Storage",
     "cluster": "data generation on several machines",
     "align": "ground truth from scans",
+    "serve": "answers over HTTP",
     "docs": "the documentation as pages",
     "dev": "tests and checks",
 }
