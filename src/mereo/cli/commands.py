@@ -19,6 +19,7 @@ from mereo.io.cores import workers_for
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.training.config import PresetName, TrainConfig
+from mereo.workers.config import ONE_CPU, RayAddress, TaskResources, cluster_of
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,8 @@ class Generate:
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
         settings: how one example is made.
         threads: processes where --workers does not say; 0 means one per core.
+        ray: make them in tasks of a Ray cluster: local, one of so many workers for this run; auto or HOST:PORT, all
+            of the one that this machine is a node of.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
@@ -110,6 +113,7 @@ class Generate:
     sensor: Sensor = "paper"
     settings: Annotated[GenerateConfig, arg(name="")] = field(default_factory=GenerateConfig)
     threads: Threads = 0
+    ray: RayAddress = None
     options_from: ConfigFile = None
 
     def run(self) -> None:
@@ -127,6 +131,7 @@ class Generate:
             shard=part_of(self.shard),
             resume=self.resume,
             test=self.test,
+            cluster=cluster_of(self.ray, workers_for(self.workers, self.threads)),
         )
         write_json(self.output / CONFIG, options_of(self, "generate"))
 
@@ -185,6 +190,9 @@ class Evaluate:
             and the draws' own scores beside it; off the network alone; modes leaves the draws out.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
         threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        ray: score each view in a task of a Ray cluster: local, one of so many --threads for this run; auto or
+            HOST:PORT, the one that this machine is a node of.
+        task: what each task has for itself.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
@@ -203,6 +211,8 @@ class Evaluate:
     fit: FitChoice = "auto"
     force: bool = False
     threads: Threads = 0
+    ray: RayAddress = None
+    task: Annotated[TaskResources, arg(name="")] = ONE_CPU
     options_from: ConfigFile = None
 
     def run(self) -> None:
@@ -212,6 +222,7 @@ class Evaluate:
         settings = GenerateConfig(
             image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms, workspace=self.workspace
         )
+        cluster = cluster_of(self.ray, self.threads, self.task)
         if self.scans is not None:
             from mereo.models.weights import load_for
 
@@ -220,6 +231,8 @@ class Evaluate:
                     "--scans are real and take no simulated camera: leave out --sensor, --image-size, --noise-std and "
                     "--workspace"
                 )
+            if cluster is not None:
+                raise ValueError("--scans are few and are scored here: leave out --ray")
             model = load_for(self.weights, self.inference)
             evaluate_on_scans(
                 model,
@@ -242,6 +255,7 @@ class Evaluate:
             choice=self.fit,
             force=self.force,
             options=options_of(self, "evaluate"),
+            cluster=cluster,
         )
 
 

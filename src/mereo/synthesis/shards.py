@@ -46,7 +46,8 @@ from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
 from mereo.synthesis.dataset_files import check_space, dataset_key, read_shard, read_template
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.observations import Clouds
-from mereo.synthesis.workers import in_processes
+from mereo.workers.config import Cluster
+from mereo.workers.spread import spread
 
 SHARD_SIZE = 64
 MANIFEST = "manifest.json"
@@ -91,6 +92,7 @@ def generate(
     shard: tuple[int, int] = (0, 1),
     resume: bool = False,
     test: bool = False,
+    cluster: Cluster | None = None,
 ) -> None:
     """Make ``examples`` labelled examples of a scene in the directory ``output``.
 
@@ -106,6 +108,7 @@ def generate(
             write to one directory.
         resume: go on with a dataset of the same settings that is there; without it that is an error.
         test: make a test set, whose seed training refuses.
+        cluster: whose tasks make the files' content, instead of workers; they are written here all the same.
 
     Raises:
         ValueError: a number out of its range, a seed of the wrong kind, ``resume`` with other settings.
@@ -132,9 +135,10 @@ def generate(
         save_statistical_model(scene_model(loaded, states, quiet=False), output / STATISTICAL_MODEL, key)
     missing = [item for item in shards if not item.is_complete(key)]
     total = sum(item.end - item.first for item in missing)
-    # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile
-    work = partial(_make_shard, _Work(loaded if is_yaml(scene) else scene, settings, seed, key))
-    with closing(in_processes(work, missing, workers)) as made, progress("generate", total) as shown:
+    # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile; other
+    # machines have neither file nor assets
+    work = partial(_make_shard, _Work(loaded if cluster or is_yaml(scene) else scene, settings, seed, key))
+    with closing(spread(work, missing, workers, cluster)) as made, progress("generate", total) as shown:
         for item, data in made:
             with atomic_file(item.path) as temporary:
                 temporary.write_bytes(data)

@@ -1,0 +1,233 @@
+"""A Ray cluster: one of this machine for the time of a command, or one that is there and stays.
+
+What Ray itself would leave or change is put right: its files lie in a scratch folder of ours, which goes; it sends no
+statistics, prints nothing, and signals end the command as before.
+"""
+
+import logging
+import math
+import os
+import signal
+import socket
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from mereo.io.cores import cores
+from mereo.io.scratch_folders import scratch_folder
+from mereo.workers.config import LOCAL, Cluster
+from mereo.workers.installation import Installation, installation
+
+ANSWER_S = 5.0
+"""Seconds in which an address must take a connection."""
+
+PROBE_S = 60.0
+"""Seconds in which every node must say what is installed there: its first worker has to start."""
+
+
+def ray_library() -> ModuleType:
+    """Ray, imported where it is used, quiet and without statistics; ``ImportError`` where it is not installed."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError:
+        raise ImportError("Ray, which --ray needs, is not installed: run pip install 'mereo[cluster]'") from None
+    library: ModuleType = ray
+    return library
+
+
+@contextmanager
+def connected(cluster: Cluster) -> Iterator[None]:
+    """Connection of this process to a cluster, for as long as the block runs.
+
+    Where the process is connected already (its caller uses Ray too), that connection is used and stays.
+
+    Raises:
+        ConnectionError: there is no such cluster.
+        ValueError: the address is none, a node has another installation, or this machine has not what a task asks for.
+    """
+    ray = ray_library()
+    if ray.is_initialized():
+        _check_nodes()
+        yield
+    elif cluster.address == LOCAL:
+        with _started(cluster):
+            yield
+    else:
+        with _joined(cluster):
+            yield
+
+
+@contextmanager
+def _started(cluster: Cluster) -> Iterator[None]:
+    """Cluster of this machine, which ends with the block."""
+    ray = ray_library()
+    with scratch_folder(_place()) as folder, _ended():
+        with _own_signals():
+            ray.init(
+                address="local",
+                num_cpus=cluster.local_cpus or cores(),
+                include_dashboard=False,
+                log_to_driver=False,
+                logging_level=logging.CRITICAL,
+                _temp_dir=str(folder),
+            )
+        if not task_slots(cluster):
+            raise ValueError(
+                f"a task has {_asked(cluster)}, more than there is here ({_offered()}): ask for less, or join a "
+                "cluster that has it with --ray HOST:PORT"
+            )
+        yield
+
+
+@contextmanager
+def _joined(cluster: Cluster) -> Iterator[None]:
+    """Connection to a cluster that stays."""
+    ray = ray_library()
+    address = cluster.address
+    if address != "auto":
+        _check_reachable(address)
+    with _ended():
+        try:
+            with _own_signals():
+                ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
+        except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
+            raise ConnectionError(_not_joined(address, error)) from error
+        _check_nodes()
+        if not task_slots(cluster):
+            print(
+                f"mereo: warning: a task has {_asked(cluster)}, which no node of the cluster has now ({_offered()}); "
+                "waiting for one that does",
+                file=sys.stderr,
+            )
+        yield
+
+
+@contextmanager
+def _ended() -> Iterator[None]:
+    """Block after which this process is connected to nothing, and what it has started has ended."""
+    try:
+        yield
+    finally:
+        ray_library().shutdown()
+
+
+@contextmanager
+def _own_signals() -> Iterator[None]:
+    """Block after which signals are handled as before: Ray makes TERM end the process by itself."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _place() -> Path:
+    """Where the scratch folder of a cluster lies: paths of sockets in it may not be longer than about 100 bytes."""
+    return (Path("/tmp") if os.name == "posix" else Path(tempfile.gettempdir())) / "mereo-ray"
+
+
+# --- addresses --------------------------------------------------------------------------------------------------------
+
+
+def _check_reachable(address: str) -> None:
+    """Raise where nothing answers at an address, at once; Ray itself would try for a minute."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or "/" in host:
+        raise ValueError(
+            f"--ray is {address!r}; it must be local, auto, or the HOST:PORT that `ray start --head` prints: correct it"
+        )
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConnectionError(
+            f"there is no Ray cluster at {address} ({reason}): correct the address, start one there with `ray start "
+            "--head`, or use --ray local"
+        ) from None
+
+
+def _not_joined(address: str, error: BaseException) -> str:
+    """Sentence on why a cluster that may be there cannot be joined."""
+    told = " ".join(str(error).split())[:300]
+    if address == "auto":
+        return (
+            f"this machine is a node of no Ray cluster{f' ({told})' if told else ''}: start one or join it with `ray "
+            "start`, or use --ray local"
+        )
+    return (
+        f"the Ray cluster at {address} cannot be joined ({told or type(error).__name__}): this machine must be one of "
+        f"its nodes (`ray start --address={address}`), with the same Ray and Python"
+    )
+
+
+# --- nodes ------------------------------------------------------------------------------------------------------------
+
+
+def task_slots(cluster: Cluster) -> int:
+    """Number of tasks that the nodes can run at a time, by what they have."""
+    return sum(
+        int(min(has.get("CPU", 0.0) / cluster.cpus, has.get("GPU", 0.0) / cluster.gpus if cluster.gpus else math.inf))
+        for has in _resources()
+    )
+
+
+def _resources() -> list[dict[str, float]]:
+    """What each living node has."""
+    return [node["Resources"] for node in ray_library().nodes() if node["Alive"]]
+
+
+def _asked(cluster: Cluster) -> str:
+    return f"{cluster.cpus} CPUs" + (f" and {cluster.gpus:g} GPUs" if cluster.gpus else "")
+
+
+def _offered() -> str:
+    each = [f"{has.get('CPU', 0):g} CPUs and {has.get('GPU', 0):g} GPUs" for has in _resources()]
+    return "; ".join(each) or "no node"
+
+
+def _check_nodes() -> None:
+    """Raise ``ValueError`` where a node has another installation than this machine, before any work."""
+    ray = ray_library()
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    told: dict[Any, str] = {}
+    probe = ray.remote(_installed)
+    for node in ray.nodes():
+        if node["Alive"]:
+            there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            reference = probe.options(num_cpus=0, max_retries=3, scheduling_strategy=there).remote()
+            told[reference] = node["NodeManagerAddress"]
+    for reference, address in told.items():
+        try:
+            found = ray.get(reference, timeout=PROBE_S)
+        except Exception as error:
+            reason = " ".join(str(error).split())
+            missing = "No module named 'mereo'" in reason
+            raise ValueError(
+                f"node {address} has no mereo: install the same there, or take another --ray"
+                if missing
+                else f"node {address} cannot say what is installed there ({reason[-300:]}): look at `ray status`"
+            ) from error
+        check_same(found, f"node {address}")
+
+
+def check_same(theirs: Installation, place: str) -> None:
+    """Raise ``ValueError`` where another installation differs from this process's."""
+    difference = installation().difference(theirs, place)
+    if difference is not None:
+        raise ValueError(difference)
+
+
+def _installed() -> Installation:
+    """Task: what is installed on a node."""
+    return installation()
