@@ -120,19 +120,23 @@ class Generate:
         """Write the folder of labelled examples."""
         from mereo.io.atomic_files import write_json
         from mereo.synthesis.shards import generate
+        from mereo.workers.cluster import joined_first
 
-        generate(
-            self.scene,
-            self.output,
-            self.settings,
-            examples=self.examples,
-            seed=self.seed,
-            workers=workers_for(self.workers, self.threads),
-            shard=part_of(self.shard),
-            resume=self.resume,
-            test=self.test,
-            cluster=cluster_of(self.ray, workers_for(self.workers, self.threads)),
-        )
+        workers = workers_for(self.workers, self.threads)
+        cluster = cluster_of(self.ray, workers)
+        with joined_first(cluster):
+            generate(
+                self.scene,
+                self.output,
+                self.settings,
+                examples=self.examples,
+                seed=self.seed,
+                workers=workers,
+                shard=part_of(self.shard),
+                resume=self.resume,
+                test=self.test,
+                cluster=cluster,
+            )
         write_json(self.output / CONFIG, options_of(self, "generate"))
 
 
@@ -218,6 +222,7 @@ class Evaluate:
     def run(self) -> None:
         """Write scores and pictures of their errors, and print the table."""
         from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
+        from mereo.workers.cluster import joined_first
 
         settings = GenerateConfig(
             image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms, workspace=self.workspace
@@ -244,19 +249,20 @@ class Evaluate:
                 options=options_of(self, "evaluate"),
             )
             return
-        evaluate_weights(
-            self.weights,
-            self.output,
-            examples=self.examples,
-            seed=self.seed,
-            scene=self.scene,
-            settings=settings,
-            inference=self.inference,
-            choice=self.fit,
-            force=self.force,
-            options=options_of(self, "evaluate"),
-            cluster=cluster,
-        )
+        with joined_first(cluster):
+            evaluate_weights(
+                self.weights,
+                self.output,
+                examples=self.examples,
+                seed=self.seed,
+                scene=self.scene,
+                settings=settings,
+                inference=self.inference,
+                choice=self.fit,
+                force=self.force,
+                options=options_of(self, "evaluate"),
+                cluster=cluster,
+            )
 
 
 @dataclass(frozen=True)

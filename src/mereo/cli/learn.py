@@ -52,6 +52,7 @@ class LearnCommand:
         """Learn, and print the scores and how to use the weights."""
         from mereo.learning.learn import learn
         from mereo.learning.object_folders import is_folder_of_objects, learn_objects
+        from mereo.workers.cluster import joined_first
 
         workers = workers_for(self.workers, self.threads)
         if not is_folder_of_objects(self.object):
@@ -60,12 +61,14 @@ class LearnCommand:
             learn(self.object, self.output, minutes=self.minutes, init=self.init, units=self.units, workers=workers)
             return
         task = TaskResources(self.cpus_per_object, self.gpus_per_object)
-        learn_objects(
-            self.object[0],
-            self.output,
-            minutes=self.minutes,
-            init=self.init,
-            units=self.units,
-            workers=workers,
-            cluster=None if self.ray is None else cluster_of(self.ray, self.threads, task),
-        )
+        cluster = None if self.ray is None else cluster_of(self.ray, self.threads, task)
+        with joined_first(cluster):
+            learn_objects(
+                self.object[0],
+                self.output,
+                minutes=self.minutes,
+                init=self.init,
+                units=self.units,
+                workers=workers,
+                cluster=cluster,
+            )

@@ -75,6 +75,7 @@ class ReconstructCommand:
         from mereo.cli.reconstruct import FrameJob
         from mereo.cli.reconstruct_many import reconstruct_inputs
         from mereo.models.elsewhere import for_tasks
+        from mereo.workers.cluster import joined_first
 
         cluster = cluster_of(self.ray, self.threads, self.task)
         job = FrameJob(
@@ -92,4 +93,5 @@ class ReconstructCommand:
             self.explain,
             options_of(self, "reconstruct"),
         )
-        reconstruct_inputs(self.inputs, self.output, job, cluster)
+        with joined_first(cluster):
+            reconstruct_inputs(self.inputs, self.output, job, cluster)

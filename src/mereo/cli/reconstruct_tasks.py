@@ -110,8 +110,8 @@ def answer_in_tasks(
 ) -> Iterator[tuple[Path, Told | None]]:
     """Answer frames in tasks of a cluster, and write the folder of each; yields each as it is there, in any order.
 
-    What a task prints is printed here, below what ``heading`` prints of its frame. None is yielded for a frame for which
-    ``failed`` was called.
+    What a task prints is printed here, below what ``heading`` prints of its frame. None is yielded for a frame for
+    which ``failed`` was called.
     """
     lost: list[Path] = []
 

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -61,6 +61,14 @@ def connected(cluster: Cluster) -> Iterator[None]:
     else:
         with _joined(cluster):
             yield
+
+
+def joined_first(cluster: Cluster | None) -> AbstractContextManager[None]:
+    """Connection to a cluster that is there already, before any work: a wrong address is said at once.
+
+    One that would be started, or none, is left to ``in_tasks``: other mistakes are said before seconds go by.
+    """
+    return nullcontext() if cluster is None or cluster.address == LOCAL else connected(cluster)
 
 
 @contextmanager

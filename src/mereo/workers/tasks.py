@@ -14,7 +14,6 @@ from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from mereo.io.cores import use_threads
@@ -144,7 +143,7 @@ def _pickled(function: Function[Any, Any]) -> bytes:
     return pickled
 
 
-def _is_here_alone(name: str, module: ModuleType) -> bool:
+def _is_here_alone(name: str, module: Any) -> bool:
     """Whether a module was loaded from a file that nobody finds by its name, as a Python scene's is."""
     file = getattr(module, "__file__", None)
     if "." in name or name == "__main__" or file is None or getattr(module, "__path__", None) is not None:
