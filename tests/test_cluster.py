@@ -4,14 +4,16 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cluster_work import Cancelled, die, die_once, fail_on_three, report, square, wait_long
 from scene_files import write_bar
 
 from mereo import __main__ as command_line
+from mereo.io.cores import THREAD_VARIABLES
 from mereo.learning import object_folders
 from mereo.learning.object_folders import learn_objects, objects_in
 from mereo.models.config import InferenceConfig
@@ -23,47 +25,10 @@ from mereo.workers import tasks
 from mereo.workers.cluster import connected, ray_library
 from mereo.workers.config import Cluster, TaskResources, cluster_of
 from mereo.workers.installation import installation
-from mereo.workers.processes import THREAD_VARIABLES
 from mereo.workers.spread import in_order, spread
 from mereo.workers.tasks import in_tasks
 
-Cancelled = Callable[[], bool]
 HERE = Cluster(local_cpus=2)
-
-
-def square(number: int, cancelled: Cancelled) -> int:
-    return number * number
-
-
-def report(number: int, cancelled: Cancelled) -> tuple[int, list[str | None], str | None]:
-    return os.getpid(), [os.environ.get(name) for name in THREAD_VARIABLES], os.environ.get("CUDA_VISIBLE_DEVICES")
-
-
-def fail_on_three(number: int, cancelled: Cancelled) -> int:
-    if number == 3:
-        raise ValueError("three is bad: pass another number")
-    return number
-
-
-def die_once(place: tuple[str, int], cancelled: Cancelled) -> int:
-    """Kills its worker, the first time, where the number is odd."""
-    folder, number = place
-    mark = Path(folder) / str(number)
-    if number % 2 and not mark.exists():
-        mark.touch()
-        os.kill(os.getpid(), 9)
-    return number
-
-
-def die(number: int, cancelled: Cancelled) -> int:
-    if number:
-        os.kill(os.getpid(), 9)
-    return number
-
-
-def wait_long(number: int, cancelled: Cancelled) -> int:
-    time.sleep(60.0 * number)
-    return number
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,8 @@ from mereo.learning import learn as learning
 from mereo.learning.example_frame import FRAME
 from mereo.learning.object_files import scene_for
 from mereo.models.config import EXACT, InferenceConfig
-from mereo.models.export.onnx_export import export_weights
 from mereo.models.elsewhere import for_tasks
+from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
 from mereo.models.weights import WEIGHTS, load_for
 from mereo.scenes.registry import load_scene

@@ -40,12 +40,14 @@ class _Work:
         function: pickled: what it imports must find the number of threads set.
         threads: in which a task computes.
         gpu: whether a task has a GPU, or a share of one; else it must see none.
+        places: where this process finds modules; on this machine, and where nodes share files, tasks find them too.
         installation: of the machine that wants the results.
     """
 
     function: bytes
     threads: int
     gpu: bool
+    places: tuple[str, ...]
     installation: Installation
 
 
@@ -90,7 +92,8 @@ def in_tasks(
     """
     ray = ray_library()
     with connected(cluster):
-        shared = ray.put(_Work(_pickled(function), cluster.cpus, cluster.gpus > 0, installation()))
+        work = _Work(_pickled(function), cluster.cpus, cluster.gpus > 0, _places(), installation())
+        shared = ray.put(work)
         task = ray.remote(_apply).options(
             num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=DEATHS, retry_exceptions=False
         )
@@ -148,7 +151,12 @@ def _is_here_alone(name: str, module: Any) -> bool:
     file = getattr(module, "__file__", None)
     if "." in name or name == "__main__" or file is None or getattr(module, "__path__", None) is not None:
         return False
-    return str(Path(file).parent) not in {str(Path(place or ".").absolute()) for place in sys.path}
+    return str(Path(file).parent) not in _places()
+
+
+def _places() -> tuple[str, ...]:
+    """``sys.path`` by absolute names."""
+    return tuple(str(Path(place).absolute()) for place in sys.path)
 
 
 _arrived: tuple[str, Function[Any, Any]] | None = None
@@ -177,6 +185,7 @@ def _function(reference: Any) -> Function[Any, Any]:
         difference = work.installation.difference(installation(), f"node {socket.gethostname()}")
         if difference is not None:  # it has joined the cluster since that was looked at
             raise ValueError(difference)
+        sys.path.extend(place for place in work.places if place not in sys.path)
         _arrived = reference.hex(), pickle.loads(work.function)
     return _arrived[1]
 
