@@ -7,16 +7,16 @@ statistics, prints nothing, and signals end the command as before.
 import logging
 import math
 import os
-import signal
 import socket
 import sys
 import tempfile
-import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 from mereo.io.cores import cores
 from mereo.io.scratch_folders import scratch_folder
@@ -25,6 +25,8 @@ from mereo.workers.installation import Installation, installation
 
 ANSWER_S = 5.0
 """Seconds in which an address must take a connection."""
+
+Value = TypeVar("Value")
 
 PROBE_S = 60.0
 """Seconds in which every node must say what is installed there: its first worker has to start."""
@@ -76,15 +78,17 @@ def _started(cluster: Cluster) -> Iterator[None]:
     """Cluster of this machine, which ends with the block."""
     ray = ray_library()
     with scratch_folder(_place()) as folder, _ended():
-        with _own_signals():
-            ray.init(
-                address="local",
-                num_cpus=cluster.local_cpus or cores(),
-                include_dashboard=False,
-                log_to_driver=False,
-                logging_level=logging.CRITICAL,
-                _temp_dir=str(folder),
-            )
+        start = partial(
+            ray.init,
+            address="local",
+            num_cpus=cluster.local_cpus or cores(),
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level=logging.CRITICAL,
+            _temp_dir=str(folder),
+        )
+        aside(start)
+        _quiet()
         if not task_slots(cluster):
             raise ValueError(
                 f"a task has {_asked(cluster)}, more than there is here ({_offered()}): ask for less, or join a "
@@ -102,8 +106,8 @@ def _joined(cluster: Cluster) -> Iterator[None]:
         _check_reachable(address)
     with _ended():
         try:
-            with _own_signals():
-                ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
+            aside(partial(ray.init, address=address, log_to_driver=False, logging_level=logging.CRITICAL))
+            _quiet()
         except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
             raise ConnectionError(_not_joined(address, error)) from error
         _check_nodes()
@@ -125,18 +129,24 @@ def _ended() -> Iterator[None]:
         ray_library().shutdown()
 
 
-@contextmanager
-def _own_signals() -> Iterator[None]:
-    """Block after which signals are handled as before: Ray makes TERM end the process by itself."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def aside(function: Callable[[], Value]) -> Value:
+    """Result of a function, which runs in a thread of its own so that this one can be interrupted.
+
+    In the main thread Ray takes TERM for itself and makes one exception, its own, of all that signals raise. What is
+    interrupted is waited for before the exception goes on.
+    """
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(function).result()
+
+
+def _quiet() -> None:
+    """Let Ray print nothing about workers and nodes that die: what they did is done again.
+
+    Nothing public stops that: Ray's own errors are printed even where the output of workers is not.
+    """
+    from ray._private import worker
+
+    worker._worker_logs_enabled = False
 
 
 def _place() -> Path:

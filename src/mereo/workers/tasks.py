@@ -12,12 +12,13 @@ import time
 import traceback
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from mereo.io.cores import use_threads
-from mereo.workers.cluster import connected, ray_library, task_slots
+from mereo.workers.cluster import aside, connected, ray_library, task_slots
 from mereo.workers.config import Cluster
 from mereo.workers.installation import Installation, installation
 from mereo.workers.processes import Function, Item, Result
@@ -104,13 +105,18 @@ def in_tasks(
                     running[task.remote([shared], item)] = item
                 if not running:
                     break
-                done, _ = ray.wait(list(running), num_returns=1, timeout=LOOK_EVERY_S)
-                for reference in done:
+                for reference in aside(partial(_done, list(running))):
                     item = running.pop(reference)
                     yield item, _result(reference, item, lost)
         finally:
             for reference in running:
                 ray.cancel(reference, force=True)
+
+
+def _done(running: list[Any]) -> list[Any]:
+    """The tasks that are done, one at most, as soon as one is; none after a second, in which nobody could interrupt."""
+    done: list[Any] = ray_library().wait(running, num_returns=1, timeout=1.0)[0]
+    return done
 
 
 class _Slots:
