@@ -17,6 +17,7 @@ from pathlib import Path
 ROOMS = (
     "geometry",
     "io",
+    "workers",
     "deformation",
     "scenes",
     "synthesis",

@@ -24,7 +24,7 @@ PURPOSES: dict[str, str] = {
     "sensors": "ROS bags, EXR depth images and Zivid clouds",
     "simulation": "states from finite elements",
     "hub": "weights on a model hub",
-    "cluster": "data generation on several machines",
+    "cluster": "generation, scoring, frames and learning on Ray clusters",
     "align": "ground truth from scans",
     "docs": "the documentation as pages",
     "dev": "tests and checks",
