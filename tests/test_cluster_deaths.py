@@ -41,6 +41,15 @@ def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shards, "SHARD_SIZE", 4)
 
 
+@pytest.fixture
+def place(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Folder for the files of this test's clusters alone."""
+    with TemporaryDirectory(prefix="m", dir="/tmp") as folder:
+        monkeypatch.setenv("TMPDIR", folder)  # of a command
+        monkeypatch.setattr("tempfile.tempdir", folder)
+        yield Path(folder)
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The dataset as one process makes it: 24 shards."""
@@ -61,7 +70,7 @@ def nodes() -> Iterator[Any]:
         made = Nodes(initialize_head=True, head_node_args=head)
         for _ in range(2):
             made.add_node(num_cpus=1)
-        yield made
+        yield made, folder
         ray.shutdown()
         made.shutdown()
 
@@ -79,6 +88,14 @@ def processes(*words: str) -> list[int]:
     return sorted(found)
 
 
+def parent(process: int) -> int:
+    """Process that has started another one; 0 where that is gone."""
+    try:
+        return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return 0
+
+
 def gone(*words: str, within_s: float = 15.0) -> bool:
     """Whether such processes end soon."""
     until = time.monotonic() + within_s
@@ -88,18 +105,19 @@ def gone(*words: str, within_s: float = 15.0) -> bool:
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
-def test_workers_change_no_bit(workers: int, whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_workers_change_no_bit(workers: int, whole: dict[str, bytes], tmp_path: Path, place: Path) -> None:
     generate(TOY, tmp_path / "data", SMALL, examples=EXAMPLES, seed=3, cluster=Cluster(local_cpus=workers))
     assert contents(tmp_path / "data") == whole
-    assert gone("raylet", "mereo-ray") and not list(Path("/tmp").glob(".mereo-ray.*"))
+    assert gone(str(place)) and not list(place.iterdir())
 
 
 def test_nodes_that_die_lose_nothing(
-    nodes: Any, whole: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    nodes: tuple[Any, str], whole: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Ten times a worker is killed, or a node, which another one then replaces."""
     output, killed, rng = tmp_path / "data", list[str](), np.random.default_rng(7)
-    there = Cluster(nodes.address)
+    made_nodes, place = nodes
+    there = Cluster(made_nodes.address)
     work = partial(generate, TOY, output, SMALL, examples=EXAMPLES, seed=3, cluster=there)
     with ThreadPoolExecutor(1) as thread:  # nodes can be started in the main thread alone
         made = thread.submit(work)
@@ -108,34 +126,34 @@ def test_nodes_that_die_lose_nothing(
             if len(list(output.glob("shard-*"))) <= 2 * len(killed):
                 continue
             if rng.random() < 0.3:
-                alive = list(nodes.worker_nodes)
-                nodes.remove_node(alive[int(rng.integers(len(alive)))], allow_graceful=False)
-                nodes.add_node(num_cpus=1)
+                alive = list(made_nodes.worker_nodes)
+                made_nodes.remove_node(alive[int(rng.integers(len(alive)))], allow_graceful=False)
+                made_nodes.add_node(num_cpus=1)
                 killed.append("node")
-            elif working := processes("ray::_apply"):
+            elif working := [pid for pid in processes("ray::_apply") if parent(pid) in processes("raylet", place)]:
                 os.kill(int(rng.choice(working)), signal.SIGKILL)
                 killed.append("worker")
         made.result()
     assert len(killed) == KILLS and min(killed.count("node"), killed.count("worker")) >= 2, killed
     assert contents(output) == whole
-    assert nodes.worker_nodes and processes("raylet"), "a cluster that was there stays"
+    assert made_nodes.worker_nodes and processes("raylet", place), "a cluster that was there stays"
     assert "raylet" not in capsys.readouterr().out, "Ray says nothing of what is done again"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path) -> None:
+def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path, place: Path) -> None:
     """Ctrl-C reaches all processes of a terminal; TERM and KILL the command alone."""
     output = tmp_path / "data"
-    line = f"generate shapes --examples 6400 --seed 3 --output {output} --ray local --workers 2 --image-size 48"
+    line = f"generate shapes --examples 6400 --test --seed 1000003 --output {output} --ray local --workers 2"
     command = subprocess.Popen(
-        [sys.executable, "-m", "mereo", *line.split(), "--points", "64", "--per-segment", "8"],
+        [sys.executable, "-m", "mereo", *line.split(), *["--image-size", "32", "--points", "64", "--per-segment", "8"]],
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         start_new_session=True,
         text=True,
     )
     until = time.monotonic() + 300
-    while not (output / "shard-00001.safetensors").exists() and time.monotonic() < until and command.poll() is None:
+    while not (output / "shard-00000.safetensors").exists() and time.monotonic() < until and command.poll() is None:
         time.sleep(0.1)
     if number == signal.SIGINT:
         os.killpg(command.pid, number)
@@ -143,7 +161,7 @@ def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path
         command.send_signal(number)
     said = command.communicate(timeout=60)[1]
     assert command.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[number], said
-    assert gone("ray", "mereo-ray")
+    assert gone(str(place))
     if number == signal.SIGKILL:  # its files are removed by the next one
         with connected(Cluster(local_cpus=1)):
             pass
@@ -152,7 +170,7 @@ def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path
             "mereo: interrupted" if number == signal.SIGINT else "mereo: stopped by SIGTERM"
         )
         assert not [place for place in output.iterdir() if place.name.endswith(".partial")]
-    assert not list(Path("/tmp").glob(".mereo-ray.*"))
+    assert not list(place.iterdir())
 
 
 def without_seconds(value: Any) -> Any:

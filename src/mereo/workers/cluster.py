@@ -11,7 +11,7 @@ import socket
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,9 @@ ANSWER_S = 5.0
 """Seconds in which an address must take a connection."""
 
 Value = TypeVar("Value")
+
+LONGEST_PLACE = 16
+"""Characters of a folder's name in which Ray's sockets have names that are short enough: at most 107 bytes on Linux."""
 
 PROBE_S = 60.0
 """Seconds in which every node must say what is installed there: its first worker has to start."""
@@ -77,7 +80,7 @@ def joined_first(cluster: Cluster | None) -> AbstractContextManager[None]:
 def _started(cluster: Cluster) -> Iterator[None]:
     """Cluster of this machine, which ends with the block."""
     ray = ray_library()
-    with scratch_folder(_place()) as folder, _ended():
+    with scratch_folder(_place()) as folder, ThreadPoolExecutor(1) as starter, _ended():
         start = partial(
             ray.init,
             address="local",
@@ -87,7 +90,7 @@ def _started(cluster: Cluster) -> Iterator[None]:
             logging_level=logging.CRITICAL,
             _temp_dir=str(folder),
         )
-        aside(start)
+        _finished(starter.submit(start))  # in a thread that stays: Linux ends what a thread has started when that ends
         _quiet()
         if not task_slots(cluster):
             raise ValueError(
@@ -136,7 +139,16 @@ def aside(function: Callable[[], Value]) -> Value:
     interrupted is waited for before the exception goes on.
     """
     with ThreadPoolExecutor(1) as thread:
-        return thread.submit(function).result()
+        return _finished(thread.submit(function))
+
+
+def _finished(running: Future[Value]) -> Value:
+    """Result of what runs in a thread; an interruption goes on once that has ended."""
+    try:
+        return running.result()
+    except BaseException:
+        wait([running])
+        raise
 
 
 def _quiet() -> None:
@@ -150,8 +162,9 @@ def _quiet() -> None:
 
 
 def _place() -> Path:
-    """Where the scratch folder of a cluster lies: paths of sockets in it may not be longer than about 100 bytes."""
-    return (Path("/tmp") if os.name == "posix" else Path(tempfile.gettempdir())) / "mereo-ray"
+    """Where the scratch folder of a cluster lies: the system's place for such, or /tmp where that has a long name."""
+    place = tempfile.gettempdir()
+    return Path("/tmp" if os.name == "posix" and len(place) > LONGEST_PLACE else place) / "mereo-ray"
 
 
 # --- addresses --------------------------------------------------------------------------------------------------------
