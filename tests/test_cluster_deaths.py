@@ -96,6 +96,12 @@ def parent(process: int) -> int:
         return 0
 
 
+def working(place: str | Path) -> list[int]:
+    """Workers at a task, of the cluster whose files lie in a folder."""
+    nodes = processes("raylet", str(place))
+    return [process for process in processes("ray::_apply") if parent(process) in nodes]
+
+
 def gone(*words: str, within_s: float = 15.0) -> bool:
     """Whether such processes end soon."""
     until = time.monotonic() + within_s
@@ -130,8 +136,8 @@ def test_nodes_that_die_lose_nothing(
                 made_nodes.remove_node(alive[int(rng.integers(len(alive)))], allow_graceful=False)
                 made_nodes.add_node(num_cpus=1)
                 killed.append("node")
-            elif working := [pid for pid in processes("ray::_apply") if parent(pid) in processes("raylet", place)]:
-                os.kill(int(rng.choice(working)), signal.SIGKILL)
+            elif busy := working(place):
+                os.kill(int(rng.choice(busy)), signal.SIGKILL)
                 killed.append("worker")
         made.result()
     assert len(killed) == KILLS and min(killed.count("node"), killed.count("worker")) >= 2, killed
@@ -152,14 +158,17 @@ def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path
         start_new_session=True,
         text=True,
     )
-    until = time.monotonic() + 300
-    while not (output / "shard-00000.safetensors").exists() and time.monotonic() < until and command.poll() is None:
-        time.sleep(0.1)
-    if number == signal.SIGINT:
-        os.killpg(command.pid, number)
-    else:
-        command.send_signal(number)
-    said = command.communicate(timeout=60)[1]
+    try:
+        until = time.monotonic() + 300
+        while not working(place) and time.monotonic() < until and command.poll() is None:
+            time.sleep(0.1)
+        if number == signal.SIGINT:
+            os.killpg(command.pid, number)
+        else:
+            command.send_signal(number)
+        said = command.communicate(timeout=60)[1]
+    finally:
+        command.kill()
     assert command.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[number], said
     assert gone(str(place))
     if number == signal.SIGKILL:  # its files are removed by the next one
