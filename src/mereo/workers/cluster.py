@@ -7,9 +7,11 @@ statistics, prints nothing, and signals end the command as before.
 import logging
 import math
 import os
+import signal
 import socket
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -90,7 +92,8 @@ def _started(cluster: Cluster) -> Iterator[None]:
             logging_level=logging.CRITICAL,
             _temp_dir=str(folder),
         )
-        _finished(starter.submit(start))  # in a thread that stays: Linux ends what a thread has started when that ends
+        with _own_signals():  # in a thread that stays: Linux ends what a thread has started when that ends
+            _finished(starter.submit(start))
         _quiet()
         if not task_slots(cluster):
             raise ValueError(
@@ -109,7 +112,8 @@ def _joined(cluster: Cluster) -> Iterator[None]:
         _check_reachable(address)
     with _ended():
         try:
-            aside(partial(ray.init, address=address, log_to_driver=False, logging_level=logging.CRITICAL))
+            with _own_signals():
+                aside(partial(ray.init, address=address, log_to_driver=False, logging_level=logging.CRITICAL))
             _quiet()
         except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
             raise ConnectionError(_not_joined(address, error)) from error
@@ -149,6 +153,20 @@ def _finished(running: Future[Value]) -> Value:
     except BaseException:
         wait([running])
         raise
+
+
+@contextmanager
+def _own_signals() -> Iterator[None]:
+    """Block after which signals are handled as before: Ray's compiled code would abort the process at TERM."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _quiet() -> None:
