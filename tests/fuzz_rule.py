@@ -18,7 +18,7 @@ from traceback import extract_tb
 from types import FrameType
 
 from mereo import __main__ as command_line
-from mereo.cli.last_resort import PACKAGE, is_foreseen
+from mereo.io.foreseen import PACKAGE, is_foreseen
 from mereo.io.size_limits import LIMIT_VARIABLE
 
 MOST_SECONDS, MOST_GB = 20.0, 2.0

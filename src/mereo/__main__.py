@@ -17,16 +17,18 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo.cli import commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
+from mereo.cli import commands, dataset_commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
 from mereo.cli.calibrate import CalibrateCommand
 from mereo.cli.config_file import GivenOptions, defaults_from, read_options
-from mereo.cli.last_resort import is_foreseen, sentence
+from mereo.cli.last_resort import sentence
 from mereo.cli.learn import LearnCommand
 from mereo.cli.reconstruct_command import ReconstructCommand
+from mereo.cli.serve_command import ServeCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.cli.usage import noted_events, usage_sentence
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import FreeCores, use_free_cores, use_threads
+from mereo.io.foreseen import is_foreseen
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
@@ -209,6 +211,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         (weights_hub_commands.WeightsPush, "push"),
         (weights_hub_commands.WeightsPull, "pull"),
     )
+    datasets = (dataset_commands.DatasetCheck, "check"), (dataset_commands.DatasetShow, "show")
     assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")
     return (
         Annotated[commands.Demo, subcommand("demo")]
@@ -220,6 +223,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
         | Annotated[_group(weights), subcommand("weights", description="List, show, publish or fetch weights.")]
         | starting(commands.Generate, "generate", settings=GenerateConfig(sensor=sensor))
+        | Annotated[_group(datasets), subcommand("dataset", description="Check or describe generated examples.")]
         | starting(commands.Train, "train", config=recipe)
         | starting(commands.Evaluate, "evaluate", terms=sensor)
         | Annotated[CalibrateCommand, subcommand("calibrate")]
@@ -227,6 +231,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         | Annotated[tool_commands.Align, subcommand("align")]
         | Annotated[tool_commands.ViewCommand, subcommand("view")]
         | Annotated[tool_commands.StreamCommand, subcommand("stream")]
+        | Annotated[ServeCommand, subcommand("serve")]
         | Annotated[commands.Export, subcommand("export")]
         | Annotated[tool_commands.Experiment, subcommand("experiment")]
         | Annotated[tool_commands.BenchCommand, subcommand("bench")]

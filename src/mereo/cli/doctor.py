@@ -24,8 +24,11 @@ PURPOSES: dict[str, str] = {
     "sensors": "ROS bags, EXR depth images and Zivid clouds",
     "simulation": "states from finite elements",
     "hub": "weights on a model hub",
+    "storage": "datasets in S3 and what speaks it",
+    "gcs": "datasets in Google Cloud Storage",
     "cluster": "generation, scoring, frames and learning on Ray clusters",
     "align": "ground truth from scans",
+    "serve": "answers over HTTP",
     "docs": "the documentation as pages",
     "dev": "tests and checks",
 }

@@ -1,34 +1,12 @@
 """Last resort of the command line: one line for what no part of mereo has foreseen."""
 
-import sysconfig
 from pathlib import Path
-from traceback import walk_tb
-
-PACKAGE = Path(__file__).parents[1]
-
-LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-"""Where the code of others is; mereo itself may be installed there."""
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "bad_alloc")
 """What torch and compiled libraries say where Python has a ``MemoryError``."""
 
 MOST_CHARACTERS = 300
 """Length of a quoted text, of which libraries may make pages."""
-
-
-def is_foreseen(error: Exception) -> bool:
-    """Whether the text of an error is a sentence for users: not what a library's ``ValueError`` says of its arguments.
-
-    Those of the operating system, and imports that fail, name what is wrong themselves.
-    """
-    if isinstance(error, OSError | ImportError):
-        return True
-    return isinstance(error, ValueError) and not _raised_in_library(error)
-
-
-def _raised_in_library(error: Exception) -> bool:
-    places = [frame.f_code.co_filename for frame, _ in walk_tb(error.__traceback__)]
-    return bool(places) and places[-1].startswith(LIBRARIES) and not Path(places[-1]).is_relative_to(PACKAGE)
 
 
 def sentence(error: Exception, arguments: list[str], variable: str) -> str:
@@ -55,7 +33,7 @@ def sentence(error: Exception, arguments: list[str], variable: str) -> str:
 def _command(arguments: list[str]) -> str:
     """Names of the command and of the existing files among its arguments: ``mereo align on scan.ply``."""
     words = next((n for n, word in enumerate(arguments) if not word.isalpha()), len(arguments))
-    named = arguments[:1] if words < 2 or arguments[0] not in ("scene", "assets") else arguments[:2]
+    named = arguments[:1] if words < 2 or arguments[0] not in ("scene", "assets", "dataset") else arguments[:2]
     values = [word.partition("=")[2] if word.startswith("--") else word for word in arguments[len(named) :]]
     files = [value for value in values if value and _is_there(value)]
     return " ".join(["mereo", *named, *(["on", ", ".join(files)] if files else [])])

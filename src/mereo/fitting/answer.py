@@ -75,6 +75,7 @@ def answer(
     stated_unit: float | None = None,
     keep_all: bool = False,
     unit_assumed: bool = False,
+    encoded: EncodedFrame | None = None,
 ) -> Answer:
     """Answer to the frame that a cloud shows.
 
@@ -92,12 +93,13 @@ def answer(
             estimate agrees.
         keep_all: drop no strays.
         unit_assumed: ``stated_unit`` is only assumed: an object of another size is no sign of another object then.
+        encoded: the likelier reading of the cloud as the model has understood it, where that is known already.
 
     Raises ``ValueError`` as ``mereo.reconstruct`` does, and for other choices than "auto" as ``fit_frame`` does.
     """
     if isinstance(registrar, str):
         registrar = registrar_for(model, registrar)
-    found = fitted_frame(cloud, model, registrar, frame, scene_unit, stated_unit, keep_all)
+    found = fitted_frame(cloud, model, registrar, frame, scene_unit, stated_unit, keep_all, encoded)
     return answer_fitted(found, model, registrar, resolution, label_points, None if unit_assumed else stated_unit)
 
 

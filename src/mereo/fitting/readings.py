@@ -72,6 +72,7 @@ def fitted_frame(
     scene_unit: float | None = None,
     stated_unit: float | None = None,
     keep_all: bool = False,
+    encoded: EncodedFrame | None = None,
 ) -> FittedFrame:
     """The frame in the reading that its fit explains best; without a registrar in the one that is likely by itself.
 
@@ -83,6 +84,7 @@ def fitted_frame(
         scene_unit: length of a scene unit in the cloud's unit, where it is known.
         stated_unit: the same as the input states it, believed only where the network's own estimate agrees.
         keep_all: take every point for the object's.
+        encoded: the likelier reading as the model has understood it, where that is known already (``encode_frames``).
 
     Raises ``ValueError`` for unusable clouds. Where a fit finds too little, ``FittedFrame.error`` says so.
     """
@@ -92,7 +94,7 @@ def fitted_frame(
     fitting = registrar if registrar is None or len(found) == 1 else registrar.at_once
 
     def fitted(reading: Reading) -> FittedFrame:
-        seen = encode_frame(reading, model, axes)
+        seen = encoded if encoded is not None and reading is found[0] else encode_frame(reading, model, axes)
         if fitting is None:
             return FittedFrame(seen, seen)
         doubtful = transform_points(seen.T_camera_input, reading.whole.points[~reading.keep])

@@ -8,7 +8,7 @@ frame and units.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -23,6 +23,7 @@ from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.models.joint_encoding import encode_all
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import Field
 from mereo.reconstruction.isosurfaces import extract_whole, locate
@@ -119,6 +120,28 @@ def encode_frame(
     with timed(seconds, "encode"):
         code = model.encode(PointCloud(transform_points(T_camera_input, points)))
     return EncodedFrame(reading, axes, T_camera_input, code, seconds)
+
+
+def encode_frames(found: Sequence[tuple[Reading, CloudAxes]], model: Model) -> list[EncodedFrame]:
+    """``encode_frame`` of several readings, each with its axes, in one call of the network (``encode_all``).
+
+    Each takes an equal share of the seconds. Raises ``ValueError`` where any is unusable.
+    """
+    seconds: dict[str, float] = {}
+    placed = [into_camera(reading.cloud.points, axes) for reading, axes in found]
+    with timed(seconds, "encode"):
+        codes = encode_all(
+            model,
+            [
+                PointCloud(transform_points(T_camera_input, reading.cloud.points))
+                for (reading, _), T_camera_input in zip(found, placed, strict=True)
+            ],
+        )
+    share = {stage: spent / len(found) for stage, spent in seconds.items() if found}
+    return [
+        EncodedFrame(reading, axes, T_camera_input, code, dict(share))
+        for (reading, axes), T_camera_input, code in zip(found, placed, codes, strict=True)
+    ]
 
 
 def reconstruct(

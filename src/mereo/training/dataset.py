@@ -6,7 +6,6 @@ Notation: e examples, b of them in a batch, p stored points, n points that the n
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,10 +13,19 @@ from jaxtyping import Float, Float16, Int, UInt8
 from torch import Tensor
 
 from mereo.geometry.conventions import MIN_POINTS
+from mereo.io.places import Place
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.scenes.statistical_model_file import load_statistical_model
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE
-from mereo.synthesis.dataset_files import OBSERVED, dataset_key, read_manifest, read_shard, read_template
+from mereo.synthesis.dataset_files import (
+    OBSERVED,
+    dataset_key,
+    list_shards,
+    read_manifest,
+    read_shard,
+    read_template,
+    recorded_files,
+)
 from mereo.training.config import AugmentConfig
 
 
@@ -73,12 +81,14 @@ class Dataset:
         return len(self.cloud)
 
     @classmethod
-    def load(cls, directory: Path, device: torch.device | str = "cpu") -> "Dataset":
+    def load(cls, directory: Place, device: torch.device | str = "cpu") -> "Dataset":
         """Dataset of a directory; ``ValueError`` or ``FileNotFoundError`` when that is not a whole dataset."""
         manifest = read_manifest(directory)
-        key = dataset_key(manifest)
-        shards = sorted(directory.glob("shard-*.safetensors"))
-        parts = [_read_part(path, key, manifest.get("shard_size")) for path in shards]
+        key, recorded = dataset_key(manifest), recorded_files(manifest)
+        parts = [
+            _read_part(path, key, manifest.get("shard_size"), recorded.get(path.name))
+            for path in list_shards(directory)
+        ]
         have = sum(len(part["cloud"]) for part in parts)
         if have != manifest["examples"]:
             raise ValueError(
@@ -97,9 +107,11 @@ class Dataset:
             viewpoint=viewpoint,
             **{name: joined[name] for name in queries},
             manifest=manifest,
-            template=_read_template(directory / TEMPLATE, key, len(manifest["segments"])),
+            template=_read_template(directory / TEMPLATE, key, len(manifest["segments"]), recorded.get(TEMPLATE)),
             visible_m=_visible_m(joined["scale"], manifest.get("unit_m")),
-            statistical_model=_read_statistical_model(directory / STATISTICAL_MODEL, key),
+            statistical_model=_read_statistical_model(
+                directory / STATISTICAL_MODEL, key, recorded.get(STATISTICAL_MODEL)
+            ),
             seen=joined.get("seen"),
             seen_count=joined["seen_count"].long() if observed else None,
         )
@@ -186,16 +198,16 @@ def draw_observations(count: int, further: int, probability: float, rng: torch.G
     return chosen * torch.randint(1, further + 1, (count,), generator=rng)
 
 
-def _read_part(path: Path, key: str, size: int | None) -> dict[str, Tensor]:
+def _read_part(path: Place, key: str, size: int | None, recorded: str | None) -> dict[str, Tensor]:
     """Tensors of the shard that ``path`` names; ``size`` is the number of examples of a whole one, if known."""
     number = path.stem.partition("-")[2]
     first = int(number) * size if size is not None and number.isdecimal() else None
     with _part_of_dataset(path):
-        return {name: torch.from_numpy(value) for name, value in read_shard(path, key, first).items()}
+        return {name: torch.from_numpy(value) for name, value in read_shard(path, key, first, None, recorded).items()}
 
 
 @contextmanager
-def _part_of_dataset(path: Path) -> Iterator[None]:
+def _part_of_dataset(path: Place) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
@@ -207,15 +219,15 @@ def _visible_m(scale: Float[Tensor, " e"], unit_m: float | None) -> tuple[float,
     return None if unit_m is None else (2 * unit_m / float(scale.max()), 2 * unit_m / float(scale.min()))
 
 
-def _read_statistical_model(path: Path, key: str) -> StatisticalModel | None:
-    return load_statistical_model(path, key) if path.exists() else None
+def _read_statistical_model(path: Place, key: str, recorded: str | None) -> StatisticalModel | None:
+    return load_statistical_model(path, key, recorded) if path.exists() else None
 
 
-def _read_template(path: Path, key: str, segments: int) -> Tensor | None:
+def _read_template(path: Place, key: str, segments: int, recorded: str | None) -> Tensor | None:
     if not path.is_file():
         return None
     with _part_of_dataset(path):
-        return torch.from_numpy(read_template(path, key, segments)).float()
+        return torch.from_numpy(read_template(path, key, segments, recorded)).float()
 
 
 def choose_points(

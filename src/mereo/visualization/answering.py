@@ -22,6 +22,7 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, SizeWarning, find_object, size_warning
+from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.scenes.scene import Scene
 from mereo.visualization.result import Result
 
@@ -41,6 +42,7 @@ def answer(
     scene: Scene | str | None = None,
     scene_unit: float | None = None,
     label_points: bool = False,
+    encoded: EncodedFrame | None = None,
 ) -> Result:
     """Answer to one frame: the registered model itself where it explains the frame, else the network's surfaces.
 
@@ -59,6 +61,7 @@ def answer(
         scene: whose draws are fitted, where it is not the built-in one of the weights.
         scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
         label_points: also say on which segment each point of the object lies.
+        encoded: the likelier reading of the object's cloud as the model has understood it, where that is known already.
 
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises ``ValueError`` for unusable clouds, where
     nothing is found, for axes or a unit of a frame that states its own, and for other fits than "auto" where the model
@@ -84,6 +87,7 @@ def answer(
         None if registrar is None or not stated else registrar.stated_unit(seen.frame.unit_m),
         keep_all=isolation is not None and isolation.keep_all,
         unit_assumed=not seen.frame.unit_stated,
+        encoded=encoded,
     )
     result = Result.of(found, seen, network, registrar, resolution, stated)
     warning = size_warning(result.seen, network.provenance) if stated else None

@@ -49,11 +49,11 @@ def in_processes(
     _check_can_be_sent(function)
     # spawned, not forked: threads of libraries that this process has used do not survive a fork
     context = multiprocessing.get_context("spawn")
-    _start_resource_tracker()
+    start_resource_tracker()
     stop = context.Event()
     waiting, running = iter(items), dict[Future[Result], Item]()
     with (
-        _one_thread_each(),
+        one_thread_each(),
         ProcessPoolExecutor(min(workers, len(items)), context, _start_worker, (function, stop)) as pool,
     ):
         try:
@@ -74,8 +74,8 @@ def in_processes(
             pool.shutdown(cancel_futures=True)
 
 
-def _start_resource_tracker() -> None:
-    """Start Python's process that frees shared things, which ignores INT and TERM by itself, with HUP blocked too.
+def start_resource_tracker() -> None:
+    """Start Python's process that frees shared things, once; it ignores INT and TERM by itself, with HUP blocked too.
 
     A closed terminal would end it before the others, which then complain that what they free is gone.
     """
@@ -97,12 +97,12 @@ def _start_worker(function: Function[Any, Any], stop: Event) -> None:
     # Ctrl-C and a closed terminal are the parent's business, which sets `stop`; TERM is how the pool ends its processes
     for number in (signal.SIGINT, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ())):
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    threading.Thread(target=exit_with_parent, daemon=True).start()
     _in_worker = function, stop
 
 
-def _exit_with_parent() -> None:
-    """A parent that was killed cannot stop its workers; they see it go."""
+def exit_with_parent() -> None:
+    """End this process when its parent does; one that was killed cannot stop its workers. Blocks, for a thread."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
@@ -126,8 +126,8 @@ def _check_can_be_sent(function: Function[Any, Any]) -> None:
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started meanwhile compute in one thread: libraries read these when they are loaded."""
+def one_thread_each() -> Iterator[None]:
+    """Let processes that are started in the block compute in one thread: libraries read this when they are loaded."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:

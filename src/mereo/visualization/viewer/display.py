@@ -5,10 +5,8 @@ the input's unit, so that sizes of points, gizmos and clipping distances fit.
 """
 
 import contextlib
-import errno
 import io
 import logging
-import socket
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -18,7 +16,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
-from mereo.visualization.viewer.guard import Entry, guarded_servers
+from mereo.visualization.viewer.guard import Entry, bound_socket, guarded_servers
 
 BACKDROP = ((58, 65, 78), (22, 25, 32))
 """Top and bottom of the background, neutral and dark: the palette's yellow is hard to see on white."""
@@ -60,7 +58,8 @@ def start_server(port: int, title: str, entry: Entry | None = None) -> Any:
     """
     viser = import_viser()
     entry = entry or Entry()
-    port = _free_port(entry.host, port)
+    with bound_socket(entry.host, port) as probe:  # viser would silently take another port
+        port = probe.getsockname()[1]
     # browsers open connections ahead and drop them, which websockets reports with a traceback each
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()), guarded_servers(entry) as guards:  # without its own banner
@@ -81,24 +80,6 @@ def start_server(port: int, title: str, entry: Entry | None = None) -> Any:
     server.scene.configure_default_lights(cast_shadow=False)
     server.scene.configure_environment_map(environment_intensity=ENVIRONMENT)
     return server
-
-
-def _free_port(host: str, port: int) -> int:
-    """The port, or any free one for 0; viser would silently take another one."""
-    try:
-        family, *_, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    except (OSError, UnicodeError):
-        raise OSError(f"{host!r} is no name of this machine; choose another --host, or leave it out") from None
-    with socket.socket(family) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(place)
-        except OSError as error:
-            if error.errno == errno.EADDRNOTAVAIL:
-                raise OSError(f"{host} is no address of this machine; choose another --host") from None
-            raise OSError(f"port {port} is taken or not allowed; choose another one with --port") from None
-        found: int = probe.getsockname()[1]
-        return found
 
 
 def stop_server(server: Any) -> None:

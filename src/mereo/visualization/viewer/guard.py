@@ -8,6 +8,7 @@ Bound to another address than this machine's own, whoever reaches that address c
 token of the printed address; a browser gives it once and then as a cookie, since the page's websocket has no query.
 """
 
+import errno
 import re
 import secrets
 import socket
@@ -48,6 +49,27 @@ class Entry:
     def is_token(self, given: str) -> bool:
         """Whether this is the token, in a time that does not depend on where it differs."""
         return secrets.compare_digest(given.encode(errors="replace"), self.token.encode())
+
+
+def bound_socket(host: str, port: int) -> socket.socket:
+    """Socket at an address of this machine, with any free port for 0.
+
+    Raises ``OSError`` where the port is taken, or the host no address of this machine.
+    """
+    try:
+        family, *_, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except (OSError, UnicodeError):
+        raise OSError(f"{host!r} is no name of this machine; choose another --host, or leave it out") from None
+    bound = socket.socket(family)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind(place)
+    except OSError as error:
+        bound.close()
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise OSError(f"{host} is no address of this machine; choose another --host") from None
+        raise OSError(f"port {port} is taken or not allowed; choose another one with --port") from None
+    return bound
 
 
 def refusal(hosts: Sequence[str], origins: Sequence[str], entry: Entry | None = None, given: Sequence[str] = ()) -> str:

@@ -1,0 +1,69 @@
+"""The command ``mereo serve``. See ``mereo.cli.commands`` for how commands are written."""
+
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Annotated
+
+from tyro.conf import UseAppendAction, arg
+
+from mereo.fitting.config import FitChoice
+from mereo.io.bounds import Cells, Port, Workers
+from mereo.models.config import InferenceConfig
+from mereo.serving.config import ServeConfig
+
+NEEDED = ("fastapi", "uvicorn", "prometheus_client", "python_multipart")
+"""Modules of the extra."""
+
+
+@dataclass(frozen=True)
+class ServeCommand:
+    """Answer frames of many clients over HTTP: a depth image or cloud in, JSON or GLB out: needs the extra `serve`.
+
+    POST a frame to /v1/NAME/reconstruct; /docs says how, /metrics has numbers for Prometheus. TERM and Ctrl-C answer
+    what is begun and refuse the rest.
+
+    Attributes:
+        weights: a shipped name or a file, once for each object; NAME=FILE says what clients call it.
+        scene: NAME=FILE of the scene whose draws are fitted, where it is not the built-in one of the weights; once for
+            each.
+        fit: register the object's own deformation model to the frames: auto takes the registered model where it
+            explains the frame, if the weights carry one; off leaves the network's answer; modes and full take the model
+            in any case, full by fitting the draws of the scene as well.
+        port: where it listens; 0 takes any that is free.
+        host: address of this machine. Only this machine reaches the default. Another one needs the token of the address
+            that is printed, and others on the network can read along: a proxy that encrypts is safer.
+        resolution: grid cells along the longest side, where a request does not say.
+        limits: so that no client, and no crowd of them, takes more than the machine has.
+        inference: where and how exactly the networks compute.
+        workers: processes that answer, each with all weights and one thread; 0 means one per core that is free, on half
+            of them at least.
+    """
+
+    weights: UseAppendAction[tuple[str, ...]] = ()
+    scene: UseAppendAction[tuple[str, ...]] = ()
+    fit: FitChoice = "auto"
+    port: Port = 8000
+    host: str = "127.0.0.1"
+    resolution: Cells = 128
+    limits: Annotated[ServeConfig, arg(name="")] = field(default_factory=ServeConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    workers: Workers = 0
+
+    def run(self) -> None:
+        """Serve until a signal asks for the end."""
+        if missing := [name for name in NEEDED if find_spec(name) is None]:
+            raise ImportError(f"{missing[0]} is not installed; `mereo serve` needs it: run pip install 'mereo[serve]'")
+        from mereo.io.cores import FreeCores, cores, threads_for
+        from mereo.serving.server import serve
+
+        serve(
+            self.weights,
+            scenes=self.scene,
+            fit=self.fit,
+            resolution=self.resolution,
+            host=self.host,
+            port=self.port,
+            workers=self.workers or threads_for(FreeCores().now(), cores()),
+            config=self.limits,
+            inference=self.inference,
+        )

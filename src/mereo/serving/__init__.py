@@ -1,0 +1,1 @@
+"""Answers over HTTP: many clients, frames of several objects, one machine."""

@@ -1,0 +1,258 @@
+"""The process that answers: frames are read, encoded together where that is faster, and fitted one by one.
+
+    Begin -read, isolate-> Observation of each -encode together-> EncodedFrame of each
+    Finish -answer, write-> Reply: summary.json or segments.glb, as ``mereo reconstruct`` writes them
+
+Whatever goes wrong with a frame is its own ``Reply``; nothing is raised for it.
+"""
+
+import json
+import logging
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+from mereo.fitting.register import Registrar, registrar_for
+from mereo.io.atomic_files import to_json
+from mereo.io.foreseen import is_foreseen
+from mereo.io.sensor_frame import read_frame
+from mereo.io.size_limits import SizeError
+from mereo.io.writers.glb import viewer_rotation, write_segments_glb
+from mereo.models.config import Precision
+from mereo.models.model import Model
+from mereo.models.weights import load_for
+from mereo.reconstruction.observation import Observation, find_object
+from mereo.reconstruction.pipeline import EncodedFrame, encode_frames
+from mereo.reconstruction.strays import readings
+from mereo.serving.messages import JSON, Begin, Finish, FrameRequest, Ready, Reply, Served, Setup
+from mereo.serving.refusals import FAULT, failed
+from mereo.visualization.answering import answer
+from mereo.visualization.result import Result
+from mereo.visualization.result_files import radii_of, summarize
+
+LOG = logging.getLogger("mereo.serving")
+
+GPU_BATCH = 8
+"""Frames that are encoded together on a GPU."""
+
+
+class TooManyPoints(ValueError):
+    """Refusal of a frame with more points than are answered."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """Weights that are ready.
+
+    Attributes:
+        served: as they are served.
+        model: on its device, known by the name that clients use.
+        registrar: of the object's own model; None where the network alone answers.
+    """
+
+    served: Served
+    model: Model
+    registrar: Registrar | None
+
+    @classmethod
+    def of(cls, served: Served, setup: Setup) -> "Loaded":
+        """Load weights, and make what every frame needs; raises as ``load_for`` and ``registrar_for`` do."""
+        model = replace(load_for(served.weights, setup.inference), name=served.name)
+        registrar = registrar_for(model, setup.fit, served.scene)
+        if registrar is not None and registrar.choice != "modes":
+            _ = registrar.at_hand  # takes seconds, once
+        _ = model.inference
+        return cls(served, model, registrar)
+
+    def facts(self) -> dict[str, Any]:
+        """What clients may know of the weights."""
+        model, own = self.model, self.model.calibration
+        frame = None if self.registrar is None else self.registrar.model.source_frame
+        return {
+            "name": self.served.name,
+            "segments": [
+                {"name": name, "label": number + 1, "color": list(color)}
+                for number, (name, color) in enumerate(zip(model.names, model.colors, strict=True))
+            ],
+            "nested": [list(pair) for pair in model.nested],
+            "scene": model.provenance.get("scene"),
+            "fit": "off" if self.registrar is None else self.registrar.choice,
+            "scene_unit_m": None if frame is None else frame.unit_m,
+            "calibrated": model.calibrates,
+            "recognition_calibrated": own is not None and own.recognizing is not None,
+            "device": model.device.type,
+            "precision": model.working_precision,
+        }
+
+
+@dataclass(eq=False)
+class Begun:
+    """Frame that is read and waits for its answer.
+
+    Attributes:
+        request: what is wanted.
+        observation: the object in the frame.
+        told: warnings so far, for the client.
+        read_s: seconds of reading.
+        encoded: what the network made of the likelier reading, where frames were encoded together.
+    """
+
+    request: FrameRequest
+    observation: Observation
+    told: list[str]
+    read_s: float
+    encoded: EncodedFrame | None = None
+
+
+@dataclass(eq=False)
+class Answerer:
+    """Answers frames, a batch after the other.
+
+    Attributes:
+        setup: what is served.
+        loaded: the weights, by name.
+    """
+
+    setup: Setup
+    loaded: dict[str, Loaded] = field(default_factory=dict)
+    _begun: list[Begun | None] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, setup: Setup) -> "Answerer":
+        """Load all weights; raises ``ValueError`` or ``OSError`` where some cannot be served so."""
+        return cls(setup, {one.name: Loaded.of(one, setup) for one in setup.served})
+
+    def ready(self) -> Ready:
+        """What is told first."""
+        facts = tuple(one.facts() for one in self.loaded.values())
+        on_gpu = any(one.model.device.type == "cuda" for one in self.loaded.values())
+        precision = next(iter(self.loaded.values())).model.working_precision
+        return Ready(facts, self.setup.batch or (GPU_BATCH if on_gpu else 1), cast(Precision, precision))
+
+    def __call__(self, message: Begin | Finish) -> Any:
+        """Answer to a message: a refusal or None for each frame of a ``Begin``, a ``Reply`` to a ``Finish``."""
+        return self.begin(message.frames) if isinstance(message, Begin) else self.finish(message.number)
+
+    def begin(self, frames: tuple[FrameRequest, ...]) -> list[Reply | None]:
+        """Read frames, all of the same weights; a refusal for each that cannot be."""
+        self._begun, replies = [], list[Reply | None]()
+        for frame in frames:
+            try:
+                self._begun.append(self._read(frame))
+                replies.append(None)
+            except Exception as error:
+                self._begun.append(None)
+                replies.append(refusal(error, frame))
+        self._encode([one for one in self._begun if one is not None])
+        return replies
+
+    def finish(self, number: int) -> Reply:
+        """The answer to a frame that was begun."""
+        begun, self._begun[number] = self._begun[number], None
+        assert begun is not None, "only asked for a frame that was read"
+        try:
+            return self._answer(begun)
+        except Exception as error:
+            return refusal(error, begun.request)
+
+    def _read(self, frame: FrameRequest) -> Begun:
+        started, told = time.perf_counter(), list[str]()
+        with taken_warnings(told, frame):
+            read = read_frame(frame.path, frame.reading)
+            if len(read.cloud) > self.setup.max_points:
+                raise TooManyPoints(
+                    f"{frame.file} has {len(read.cloud)} points; at most {self.setup.max_points} are answered here: "
+                    "thin it out, or crop it around the object"
+                )
+            seen = find_object(read, frame.isolation)
+        return Begun(frame, seen, told, time.perf_counter() - started)
+
+    def _encode(self, begun: list[Begun]) -> None:
+        """Encode frames together, where there are several; one alone is encoded as it is answered."""
+        if len(begun) < 2:
+            return
+        model = self.loaded[begun[0].request.weights].model
+        likelier = [
+            (readings(one.observation.cloud, one.observation.frame.axes, one.request.isolation.keep_all)[0], axes)
+            for one in begun
+            for axes in [one.observation.frame.axes]
+        ]
+        try:
+            encoded = encode_frames(likelier, model)
+        except ValueError:  # an unusable cloud among them, which says so when it is encoded alone
+            return
+        for one, code in zip(begun, encoded, strict=True):
+            one.encoded = code
+
+    def _answer(self, begun: Begun) -> Reply:
+        request, loaded = begun.request, self.loaded[begun.request.weights]
+        with taken_warnings(begun.told, request):
+            found = answer(
+                begun.observation,
+                loaded.model,
+                loaded.registrar,
+                request.resolution,
+                isolation=request.isolation,
+                encoded=begun.encoded,
+            )
+        started = time.perf_counter()
+        body = json_of(found, begun.told) if request.media == JSON else glb_of(found, request)
+        seconds = {"read": begun.read_s, **found.reconstruction.timings_s, "write": time.perf_counter() - started}
+        known = found.recognition.known
+        headers = {
+            "Mereo-Known": known if isinstance(known, str) else str(known).lower(),
+            "Mereo-Answer": "registration" if found.taken else "network",
+        }
+        return Reply(200, body, request.media, headers, seconds)
+
+
+def json_of(found: Result, told: list[str]) -> bytes:
+    """Content of summary.json, and what was warned of."""
+    frame, registered = found.seen.frame, found.registered
+    sure = None if registered is None else registered.uncertainty
+    facts = {"frame": frame.axes, "unit_m": frame.unit_m, **found.facts()}
+    summary = summarize(found.reconstruction, sure, **facts)
+    return encoded_json({**summary, "warnings": told})
+
+
+def encoded_json(value: Mapping[str, Any]) -> bytes:
+    """JSON in bytes; NaN and infinity are null."""
+    return json.dumps(to_json(value), ensure_ascii=False, allow_nan=False).encode()
+
+
+def glb_of(found: Result, request: FrameRequest) -> bytes:
+    """Content of segments.glb."""
+    frame, path = found.seen.frame, request.folder / "segments.glb"
+    to_viewer, radii = viewer_rotation(frame.axes), radii_of(found.registered)
+    write_segments_glb(path, found.reconstruction.surfaces, to_viewer, frame.unit_m, radii)
+    return path.read_bytes()
+
+
+def refusal(error: Exception, frame: FrameRequest) -> Reply:
+    """Reply that a frame cannot be answered: with the sentence of the command line where it is the client's to mend."""
+    if not (is_foreseen(error) and isinstance(error, ValueError | ImportError)):
+        LOG.error("a frame of %s cannot be answered", frame.weights, exc_info=error)
+        return failed(500, FAULT)
+    status = 413 if isinstance(error, SizeError | TooManyPoints) else 415 if isinstance(error, ImportError) else 422
+    return failed(status, shown(str(error), frame))
+
+
+def shown(text: str, frame: FrameRequest) -> str:
+    """Text in one line, in which files are called by their names alone."""
+    return " ".join(text.replace(f"{frame.folder}/", "").split())
+
+
+@contextmanager
+def taken_warnings(told: list[str], frame: FrameRequest) -> Iterator[None]:
+    """Take mereo's own warnings of the block for the client; others are passed on."""
+    with warnings.catch_warnings(record=True) as recorded:
+        warnings.simplefilter("always")
+        yield
+    for one in recorded:
+        if one.category.__module__.partition(".")[0] == __name__.partition(".")[0]:
+            told.append(shown(str(one.message), frame))
+        else:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)

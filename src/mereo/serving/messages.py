@@ -1,0 +1,134 @@
+"""What the server's processes say to each other: frames to be answered, replies, and facts of the weights.
+
+    server -FrameRequest-> process that answers -Reply-> server
+
+Everything here is plain data that can be pickled, and nothing in it comes from a client but checked values.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from mereo.fitting.config import FitChoice
+from mereo.io.config import InputConfig
+from mereo.models.config import InferenceConfig, Precision
+from mereo.reconstruction.config import IsolationConfig
+
+Media = Literal["application/json", "model/gltf-binary"]
+"""Media types of an answer: figures as in summary.json, or surfaces as in segments.glb."""
+
+JSON: Media = "application/json"
+GLB: Media = "model/gltf-binary"
+
+
+@dataclass(frozen=True)
+class Served:
+    """Weights that are served.
+
+    Attributes:
+        name: by which clients know them.
+        weights: a shipped name or a file.
+        scene: whose draws are fitted, where it is not the built-in one that the weights were trained on.
+    """
+
+    name: str
+    weights: str
+    scene: str | None = None
+
+
+@dataclass(frozen=True)
+class Setup:
+    """All that a process needs to begin.
+
+    Attributes:
+        served: weights, by their names.
+        fit: source of the answers.
+        inference: where and how exactly the networks compute.
+        max_points: most points of a frame.
+        max_body: most bytes of a request.
+        batch: frames that are encoded together, at most; 0 leaves it to the device.
+    """
+
+    served: tuple[Served, ...]
+    fit: FitChoice = "auto"
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
+    max_points: int = 1_000_000
+    max_body: int = 64_000_000
+    batch: int = 0
+
+
+@dataclass(frozen=True)
+class FrameRequest:
+    """Frame to be answered; its files lie in a folder of the server's own, under names of the server's own.
+
+    Attributes:
+        weights: name of the weights.
+        folder: in which the files lie, and what is written for the answer.
+        file: name of the depth image or point cloud in it.
+        reading: how it is read; the paths in it lie in the folder too.
+        isolation: what of it is left out.
+        resolution: cells along the longest side.
+        media: of the answer.
+    """
+
+    weights: str
+    folder: Path
+    file: str
+    reading: InputConfig
+    isolation: IsolationConfig
+    resolution: int
+    media: Media
+
+    @property
+    def path(self) -> Path:
+        """Path of the frame's file."""
+        return self.folder / self.file
+
+
+@dataclass(frozen=True)
+class Reply:
+    """Answer to a frame, or a refusal.
+
+    Attributes:
+        status: HTTP's.
+        body: content.
+        media: its type.
+        headers: further ones.
+        seconds: that each stage took.
+    """
+
+    status: int
+    body: bytes
+    media: str = JSON
+    headers: Mapping[str, str] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Read these frames, and encode them together where that is faster; answered by a refusal or None for each."""
+
+    frames: tuple[FrameRequest, ...]
+
+
+@dataclass(frozen=True)
+class Finish:
+    """Answer the frame of this number of the last ``Begin``; answered by a ``Reply``."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class Ready:
+    """What a process says first: that it is ready.
+
+    Attributes:
+        facts: what is known of each of its weights.
+        batch: frames that it takes together, at most.
+        precision: of the products, as settled: "auto" measures, and two processes might measure otherwise.
+    """
+
+    facts: tuple[dict[str, Any], ...]
+    batch: int
+    precision: Precision = "float32"
