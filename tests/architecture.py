@@ -17,6 +17,7 @@ from pathlib import Path
 ROOMS = (
     "geometry",
     "io",
+    "workers",
     "deformation",
     "scenes",
     "synthesis",
@@ -50,7 +51,6 @@ TYPES_ONLY = ("TYPE_CHECKING", "typing.TYPE_CHECKING")
 """Conditions that hold for type checkers and never when a program runs."""
 
 MODULE_NAME = re.compile(r"\w+\.[\w.]*")
-
 ROOM_ROW = re.compile(r"^\| *\[?`(\w+)/`", re.MULTILINE)
 """How a row of the README's table of rooms begins; the room's name may be a link."""
 

@@ -12,8 +12,9 @@ from shapes import ball
 from toy_data import write_toy_dataset
 from training_runs import assert_resumes_exactly, train_in_two_processes
 
+from mereo.evaluation.cases import TestCase
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.scoring import TestCase, score_cases
+from mereo.evaluation.scoring import score_cases
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.config import AutodecoderConfig, NetworkConfig

@@ -17,7 +17,7 @@ VARIABLE = "OMP_WAIT_POLICY"
 
 WORKERS = f"""
 import os
-from mereo.synthesis.workers import in_processes
+from mereo.workers.processes import in_processes
 
 def policy(item, cancelled):
     return os.environ.get({VARIABLE!r}), os.getpid()

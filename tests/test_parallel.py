@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from mereo.synthesis.workers import THREAD_VARIABLES, in_processes
+from mereo.workers.processes import THREAD_VARIABLES, in_processes
 
 Cancelled = Callable[[], bool]
 

@@ -20,6 +20,7 @@ from mereo.io.cores import workers_for
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.training.config import PresetName, TrainConfig
+from mereo.workers.config import ONE_CPU, RayAddress, TaskResources, cluster_of
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,8 @@ class Generate:
         sensor: whose errors the options sensor.* below start from: the paper's, or those of a kind of depth camera.
         settings: how one example is made.
         threads: processes where --workers does not say; 0 means one per core.
+        ray: make them in tasks of a Ray cluster: local, one of so many workers for this run; auto or HOST:PORT, all
+            of the one that this machine is a node of.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
@@ -111,6 +114,7 @@ class Generate:
     sensor: Sensor = "paper"
     settings: Annotated[GenerateConfig, arg(name="")] = field(default_factory=GenerateConfig)
     threads: Threads = 0
+    ray: RayAddress = None
     options_from: ConfigFile = None
 
     def run(self) -> None:
@@ -118,18 +122,23 @@ class Generate:
         from mereo.io.atomic_files import json_text
         from mereo.io.places import write_whole
         from mereo.synthesis.shards import generate
+        from mereo.workers.cluster import joined_first
 
-        generate(
-            self.scene,
-            self.output,
-            self.settings,
-            examples=self.examples,
-            seed=self.seed,
-            workers=workers_for(self.workers, self.threads),
-            shard=part_of(self.shard),
-            resume=self.resume,
-            test=self.test,
-        )
+        workers = workers_for(self.workers, self.threads)
+        cluster = cluster_of(self.ray, workers)
+        with joined_first(cluster):
+            generate(
+                self.scene,
+                self.output,
+                self.settings,
+                examples=self.examples,
+                seed=self.seed,
+                workers=workers,
+                shard=part_of(self.shard),
+                resume=self.resume,
+                test=self.test,
+                cluster=cluster,
+            )
         write_whole(self.output / CONFIG, json_text(options_of(self, "generate")).encode())
 
 
@@ -187,6 +196,9 @@ class Evaluate:
             and the draws' own scores beside it; off the network alone; modes leaves the draws out.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
         threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        ray: score each view in a task of a Ray cluster: local, one of so many --threads for this run; auto or
+            HOST:PORT, the one that this machine is a node of.
+        task: what each task has for itself.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
@@ -205,15 +217,19 @@ class Evaluate:
     fit: FitChoice = "auto"
     force: bool = False
     threads: Threads = 0
+    ray: RayAddress = None
+    task: Annotated[TaskResources, arg(name="")] = ONE_CPU
     options_from: ConfigFile = None
 
     def run(self) -> None:
         """Write scores and pictures of their errors, and print the table."""
         from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
+        from mereo.workers.cluster import joined_first
 
         settings = GenerateConfig(
             image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms, workspace=self.workspace
         )
+        cluster = cluster_of(self.ray, self.threads, self.task)
         if self.scans is not None:
             from mereo.models.weights import load_for
 
@@ -222,6 +238,8 @@ class Evaluate:
                     "--scans are real and take no simulated camera: leave out --sensor, --image-size, --noise-std and "
                     "--workspace"
                 )
+            if cluster is not None:
+                raise ValueError("--scans are few and are scored here: leave out --ray")
             model = load_for(self.weights, self.inference)
             evaluate_on_scans(
                 model,
@@ -233,18 +251,20 @@ class Evaluate:
                 options=options_of(self, "evaluate"),
             )
             return
-        evaluate_weights(
-            self.weights,
-            self.output,
-            examples=self.examples,
-            seed=self.seed,
-            scene=self.scene,
-            settings=settings,
-            inference=self.inference,
-            choice=self.fit,
-            force=self.force,
-            options=options_of(self, "evaluate"),
-        )
+        with joined_first(cluster):
+            evaluate_weights(
+                self.weights,
+                self.output,
+                examples=self.examples,
+                seed=self.seed,
+                scene=self.scene,
+                settings=settings,
+                inference=self.inference,
+                choice=self.fit,
+                force=self.force,
+                options=options_of(self, "evaluate"),
+                cluster=cluster,
+            )
 
 
 @dataclass(frozen=True)

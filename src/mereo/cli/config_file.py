@@ -21,7 +21,19 @@ from mereo.io.bounds import check_values
 ConfigFile = Annotated[Path | None, arg(name="config")]
 """Option of commands that read their options from a file."""
 
-NOT_RESULT = ("output", "force", "resume", "shard", "workers", "threads", "options_from")
+NOT_RESULT = (
+    "output",
+    "force",
+    "resume",
+    "shard",
+    "workers",
+    "threads",
+    "ray",
+    "task",
+    "cpus_per_object",
+    "gpus_per_object",
+    "options_from",
+)
 """Options of which a result is independent: a file of options does not have them, but may."""
 
 

@@ -26,7 +26,7 @@ PURPOSES: dict[str, str] = {
     "hub": "weights on a model hub",
     "storage": "datasets in S3 and what speaks it",
     "gcs": "datasets in Google Cloud Storage",
-    "cluster": "data generation on several machines",
+    "cluster": "generation, scoring, frames and learning on Ray clusters",
     "align": "ground truth from scans",
     "serve": "answers over HTTP",
     "docs": "the documentation as pages",

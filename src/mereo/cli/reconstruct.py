@@ -1,6 +1,7 @@
 """``mereo reconstruct``: one frame of a sensor to a folder of results."""
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +20,7 @@ from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
 from mereo.io.output_folders import new_directory
-from mereo.io.sensor_frame import read_frame
+from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.medical import MM_PER_M
 from mereo.models.config import InferenceConfig
@@ -27,7 +28,6 @@ from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
-from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import files_of
 from mereo.visualization.answering import answer
 from mereo.visualization.report_words import confidence_title
@@ -104,6 +104,13 @@ class FrameJob:
         of = Registrar.of if self.attachments else registrar_for
         return of(self.model, self.choice, self.scene)
 
+    def asking(self, model: Model) -> "FrameJob":
+        """The same, asking the same weights on another device; what is known of scene and attachments stays so."""
+        moved = copy(self)
+        registrar = None if self.registrar is None else self.registrar.asking(model)
+        vars(moved).update(model=model, registrar=registrar)
+        return moved
+
     @cached_property
     def placed(self) -> tuple[Placed, ...]:
         """What is carried, in its place on the object at rest."""
@@ -124,32 +131,45 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Re
     """
     job.check()
     with new_directory(output, job.force, [input, *job.read]) as directory:
-        frame = read_frame(input, job.reading)
-        seen = find_object(frame, job.isolation)
-        print(seen)
-        placed = job.placed  # what is carried is refused before the work
-        wishes = [wish_of(text, job.model.names) for text in job.explain]
-        found = answer(
-            seen,
-            job.model,
-            job.registrar,
-            job.resolution,
-            isolation=job.isolation,
-            label_points="points" in chosen_formats(job.files.formats),
-        )
-        if found.reconstruction.reading.dropped:
-            print(found.reconstruction.reading)
-        if job.registrar is not None:
-            print_source(found)
-            print_sure(found.registered, found.unit)
-        found.write(directory, job.files, carried_along(placed, found))
-        factor = MM_PER_M * frame.unit_m if job.files.millimetres else 1.0
-        explain(found.registered, wishes, directory, found.seen.cloud.points, factor, found.unit)
-        if job.options is not None:
-            write_json(directory / CONFIG, {**job.options, "inputs": [str(Path(input).absolute())]})
-    print_segments(found.reconstruction, f"{frame.source}, {len(found.seen.cloud)} points")
-    print(f"wrote {output} in {seconds_of(found):.1f} s; open {Path(output) / 'report.html'} in a browser")
+        found = answer_frame(read_frame(input, job.reading), directory, job, Path(input).absolute())
+    print_segments(found)
+    print(written(output, seconds_of(found)))
     return found
+
+
+def answer_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: Path) -> Result:
+    """Reconstruct a frame that was read, write all its files into a directory that is there, print what was found.
+
+    ``path`` is the frame's own, for the options. Raises and warns as ``reconstruct_file``.
+    """
+    seen = find_object(frame, job.isolation)
+    print(seen)
+    placed = job.placed  # what is carried is refused before the work
+    wishes = [wish_of(text, job.model.names) for text in job.explain]
+    found = answer(
+        seen,
+        job.model,
+        job.registrar,
+        job.resolution,
+        isolation=job.isolation,
+        label_points="points" in chosen_formats(job.files.formats),
+    )
+    if found.reconstruction.reading.dropped:
+        print(found.reconstruction.reading)
+    if job.registrar is not None:
+        print_source(found)
+        print_sure(found.registered, found.unit)
+    found.write(directory, job.files, carried_along(placed, found))
+    factor = MM_PER_M * frame.unit_m if job.files.millimetres else 1.0
+    explain(found.registered, wishes, directory, found.seen.cloud.points, factor, found.unit)
+    if job.options is not None:
+        write_json(directory / CONFIG, {**job.options, "inputs": [str(path)]})
+    return found
+
+
+def written(output: str | Path, seconds: float) -> str:
+    """Line about a folder of results that is there."""
+    return f"wrote {output} in {seconds:.1f} s; open {Path(output) / 'report.html'} in a browser"
 
 
 def seconds_of(found: Answer) -> float:
@@ -188,9 +208,10 @@ def print_source(found: Answer) -> None:
         print(found.recognition.told)
 
 
-def print_segments(result: Reconstruction, title: str) -> None:
+def print_segments(answered: Result) -> None:
     """Print a table of the segments, and a line of the stages' seconds."""
-    table = Table(title=title, title_justify="left")
+    result, seen = answered.reconstruction, answered.seen
+    table = Table(title=f"{seen.frame.source}, {len(seen.cloud)} points", title_justify="left")
     table.add_column("segment")
     for column in ("volume", confidence_title(result.calibrated), "components", "centroid"):
         table.add_column(column, justify="right")

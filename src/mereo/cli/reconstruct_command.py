@@ -13,6 +13,7 @@ from mereo.io.bounds import Cells, Threads
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
+from mereo.workers.config import ONE_CPU, RayAddress, TaskResources, cluster_of
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,9 @@ class ReconstructCommand:
             (explained/1.ply, those that the model does not explain in red); once for each. The report has all segments.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
         threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        ray: answer each of several frames in a task of a Ray cluster: local, one of so many --threads for this run;
+            auto or HOST:PORT, the one that this machine is a node of.
+        task: what each task has for itself.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
@@ -62,19 +66,24 @@ class ReconstructCommand:
     explain: UseAppendAction[tuple[str, ...]] = ()
     force: bool = False
     threads: Threads = 0
+    ray: RayAddress = None
+    task: Annotated[TaskResources, arg(name="")] = ONE_CPU
     options_from: ConfigFile = None
 
     def run(self) -> None:
         """Write the folder of results and print the segments."""
         from mereo.cli.reconstruct import FrameJob
         from mereo.cli.reconstruct_many import reconstruct_inputs
+        from mereo.models.elsewhere import for_tasks
+        from mereo.workers.cluster import joined_first
 
+        cluster = cluster_of(self.ray, self.threads, self.task)
         job = FrameJob(
             self.weights,
             self.resolution,
             self.reading,
             self.isolation,
-            self.inference,
+            for_tasks(self.inference, cluster),
             self.files,
             self.fit,
             self.scene,
@@ -84,4 +93,5 @@ class ReconstructCommand:
             self.explain,
             options_of(self, "reconstruct"),
         )
-        reconstruct_inputs(self.inputs, self.output, job)
+        with joined_first(cluster):
+            reconstruct_inputs(self.inputs, self.output, job, cluster)

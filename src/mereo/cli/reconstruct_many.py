@@ -5,16 +5,16 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from mereo.cli.reconstruct import FrameJob, reconstruct_file, seconds_of
-from mereo.fitting.answer import Answer
-from mereo.fitting.recognition import Known
+from mereo.cli.reconstruct import FrameJob, reconstruct_file
+from mereo.cli.reconstruct_tasks import answer_in_tasks
+from mereo.cli.reconstruct_told import Told
 from mereo.io.config import InputConfig
 from mereo.io.output_folders import MARKER
 from mereo.io.progress import duration
@@ -23,6 +23,7 @@ from mereo.io.scratch_folders import check_place
 from mereo.reconstruction.observation import SizeWarning
 from mereo.reconstruction.stream import sentence
 from mereo.reconstruction.stream_sources import frames_in
+from mereo.workers.config import Cluster
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,25 +33,29 @@ class Outcome:
     Attributes:
         path: its file.
         folder: of its results.
-        found: the answer; None for a frame that could not be answered.
+        told: what it is in a table; None for a frame that could not be answered.
     """
 
     path: Path
     folder: Path
-    found: Answer | None
+    told: Told | None
 
 
-def reconstruct_inputs(inputs: Sequence[Path], output: Path, job: FrameJob) -> None:
+def reconstruct_inputs(inputs: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None) -> None:
     """Reconstruct one frame into ``output``, or several, or folders of them, into ``output``/NAME each.
+
+    Several are tasks of ``cluster``, where one is given; ``ValueError`` for a single one then.
 
     Raises as ``reconstruct_file`` does for one frame; for several as ``reconstruct_frames``.
     """
     if not inputs:
         raise ValueError("no input is given; name a frame, several, or a folder of them: mereo reconstruct FRAME ...")
     if len(inputs) == 1 and not is_folder_of_frames(inputs[0]):
+        if cluster is not None:
+            raise ValueError("--ray is for several frames, each of which is a task: name more, or leave it out")
         reconstruct_file(inputs[0], output, job)
     else:
-        reconstruct_frames(list_frames(inputs, job.reading), output, job)
+        reconstruct_frames(list_frames(inputs, job.reading), output, job, cluster)
 
 
 def is_folder_of_frames(path: Path) -> bool:
@@ -83,7 +88,9 @@ def folder_names(files: Sequence[Path]) -> list[str]:
     raise ValueError(f"{alike[0]} and {alike[1]} would both be written to {names[0]!r}: reconstruct them one at a time")
 
 
-def reconstruct_frames(files: Sequence[Path], output: Path, job: FrameJob) -> list[Outcome]:
+def reconstruct_frames(
+    files: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None
+) -> list[Outcome]:
     """Reconstruct each file into ``output``/NAME, print a table at the end; a bad frame is said and passed over.
 
     Raises ``ValueError`` at the end where a frame could not be answered, and before the work as ``FrameJob.check`` and
@@ -99,18 +106,25 @@ def reconstruct_frames(files: Sequence[Path], output: Path, job: FrameJob) -> li
         )
     job.check()
     _ = job.model, job.placed  # what is wrong with them is no frame's fault
-    outcomes: list[Outcome] = []
+    folders = [output / name for name in names]
+    found: dict[Path, Told | None] = {}
     started = time.monotonic()
+
+    def heading(file: Path) -> None:
+        left = _left([*found.values()], len(files), time.monotonic() - started)
+        print(f"\n[{len(found) + 1}/{len(files)}] {file}{left}", flush=True)
+
     with warnings.catch_warnings():
         warnings.filterwarnings("always", category=SizeWarning)  # for each frame, also in the same words
-        for number, (file, name) in enumerate(zip(files, names, strict=True)):
-            answered = sum(outcome.found is not None for outcome in outcomes)  # bad ones take no time
-            each_s = (time.monotonic() - started) / max(answered, 1)
-            left = f", {duration(each_s * (len(files) - number))} left" if answered else ""
-            print(f"\n[{number + 1}/{len(files)}] {file}{left}", flush=True)
-            outcomes.append(Outcome(file, output / name, _answered(file, output / name, job)))
+        for file, told in (
+            _answer_here(files, folders, job, heading)
+            if cluster is None
+            else answer_in_tasks(files, folders, job, cluster, heading, _say)
+        ):
+            found[file] = told
+    outcomes = [Outcome(file, folder, found[file]) for file, folder in zip(files, folders, strict=True)]
     _show(outcomes, output)
-    failed = sum(outcome.found is None for outcome in outcomes)
+    failed = sum(outcome.told is None for outcome in outcomes)
     if failed:
         raise ValueError(
             f"{failed} of {len(files)} frames could not be reconstructed, each for the reason given with it; the "
@@ -119,19 +133,32 @@ def reconstruct_frames(files: Sequence[Path], output: Path, job: FrameJob) -> li
     return outcomes
 
 
-def _answered(file: Path, folder: Path, job: FrameJob) -> Answer | None:
-    """Answer to a frame, None after a sentence on standard error where there is none."""
-    try:
-        return reconstruct_file(file, folder, job)
-    except Exception as problem:
-        if os.environ.get("MEREO_TRACEBACK") == "1":
-            raise
-        print(f"mereo: error: {sentence(problem, file.name)}", file=sys.stderr, flush=True)
-        return None
+def _answer_here(
+    files: Sequence[Path], folders: Sequence[Path], job: FrameJob, heading: Callable[[Path], None]
+) -> Iterator[tuple[Path, Told | None]]:
+    """Answer frames one after the other; None for a bad one, which is said."""
+    for file, folder in zip(files, folders, strict=True):
+        heading(file)
+        try:
+            told = Told.of(reconstruct_file(file, folder, job))
+        except Exception as problem:
+            _say(file, problem)
+            yield file, None
+        else:
+            yield file, told
 
 
-KNOWN: Mapping[Known, str] = {True: "yes", False: "no", "unsure": "unsure"}
-"""Words of a table for whether a frame shows the object."""
+def _left(done: Sequence[Told | None], count: int, seconds: float) -> str:
+    """Words on the time that is left of ``count`` frames, where something is known of it; bad frames take none."""
+    answered = sum(told is not None for told in done)
+    return f", {duration(seconds / answered * (count - len(done)))} left" if answered else ""
+
+
+def _say(file: Path, problem: Exception) -> None:
+    """Say on standard error what is wrong with a frame."""
+    if os.environ.get("MEREO_TRACEBACK") == "1":
+        raise problem
+    print(f"mereo: error: {sentence(problem, file.name)}", file=sys.stderr, flush=True)
 
 
 def _show(outcomes: Sequence[Outcome], output: Path) -> None:
@@ -150,11 +177,7 @@ def _show(outcomes: Sequence[Outcome], output: Path) -> None:
 
 
 def _row(outcome: Outcome) -> tuple[str, ...]:
-    found = outcome.found
-    if found is None:
+    told = outcome.told
+    if told is None:
         return "none", "", "", "", "", ""
-    registration, segments = found.registration, found.reconstruction.segments
-    explained = "" if registration is None else f"{registration.explained:.1%}"
-    seen = f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}"
-    who = "registered model" if found.taken else "network"
-    return who, explained, KNOWN[found.recognition.known], seen, f"{seconds_of(found):.1f}", outcome.folder.name
+    return told.answer, told.explained, told.known, told.segments, f"{told.seconds:.1f}", outcome.folder.name

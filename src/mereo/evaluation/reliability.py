@@ -71,6 +71,12 @@ class Reliability:
         rows = np.arange(len(true))
         self.add(found.probability[rows, found.label].astype(np.float64), found.label == true)
 
+    def add_all(self, other: "Reliability") -> None:
+        """Count what another one has counted."""
+        self.count += other.count
+        self.confidence += other.confidence
+        self.right += other.right
+
     @property
     def ece(self) -> float:
         """Expected calibration error, 0 to 1; NaN without answers."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from mereo.evaluation.candidates import AnswerName, Candidate, RegistrationErrors
+from mereo.evaluation.candidates import AnswerName, RegistrationErrors
 from mereo.evaluation.coverage import RadiusRatios
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
@@ -120,12 +120,11 @@ class Tally:
     examples: list[Scores] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
-    def add(self, truth: TruthGrid, found: Candidate, segments: int, segmented: bool) -> None:
+    def add(self, confusion: Int[np.ndarray, "c c"], seconds: float, segmented: bool) -> None:
         """Count one more example."""
-        confusion = grid_confusion(truth, found.labels, segments)
         self.confusion = confusion if len(self.examples) == 0 else self.confusion + confusion
         self.examples.append(intersection_over_union(confusion, segmented))
-        self.seconds.append(found.seconds)
+        self.seconds.append(seconds)
 
     @property
     def scores(self) -> AnswerScores:

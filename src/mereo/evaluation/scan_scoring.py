@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from mereo.evaluation.cases import TestCase
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.registration.truth_file import read_truth
 from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scans import SCANS, PosedScan, bunny_posed
-from mereo.evaluation.scoring import CELLS, TestCase, check_names, score_cases
+from mereo.evaluation.scoring import CELLS, check_names, score_cases
 from mereo.fitting.config import FitChoice
 from mereo.fitting.register import registrar_for
 from mereo.models.model import Model

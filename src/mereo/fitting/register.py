@@ -4,6 +4,7 @@ EncodedFrame -Registrar-> Registration
 """
 
 import warnings
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -100,6 +101,14 @@ class Registrar:
     def at_once(self) -> "Registrar":
         """The same without the patience to ask about a frame again with the camera turned."""
         return replace(self, config=replace(self.config, turned=False))
+
+    def asking(self, network: Model) -> "Registrar":
+        """The same, asking the same weights on another device; scene and states that are known stay so."""
+        if network is self.network:
+            return self
+        moved = copy(self)
+        object.__setattr__(moved, "network", network)  # `replace` would forget what is cached
+        return moved
 
     def stated_unit(self, unit_m: float) -> float | None:
         """Length of a scene unit in a cloud's unit of ``unit_m`` metres; None where the object's size is not known."""

@@ -24,6 +24,7 @@ from mereo.learning import learn as learning
 from mereo.learning.example_frame import FRAME
 from mereo.learning.object_files import scene_for
 from mereo.models.config import EXACT, InferenceConfig
+from mereo.models.elsewhere import for_tasks
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
 from mereo.models.weights import WEIGHTS, load_for
@@ -35,6 +36,8 @@ from mereo.synthesis.config import GenerateConfig
 from mereo.training import trainer
 from mereo.training.config import PRESETS, PresetName, TrainConfig
 from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
+from mereo.workers.cluster import joined_first
+from mereo.workers.config import cluster_of
 
 
 def generate(
@@ -48,6 +51,7 @@ def generate(
     shard: tuple[int, int] = (0, 1),
     resume: bool = False,
     test: bool = False,
+    ray: str | None = None,
 ) -> Place:
     """Labelled examples of a scene in a folder, which is returned: `mereo generate`.
 
@@ -62,23 +66,28 @@ def generate(
         shard: part i of n, as (i, n), to share the work between machines.
         resume: go on with what is there.
         test: allow a test seed.
+        ray: make them in tasks of a Ray cluster: "local", one of so many workers for this call; "auto" or "HOST:PORT",
+            the one that this machine is a node of.
 
     Raises as ``synthesis.shards.generate`` does.
     """
     made = str(scene) if isinstance(scene, Path) else scene
     place = place_of(output)
     processes = workers or os.cpu_count() or 1
-    shards.generate(
-        made,
-        place,
-        settings or GenerateConfig(),
-        examples=examples,
-        seed=seed,
-        workers=processes,
-        shard=shard,
-        resume=resume,
-        test=test,
-    )
+    cluster = cluster_of(ray, processes)
+    with joined_first(cluster):
+        shards.generate(
+            made,
+            place,
+            settings or GenerateConfig(),
+            examples=examples,
+            seed=seed,
+            workers=processes,
+            shard=shard,
+            resume=resume,
+            test=test,
+            cluster=cluster,
+        )
     return place
 
 
@@ -116,6 +125,7 @@ def evaluate(
     inference: InferenceConfig = EXACT,
     cells: int = scoring.CELLS,
     progress: bool = True,
+    ray: str | None = None,
 ) -> Evaluation:
     """Scores of weights on test examples of their scene, or on real scans: `mereo evaluate`.
 
@@ -131,26 +141,28 @@ def evaluate(
         inference: where and how exactly the network computes, for weights that are loaded here.
         cells: of the grid along each axis, on which answers are compared with the truth; 100 is the paper's.
         progress: show the time left, where nothing is written.
+        ray: score each view in a task of one CPU of a Ray cluster, as in ``generate``; "local" has one for each core.
 
     Raises ``ValueError`` for a training seed, no examples, another object than the model's, and settings with scans,
     which are real; ``FileExistsError`` for an output with content.
     """
-    loaded = model if isinstance(model, Model) else load_for(model, inference)
+    cluster = cluster_of(ray)
+    loaded = model if isinstance(model, Model) else load_for(model, for_tasks(inference, cluster))
     place = str(scene) if isinstance(scene, Path) else scene
     if scans is not None:
         if settings is not None:
             raise ValueError("scans are real and take no simulated camera: leave out the settings")
+        if cluster is not None:
+            raise ValueError("scans are few and are scored here: leave out ray")
         if output is not None:
             return evaluate_on_scans(loaded, output, truths=scans, scene=place, cells=cells, choice=fit)
         posed = load_scene(place) if isinstance(place, str) else place
         return evaluate_scans(loaded, truths=scans, scene=posed, cells=cells, choice=fit)
-    if output is not None:
-        return evaluate_weights(
-            loaded, output, examples=examples, seed=seed, scene=place, cells=cells, settings=settings, choice=fit
-        )
-    return scoring.evaluate(
-        loaded, place, examples=examples, seed=seed, cells=cells, progress=progress, settings=settings, choice=fit
-    )
+    asked: dict[str, Any] = {"examples": examples, "seed": seed, "cells": cells, "settings": settings, "choice": fit}
+    with joined_first(cluster):
+        if output is not None:
+            return evaluate_weights(loaded, output, scene=place, cluster=cluster, **asked)
+        return scoring.evaluate(loaded, place, progress=progress, cluster=cluster, **asked)
 
 
 def export(

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from mereo.io.size_limits import LIMIT_VARIABLE
 from mereo.serving.messages import Begin, Finish, Ready, Setup
-from mereo.synthesis.workers import exit_with_parent, one_thread_each, start_resource_tracker
+from mereo.workers.processes import exit_with_parent, one_thread_each, start_resource_tracker
 
 POINT_BYTES = 256
 """Bytes in which a file may state a point: coordinates, normal, colour, and what else there is of it, in doubles."""

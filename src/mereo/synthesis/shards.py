@@ -49,7 +49,8 @@ from mereo.synthesis.dataset_contents import FILES, DatasetContents, shard_name
 from mereo.synthesis.dataset_files import MANIFEST, check_space, dataset_key
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.observations import Clouds
-from mereo.synthesis.workers import in_processes
+from mereo.workers.config import Cluster
+from mereo.workers.spread import spread
 
 SHARD_SIZE = 64
 LIBRARIES = ("numpy", "scipy", "embreex", "libigl", "manifold3d", "trimesh")
@@ -89,6 +90,7 @@ def generate(
     shard: tuple[int, int] = (0, 1),
     resume: bool = False,
     test: bool = False,
+    cluster: Cluster | None = None,
 ) -> None:
     """Make ``examples`` labelled examples of a scene in the folder ``output``, local or of an object storage.
 
@@ -104,6 +106,7 @@ def generate(
             write to one directory.
         resume: go on with a dataset of the same settings that is there; without it that is an error.
         test: make a test set, whose seed training refuses.
+        cluster: whose tasks make the files' content, instead of workers; they are written here all the same.
 
     Raises:
         ValueError: a number out of its range, a seed of the wrong kind, ``resume`` with other settings.
@@ -133,9 +136,10 @@ def generate(
         contents.write(STATISTICAL_MODEL, statistical_model_bytes(scene_model(loaded, states, quiet=False), key))
     missing = [item for item in shards if not contents.keeps(item.name)]
     total = sum(item.end - item.first for item in missing)
-    # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile
-    work = partial(_make_shard, _Work(loaded if is_yaml(scene) else scene, settings, seed, key))
-    with closing(in_processes(work, missing, workers)) as made, progress("generate", total) as shown:
+    # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile; other
+    # machines have neither file nor assets
+    work = partial(_make_shard, _Work(loaded if cluster or is_yaml(scene) else scene, settings, seed, key))
+    with closing(spread(work, missing, workers, cluster)) as made, progress("generate", total) as shown:
         for item, data in made:
             contents.write(item.name, data)
             shown.advance(item.end - item.first)

@@ -27,6 +27,7 @@ from mereo.io.output_folders import new_directory
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import EXACT, InferenceConfig
+from mereo.models.elsewhere import for_tasks
 from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.pipeline import Reconstruction
@@ -40,6 +41,7 @@ from mereo.visualization.pictured import pictured, with_carried
 from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.reconstruction_report import write_report
 from mereo.visualization.units import UNKNOWN, Unit
+from mereo.workers.config import Cluster
 
 
 def evaluate_weights(
@@ -55,14 +57,16 @@ def evaluate_weights(
     choice: FitChoice = "auto",
     force: bool = False,
     options: Mapping[str, Any] | None = None,
+    cluster: Cluster | None = None,
 ) -> Evaluation:
     """Score weights, write metrics.json, table.md, errors.png, report.html, and print the table: ``mereo evaluate``.
 
     With ``force`` an existing folder that mereo wrote is replaced; ``options`` are written to config.json.
+    Each view is a task of ``cluster``, where one is given.
     """
     read = [*([] if isinstance(weights, Model) else [weights]), *_files_of(scene)]
     with new_directory(output, force, read) as directory:
-        model = weights if isinstance(weights, Model) else load_for(weights, inference)
+        model = weights if isinstance(weights, Model) else load_for(weights, for_tasks(inference, cluster))
         settings = settings or GenerateConfig()
         evaluation = evaluate(
             model,
@@ -73,6 +77,7 @@ def evaluate_weights(
             progress=True,
             settings=settings,
             choice=choice,
+            cluster=cluster,
         )
         facts = {
             "weights": model.name if isinstance(weights, Model) else str(weights),
@@ -82,7 +87,7 @@ def evaluate_weights(
             "noise_std": settings.noise_std,
             "sensor": asdict(settings.sensor),
             "workspace": settings.workspace,
-            "device": model.device.type,
+            "device": cluster.device if cluster else model.device.type,
             "precision": model.working_precision,
             "trained": model.provenance,
         }
