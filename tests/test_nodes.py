@@ -1,8 +1,8 @@
 """Two nodes of two processes, started by torchrun on this machine: they train what one process does.
 
-Equal is: to rounding. Sums over processes are added in another order than those of one process, and Adam turns the
-rounding of a gradient near zero into a step of the size of the rate, so single weights may part; what the network says
-may not (docs/clusters.md).
+Equal is: to rounding, because sums over processes are added in another order than those of one. Adam turns the rounding
+of a gradient near zero into a step of the size of its rate, so that in single precision runs that differ in one last bit
+soon part (docs/clusters.md). These compute in double precision, where equal runs stay together.
 """
 
 import csv
@@ -14,18 +14,13 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 from safetensors.torch import load_file
 from toy_data import write_toy_dataset
-
-from mereo.models.weights import load_model
 
 TRAIN = (
     "--preset tiny --precision float32 --compile off --batch 8 --queries 48 --epochs 2 --network.points 64 "
     "--network.width 48 --network.neighbors 8 --holdout 6 --offset-examples 0"
 )
-PLAIN = "--network.align-points 0 --network.no-rest-template --network.local-neighbors 0 --network.sight-neighbors 0"
-"""Network without choices (of neighbours, of an alignment), which rounding may turn."""
 
 WORKER = """
 import os, signal, sys
@@ -42,7 +37,7 @@ def doubled(value):
     return value.double() if isinstance(value, torch.Tensor) and value.is_floating_point() else value
 def step(self, batch):
     batch = replace(batch, **{item.name: doubled(getattr(batch, item.name)) for item in fields(batch)})
-    if os.environ["RANK"] == victim and self.step == 6 and not fallen.exists():
+    if os.environ.get("RANK", "0") == victim and self.step == 6 and not fallen.exists():
         fallen.write_text(str(os.getpid()))
         os.kill(os.getpid(), signal.SIGKILL)
     original(self, batch)
@@ -78,41 +73,23 @@ def train_on_nodes(folder: Path, output: str, options: str, nodes: int = 2, **mo
 
 
 def train_alone(folder: Path, output: str, options: str) -> None:
-    command = [sys.executable, "-m", "mereo", "train", "data", "--output", output, *f"{TRAIN} {options}".split()]
-    subprocess.run(command, cwd=folder, env=environment(), check=True, capture_output=True, timeout=280)
-
-
-def losses(run: Path) -> torch.Tensor:
-    with (run / "metrics.csv").open() as file:
-        return torch.tensor([float(row["loss"]) for row in csv.DictReader(file)], dtype=torch.float64)
-
-
-def answers(run: Path) -> torch.Tensor:
-    """Distances that the trained network states at fixed places."""
-    model = load_model(run / "weights.safetensors")
-    rng = torch.Generator().manual_seed(0)
-    front = torch.nn.functional.normalize(torch.randn(200, 3, generator=rng), dim=1) * 7
-    front[:, 2] = -front[:, 2].abs()
-    center = torch.tensor([1.0, 2.0, 150.0])
-    places = center + 20 * torch.rand(400, 3, generator=rng) - 10
-    answer = model.query(model.encode((center + front).numpy()), places.numpy())
-    return torch.from_numpy(answer.distance).double() / 7
+    (folder / "worker.py").write_text(WORKER)
+    command = [sys.executable, "worker.py", "train", "data", "--output", output, *f"{TRAIN} {options}".split()]
+    done = subprocess.run(command, cwd=folder, env=environment(), capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stderr[-4000:]
 
 
 def differences(folder: Path, one: str, other: str) -> dict[str, float]:
-    """How far two runs are apart: losses relative to each, answers relative to the ball's radius."""
-    first, second = losses(folder / one), losses(folder / other)
-    assert len(first) == len(second)
-    apart = (first - second).abs() / first.abs()
-    weights = [load_file(folder / name / "weights.safetensors") for name in (one, other)]
-    found = {
-        "first loss": float(apart[0]),
-        "losses": float(apart.max()),
-        "answers": float((answers(folder / one) - answers(folder / other)).abs().max()),
-        "weights": max(
-            float((weights[0][n] - weights[1][n]).abs().max()) for n in weights[0] if weights[0][n].is_floating_point()
-        ),
-    }
+    """How far two runs are apart: the first loss and the worst, each relative, and weights and their statistics."""
+    tables = []
+    for name in (one, other):
+        with (folder / name / "metrics.csv").open() as file:
+            tables.append([float(row["loss"]) for row in csv.DictReader(file)])
+    apart = [abs(a - b) / abs(a) for a, b in zip(*tables, strict=True)]
+    first, second = (load_file(folder / name / "checkpoint.safetensors") for name in (one, other))
+    assert first.keys() == second.keys()
+    moved = [float((first[name] - second[name]).abs().max()) for name in first if name.startswith("network/")]
+    found = {"first loss": apart[0], "losses": max(apart), "weights": max(moved)}
     print(one, other, json.dumps(found))
     return found
 
@@ -126,13 +103,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [PLAIN, f"--data stream {PLAIN}", f"--data stream --accumulate 2 {PLAIN}"], ids=["memory", "stream", "parts"])
+@pytest.mark.parametrize("options", ["--data memory", "--data stream", "--data stream --accumulate 2"])
 def test_two_nodes_train_what_one_process_does(folder: Path, options: str) -> None:
     name = options.replace(" ", "").replace("-", "")
     train_alone(folder, f"alone{name}", options)
     train_on_nodes(folder, f"nodes{name}", options)
     apart = differences(folder, f"alone{name}", f"nodes{name}")
-    assert apart["first loss"] < 1e-6 and apart["losses"] < 2e-3 and apart["answers"] < 0.02, apart
+    assert apart["first loss"] < 1e-12 and apart["losses"] < 1e-8 and apart["weights"] < 1e-8, apart
 
 
 @pytest.mark.slow
@@ -144,5 +121,4 @@ def test_a_killed_worker_is_started_again_and_ends_with_the_same_result(folder: 
     assert any("continuing from step 6 of 16" in text for text in said), said
     assert not any("this is a fault of mereo" in text for text in said), said
     apart = differences(folder, "whole", "parts")
-    assert apart["losses"] < 2e-3 and apart["answers"] < 0.02, apart
-    assert len(losses(folder / "parts")) == 16
+    assert apart["losses"] < 1e-8 and apart["weights"] < 1e-8, apart
