@@ -154,8 +154,8 @@ def mixing(options: argparse.Namespace) -> None:
             distinct = [len(np.unique(numbers[at : at + 100])) for at in range(0, steps - 99, 100)]
             print(
                 f"batch {batch}, {name}: {equal:.2e} of the pairs in a batch are of one shard (chance: "
-                f"{(SHARD - 1) / (shards * SHARD - 1):.2e}), shard numbers in one correlate by {within:+.4f}; 100 steps "
-                f"meet {np.mean(distinct):.0f} of {shards:,} shards"
+                f"{(SHARD - 1) / (shards * SHARD - 1):.2e}), shard numbers in one correlate by {within:+.4f}; 100 "
+                f"steps meet {np.mean(distinct):.0f} of {shards:,} shards"
             )
 
 

@@ -33,8 +33,25 @@ def join_processes() -> Process:
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if world == 1:
         return Process()
-    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
-    return Process(dist.get_rank(), world)
+    process = Process(int(os.environ["RANK"]), world)
+    if process.is_main and _keeps_addresses():
+        print(f"processes may not find each other again after a restart: give torchrun {SEPARATE}=1", flush=True)
+    with connected(process):
+        dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    return process
+
+
+SEPARATE = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
+"""Variable by which torchrun's processes get a new store of addresses at each restart, instead of its own."""
+
+
+def _keeps_addresses() -> bool:
+    """Whether nodes that torchrun starts again would meet the addresses of processes that have ended.
+
+    It does since 2.5 unless told otherwise, and no restart of several nodes succeeds then (docs/clusters.md).
+    """
+    several = int(os.environ.get("GROUP_WORLD_SIZE", "1")) > 1
+    return several and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
 
 
 T = TypeVar("T")
