@@ -22,7 +22,6 @@ from mereo.training.batches import Batch, Draws, augment_batch, choose_points, d
 from mereo.training.config import AugmentConfig
 from mereo.training.orders import Order, ShuffledOrder
 
-
 QUERIES = ("positions", "labels", "distances", "directions", "rest")
 """Tensors of a shard about its queries, which a dataset has under the same names."""
 
