@@ -112,7 +112,7 @@ def test_two_nodes_train_what_one_process_does(folder: Path, options: str) -> No
     train_alone(folder, f"alone{name}", f"{options} --epochs 2")
     train_on_nodes(folder, f"nodes{name}", f"{options} --epochs 2")
     apart = differences(folder, f"alone{name}", f"nodes{name}")
-    assert apart["first loss"] < 1e-12 and apart["losses"] < 1e-8 and apart["weights"] < 1e-8, apart
+    assert apart["first loss"] < 1e-12 and apart["losses"] < 1e-8 and apart["weights"] < 1e-7, apart
 
 
 @pytest.mark.slow
@@ -125,4 +125,4 @@ def test_a_killed_worker_is_started_again_and_ends_with_the_same_result(folder: 
     assert any("continuing from step 3 of 8" in text for text in said), said
     assert not any("this is a fault of mereo" in text for text in said), said
     apart = differences(folder, "whole", "parts")
-    assert apart["losses"] < 1e-8 and apart["weights"] < 1e-8, apart
+    assert apart["losses"] < 1e-8 and apart["weights"] < 1e-7, apart

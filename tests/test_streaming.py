@@ -16,7 +16,6 @@ from training_runs import assert_resumes_exactly
 
 import mereo.__main__ as command_line
 from mereo.training import data_source, trainer
-from mereo.training.batch_normalization import adapt_momentum
 from mereo.training.batches import Batch, Draws
 from mereo.training.config import AugmentConfig, TrainConfig
 from mereo.training.data_source import choose_place
@@ -324,18 +323,6 @@ def test_a_batch_in_parts_has_the_gradient_of_the_whole(dataset: Path, tmp_path:
     config = replace(SMALL, precision="float32", compile="off")
     whole, found = (gradients(data, replace(config, accumulate=count), tmp_path) for count in (1, parts))
     assert (found - whole).abs().max() < 1e-5 * whole.abs().max()
-
-
-def test_running_statistics_move_as_far_in_parts() -> None:
-    """In as many updates as there are parts; here all parts have the statistics of the whole."""
-    rows, whole, parted = torch.rand(32, 5).repeat(4, 1), torch.nn.BatchNorm1d(5), torch.nn.BatchNorm1d(5)
-    adapt_momentum(torch.nn.Sequential(parted), 4)
-    whole(rows[:32])
-    for part in rows.chunk(4):
-        parted(part)
-    assert torch.allclose(parted.running_mean, whole.running_mean) and torch.allclose(
-        parted.running_var, whole.running_var
-    )
 
 
 def test_a_batch_that_has_no_equal_parts_is_refused() -> None:

@@ -1,6 +1,5 @@
 """Blocks of examples that a thread reads before they are needed, so that a step does not wait for the disk."""
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from queue import SimpleQueue
@@ -43,8 +42,6 @@ class ReadAhead:
         self.arrived: dict[int, SimpleQueue[_Loaded | Exception]] = {lane: SimpleQueue() for lane in lanes}
         self.used: dict[int, _Loaded] = {}
         self.ended = Event()
-        self.waited_s = 0.0
-        """Seconds that ``take`` has waited for blocks."""
         self.thread = Thread(target=self._read, args=(blocks, gather), name="read ahead", daemon=True)
         self.thread.start()
 
@@ -70,9 +67,7 @@ class ReadAhead:
         if used is not None:
             del self.used[lane], used
             self.places.release()
-        started = time.monotonic()
         arrived = self.arrived[lane].get()
-        self.waited_s += time.monotonic() - started
         if isinstance(arrived, Exception):
             raise arrived
         self.used[lane] = arrived

@@ -50,10 +50,10 @@ def train(
 ) -> Path:
     """Train on a generated dataset; returns the path of the weights (``run_dir/weights.safetensors``).
 
-    ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors. If it
-    holds a checkpoint of the same settings, training continues from it, and what is missing of a finished run is
-    written. Raises ``ValueError`` for other settings, and at the first step whose loss or gradient is not finite: what
-    was saved before stays.
+    ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors, and
+    survey.json where examples are streamed. If it holds a checkpoint of the same settings, training continues from it,
+    and what is missing of a finished run is written. Raises ``ValueError`` for other settings, and at the first step
+    whose loss or gradient is not finite: what was saved before stays. ``ConnectionError`` where a process is lost.
     """
     check_place(run_dir, may_be_link=True)
     process = join_processes()
@@ -119,7 +119,7 @@ class Trainer:
         adapt_momentum(self.network, config.accumulate)
         self.module: nn.Module = share_statistics(self.network, process, device)
         if process.world > 1:
-            self.module = nn.parallel.DistributedDataParallel(self.network)
+            self.module = nn.parallel.DistributedDataParallel(self.network, broadcast_buffers=False)
         if config.compile == "on" or (config.compile == "auto" and compiling_pays(device, self.total)):
             self.module = torch.compile(self.module)  # type: ignore[assignment]
         constant = ConstantAnswer.of(*data.first_queries(EXAMPLES), config.supervision.labels)
