@@ -11,6 +11,7 @@ from safetensors.numpy import load_file, save_file
 from toy_data import make_small_datasets
 from toy_scene import toy_scene
 
+from mereo.io.places import sha256
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
 from mereo.training.dataset import Dataset
@@ -89,6 +90,9 @@ def test_a_truncated_file_is_noticed(data: Path, originals: tuple[Path, Path], n
 
 
 def without_checksums(data: Path) -> Path:
+    manifest = json.loads((data / "manifest.json").read_text())
+    del manifest["files"]
+    (data / "manifest.json").write_text(json.dumps(manifest))
     for path in (*data.glob("shard-*"), data / "template.safetensors"):
         save_file(load_file(path), path)
     return data
@@ -96,9 +100,12 @@ def without_checksums(data: Path) -> Path:
 
 def test_a_dataset_without_checksums_is_good(data: Path) -> None:
     loaded = Dataset.load(without_checksums(data))
-    before = contents(data)
+    before, manifest = contents(data), json.loads((data / "manifest.json").read_text())
     make(data, resume=True)
-    assert contents(data) == before
+    recorded = json.loads((data / "manifest.json").read_text()).pop("files")
+    assert contents(data) | {"manifest.json": b""} == before | {"manifest.json": b""}
+    assert recorded == {name: sha256(content) for name, content in before.items() if name != "manifest.json"}
+    assert json.loads((data / "manifest.json").read_text()) == manifest | {"files": recorded}
     assert len(loaded) == 4 and loaded.template is not None
 
 

@@ -72,6 +72,17 @@ def test_what_is_free_is_taken_unless_the_user_has_said(
     assert use_free_cores(FreeCores()) == taken and said == told
 
 
+def test_a_moment_of_other_work_takes_no_core_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What starts beside a command, a shell's own listing for one, is over before the command has loaded anything."""
+    counted = iter([1.2, 1.9])
+    monkeypatch.setattr(cores, "use_threads", lambda count: pytest.fail(f"{count} threads"))
+    monkeypatch.setattr(cores, "cores", lambda: 2)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(FreeCores, "now", lambda _: next(counted))
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    assert use_free_cores(FreeCores()) == 2
+
+
 def test_commands_that_answer_take_free_cores_and_those_that_train_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[object] = []
     monkeypatch.setattr(command_line, "use_free_cores", chosen.append)

@@ -116,7 +116,8 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     fitted = ModesFit.of(points, said(model, material), model, 1.0)
     problem = DrawsProblem.of(fitted.problem, states, fitted.found)
     wrong = replace(fitted.posed, z=np.full(model.count, 2.0))
-    poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, jumps=0, hopeless=0.0)
+    poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, hopeless=0.0)
+    poor = replace(poor, jumps=0, asked_again=False)
     once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
     monkeypatch.setattr("mereo.fitting.draws_fit.second_pass", None)  # not called where the first explains the cloud

@@ -48,10 +48,10 @@ def test_a_scale_is_measured_on_views_whose_fit_is_in_the_right_state() -> None:
     right = [RadiusRatios(*np.abs(rng.normal(size=(2, 100))), *np.ones((2, 100))) for _ in range(LEAST)]
     elsewhere = RadiusRatios(*(30.0 + rng.random((2, 100))), *np.ones((2, 100)))
     gauge = RadiusGauge()
-    gauge.clean = [*right[1:], elsewhere]
-    gauge.noisy = [one.by(0.5) for one in right]
+    gauge.ratios["radius_scale"] = [*right[1:], elsewhere]
+    gauge.ratios["noisy_draws_radius_scale"] = [one.by(0.5) for one in right]
     scale = pytest.approx(RadiusRatios.together(right).scale())
-    assert list(gauge.fields()) == ["noisy_radius_scale"]
-    gauge.clean.append(right[0])
-    assert gauge.fields() == {"radius_scale": scale, "noisy_radius_scale": 2 * gauge.fields()["radius_scale"]}
+    assert list(gauge.fields()) == ["noisy_draws_radius_scale"]
+    gauge.ratios["radius_scale"].append(right[0])
+    assert gauge.fields() == {"radius_scale": scale, "noisy_draws_radius_scale": 2 * gauge.fields()["radius_scale"]}
     assert gauge.fields()["radius_scale"] == pytest.approx(1.96, abs=0.25)

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo.cli import commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
+from mereo.cli import commands, dataset_commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
 from mereo.cli.calibrate import CalibrateCommand
 from mereo.cli.config_file import GivenOptions, defaults_from, read_options
 from mereo.cli.last_resort import is_foreseen, sentence
@@ -209,6 +209,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         (weights_hub_commands.WeightsPush, "push"),
         (weights_hub_commands.WeightsPull, "pull"),
     )
+    datasets = (dataset_commands.DatasetCheck, "check"), (dataset_commands.DatasetShow, "show")
     assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")
     return (
         Annotated[commands.Demo, subcommand("demo")]
@@ -220,6 +221,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
         | Annotated[_group(weights), subcommand("weights", description="List, show, publish or fetch weights.")]
         | starting(commands.Generate, "generate", settings=GenerateConfig(sensor=sensor))
+        | Annotated[_group(datasets), subcommand("dataset", description="Check or describe generated examples.")]
         | starting(commands.Train, "train", config=recipe)
         | starting(commands.Evaluate, "evaluate", terms=sensor)
         | Annotated[CalibrateCommand, subcommand("calibrate")]

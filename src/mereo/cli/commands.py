@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import arg
 
 from mereo.cli.config_file import ConfigFile, options_of
+from mereo.cli.place_option import PlaceOption
 from mereo.cli.positionals import AssetNames, DatasetFolder, SceneName, WeightsName
 from mereo.fitting.config import FitChoice
 from mereo.geometry.conventions import WorkspaceName
@@ -87,7 +88,7 @@ class Generate:
     Attributes:
         scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
         examples: how many.
-        output: folder to create.
+        output: folder to create, or its URL in an object storage, s3://BUCKET/FOLDER or gs://BUCKET/FOLDER.
         seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
         workers: processes, each in one thread; the result does not depend on them. 0 means as many as --threads.
         shard: make only part i of n, as i/n from 0/n to (n-1)/n, for example on several machines.
@@ -101,7 +102,7 @@ class Generate:
 
     scene: SceneName
     examples: Count
-    output: Path
+    output: PlaceOption
     seed: CountOrNone = 0
     workers: Workers = 0
     shard: str = "0/1"
@@ -114,7 +115,8 @@ class Generate:
 
     def run(self) -> None:
         """Write the folder of labelled examples."""
-        from mereo.io.atomic_files import write_json
+        from mereo.io.atomic_files import json_text
+        from mereo.io.places import write_whole
         from mereo.synthesis.shards import generate
 
         generate(
@@ -128,7 +130,7 @@ class Generate:
             resume=self.resume,
             test=self.test,
         )
-        write_json(self.output / CONFIG, options_of(self, "generate"))
+        write_whole(self.output / CONFIG, json_text(options_of(self, "generate")).encode())
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ class Train:
     """Train a network on generated examples; the same command again continues a stopped run.
 
     Attributes:
-        dataset: folder written by `mereo generate`.
+        dataset: folder written by `mereo generate`, or its URL in an object storage.
         output: folder of the run.
         preset: what the options below start from: as published, as published for --network.encoder autodecoder,
             recommended, the same for a GPU, one for tests.

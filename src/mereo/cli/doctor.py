@@ -24,6 +24,8 @@ PURPOSES: dict[str, str] = {
     "sensors": "ROS bags, EXR depth images and Zivid clouds",
     "simulation": "states from finite elements",
     "hub": "weights on a model hub",
+    "storage": "datasets in S3 and what speaks it",
+    "gcs": "datasets in Google Cloud Storage",
     "cluster": "data generation on several machines",
     "align": "ground truth from scans",
     "docs": "the documentation as pages",

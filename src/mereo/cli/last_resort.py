@@ -55,7 +55,7 @@ def sentence(error: Exception, arguments: list[str], variable: str) -> str:
 def _command(arguments: list[str]) -> str:
     """Names of the command and of the existing files among its arguments: ``mereo align on scan.ply``."""
     words = next((n for n, word in enumerate(arguments) if not word.isalpha()), len(arguments))
-    named = arguments[:1] if words < 2 or arguments[0] not in ("scene", "assets") else arguments[:2]
+    named = arguments[:1] if words < 2 or arguments[0] not in ("scene", "assets", "dataset") else arguments[:2]
     values = [word.partition("=")[2] if word.startswith("--") else word for word in arguments[len(named) :]]
     files = [value for value in values if value and _is_there(value)]
     return " ".join(["mereo", *named, *(["on", ", ".join(files)] if files else [])])

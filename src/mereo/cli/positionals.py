@@ -2,7 +2,7 @@
 
 SCENE    a name from `mereo scene list`, or a scene file
 OBJECT   what an object is made from: its meshes, or a label volume
-DATASET  folder of `mereo generate`
+DATASET  folder of `mereo generate`, or its URL
 WEIGHTS  a shipped name, or a file
 INPUT    what a sensor has seen: depth image, cloud, recording, or a folder of such
 SCAN     a cloud that truth is made for
@@ -15,12 +15,14 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from mereo.cli.place_option import PlaceOption
+
 SceneName = Annotated[Positional[str], arg(metavar="SCENE")]
 SceneNameOrNone = Annotated[Positional[str], arg(metavar="[SCENE]", help_behavior_hint="")]
 ObjectFiles = Annotated[
     Positional[tuple[Path, ...]], arg(metavar="OBJECT [OBJECT ...]", help_behavior_hint="(required)")
 ]
-DatasetFolder = Annotated[Positional[Path], arg(metavar="DATASET")]
+DatasetFolder = Annotated[Positional[PlaceOption], arg(metavar="DATASET")]
 WeightsName = Annotated[Positional[str], arg(metavar="WEIGHTS")]
 WeightsFiles = Annotated[Positional[tuple[Path, ...]], arg(metavar="[WEIGHTS ...]", help_behavior_hint="")]
 Inputs = Annotated[Positional[tuple[Path, ...]], arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(required)")]

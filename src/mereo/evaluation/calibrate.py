@@ -76,8 +76,9 @@ def calibrate(
     check_names(model, scene.rest.names)
     bare = replace(model, calibration=None)
     registrar = None if model.statistical_model is None else registrar_for(bare, "modes", scene)
-    of_fits: tuple[Gauge, ...] = () if registrar is None else (RecognitionGauge(), RadiusGauge())
-    gauges: tuple[Gauge, ...] = (ProbabilityGauge(bare), *of_fits)
+    gauges: tuple[Gauge, ...] = (ProbabilityGauge(bare),)
+    if registrar is not None:
+        gauges = (*gauges, RecognitionGauge(), RadiusGauge(replace(registrar, choice="auto")))
     each = max(1, round(views / 24)) if strangers and registrar is not None else 0
     others = len(other_objects(scene)) if each else 0
     with progress("calibrate", views + each * (others + 8), "views", quiet=quiet) as shown:

@@ -1,4 +1,4 @@
-"""Gauge of radii: the factor with which 95 % of the true places lie within what the posterior of the modes says."""
+"""Gauge of radii: the factors with which 95 % of the true places lie within what the posterior of a fit says."""
 
 from typing import Any
 
@@ -8,7 +8,11 @@ from mereo.evaluation.calibration_views import CalibrationView
 from mereo.evaluation.coverage import RadiusRatios, seen_points
 from mereo.fitting.readings import FittedFrame
 from mereo.fitting.recognition import is_noisy
+from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
+
+FIELDS = ("radius_scale", "noisy_radius_scale", "draws_radius_scale", "noisy_draws_radius_scale")
+"""Fields of ``Calibration``: of modes, clean and noisy, and of draws."""
 
 LEAST = 4
 """Views without which nothing is said."""
@@ -19,18 +23,28 @@ one such view in twenty would be all that the scale is made of; recognition is t
 
 
 class RadiusGauge:
-    """Measurement of both scales of ``Calibration``'s radii. Satisfies ``Gauge``."""
+    """Measurement of all scales of ``Calibration``'s radii. Satisfies ``Gauge``.
 
-    def __init__(self) -> None:
-        self.clean: list[RadiusRatios] = []
-        self.noisy: list[RadiusRatios] = []
+    Attributes:
+        full: registrar that fits the scene's draws to what the modes were fitted to; None where no scene is at hand.
+        ratios: of the views whose registration is believed, by the field that they decide.
+    """
+
+    def __init__(self, full: Registrar | None = None) -> None:
+        self.full = None if full is None or full.at_hand is None else full
+        self.ratios: dict[str, list[RadiusRatios]] = {name: [] for name in FIELDS}
 
     def add(self, view: CalibrationView, frame: FittedFrame, registration: Registration | None) -> None:
         """Take in a view of the object where its registration is believed: of others users get no radii."""
-        if registration is not None and registration.accepted:
-            truth = view.material(registration.model)
-            ratios = RadiusRatios.of(registration, truth, seen_points(truth, view.seen, 1.0))
-            (self.noisy if is_noisy(registration) else self.clean).append(ratios)
+        each = [registration]
+        if self.full is not None and frame.modes is not None:
+            each.append(self.full.finish(frame.modes))
+        for number, one in enumerate(each):
+            if one is None or not one.accepted or (number == 1 and one.method != "draws"):
+                continue
+            truth = view.material(one.model)
+            ratios = RadiusRatios.of(one, truth, seen_points(truth, view.seen, 1.0))
+            self.ratios[FIELDS[2 * number + is_noisy(one)]].append(ratios)
 
     def add_strange(self, frame: FittedFrame, registration: Registration | None) -> None:
         """Leave out what is not the object: there are no true places."""
@@ -38,7 +52,7 @@ class RadiusGauge:
     def fields(self) -> dict[str, Any]:
         """The scales, of the views whose fit is not elsewhere; none where these are too few."""
         fields = {}
-        for name, each in (("radius_scale", self.clean), ("noisy_radius_scale", self.noisy)):
+        for name, each in self.ratios.items():
             right = [one for one in each if np.median(one.all) <= ELSEWHERE]
             if len(right) >= LEAST:
                 fields[name] = RadiusRatios.together(right).scale()

@@ -106,7 +106,9 @@ class DrawsConfig:
         hopeless: the same, above which the next starts are tried, in at most ``batches`` of them.
         passes: while it is above ``hopeless``, how often the modes are refined from where the draws ended, and the
             draws fitted to that shape again.
-        jumps: how often one draw may jump to one of ``places`` places; 0 also leaves out the network's answer.
+        jumps: how often one draw may jump to one of ``places`` places, of which the ``places_kept`` best are compared.
+        sliding: most share of a draw's motion that may leave the surface; 1 lets all draws jump.
+        asked_again: whether the network's answer is a start too, where the cloud is not explained.
         few: scenes with more draws than this get ``MANY_DRAWS`` instead: every set of differences plays each draw once.
         near: how many states count as near where draws are guessed from the modes.
         start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
@@ -135,6 +137,9 @@ class DrawsConfig:
     passes: int = 0
     jumps: int = 2
     places: int = 6
+    places_kept: int = 5
+    sliding: float = 1.0
+    asked_again: bool = True
     few: int = 30
     near: int = 100
     start_sigma: float = 0.03
@@ -150,6 +155,9 @@ MANY_DRAWS = DrawsConfig(
     sieve=((1, 3), (1, 1)),
     first_rounds=1,
     last_rounds=4,
-    jumps=0,
+    places=12,
+    places_kept=1,
+    sliding=0.2,
+    asked_again=False,
 )
 """Constants for scenes with many draws."""

@@ -6,8 +6,9 @@ and so on, from several starts.
 
 from dataclasses import replace
 
+import igl
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import spread
@@ -29,6 +30,9 @@ RANKED_BY = 150
 SMALLEST = 1e-4
 """Least share of a draw that jumps."""
 
+SLIDES = 0.03
+"""Least motion, for one standard deviation of a draw that may jump, of the point that moves farthest: of ``half``."""
+
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """The best of several starts; None where the scene has too many draws or plays none of them back."""
@@ -39,7 +43,7 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
         if explained(problem, found, problem.config.hopeless):
             break
         found += second_pass(problem, min(found, key=by_misfit, default=None))
-    if problem.config.jumps and not explained(problem, found, problem.config.explained):
+    if problem.config.asked_again and not explained(problem, found, problem.config.explained):
         camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
         found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
     best = min(found, key=lambda fit: fit.misfit, default=None)
@@ -174,20 +178,42 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     for _ in range(config.jumps):
         if explained(problem, [fit], config.explained):
             break
-        others = []
-        for number in np.flatnonzero(fit.drawn.smooth):
-            for turn in range(1, config.places):
-                z = fit.z.copy()
-                z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.places) % 1.0, SMALLEST, 1 - SMALLEST))
-                others.append(played(problem, fit.drawn, z, fit.posed))
-        likely = [other for other in others if other is not None]
-        likely.sort(key=lambda other: misfit(problem, other, sigma))
+        each = [likely_places(problem, fit, int(number), sigma) for number in likely_to_jump(problem, fit)]
+        likely = sorted((other for places in each for other in places), key=lambda other: misfit(problem, other, sigma))
         found = [descend(problem, other, config.first_rounds) for other in likely[: config.kept + 1]]
-        best = min(found, key=lambda other: other.misfit, default=fit)
+        best = min(found, key=by_misfit, default=fit)
         if best.misfit >= fit.misfit:
             break
         fit = descend(problem, best, config.first_rounds)
     return fit
+
+
+def likely_places(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[DrawsFit]:
+    """A state with one draw at other places of its range: all of them, or the best where there are many draws."""
+    config, others = problem.config, []
+    for turn in range(1, config.places):
+        z = fit.z.copy()
+        z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.places) % 1.0, SMALLEST, 1 - SMALLEST))
+        others.append(played(problem, fit.drawn, z, fit.posed))
+    there = sorted((other for other in others if other is not None), key=lambda one: misfit(problem, one, sigma))
+    return there[: config.places_kept]
+
+
+def likely_to_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
+    """Draws that may jump: of many, those that move what they move along its own surface, as a ring on its post.
+
+    Only then a state far away may look nearly the same, so that no small step leads there.
+    """
+    smooth = np.flatnonzero(fit.drawn.smooth)
+    if problem.config.sliding >= 1.0 or fit.motion is None:
+        return smooth
+    model, index = problem.model, problem.states.played.index
+    surface = index < sum(model.vertex_counts)
+    motion = fit.motion[surface][:, :, smooth].astype(np.float64)
+    normal = igl.per_vertex_normals(fit.material[: sum(model.vertex_counts)], model.faces)[index[surface]]
+    moved, off = (motion**2).sum(axis=(0, 1)), (np.einsum("ac,acd->ad", normal, motion) ** 2).sum(axis=0)
+    farthest = np.sqrt((motion**2).sum(axis=1).max(axis=0, initial=0.0))
+    return smooth[(off < problem.config.sliding * moved) & (farthest > SLIDES * model.half)]
 
 
 def first_sigma(problem: DrawsProblem) -> float:

@@ -47,7 +47,8 @@ class ModesFit:
         posed: coefficients and pose.
         seconds: that it took.
         rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
-        radius_scale: factor of the radii of the modes' uncertainty by the network's calibration.
+        radius_scale, draws_radius_scale: factors of the radii of the modes' uncertainty, and of that of draws, by the
+            network's calibration.
     """
 
     problem: Problem
@@ -57,6 +58,7 @@ class ModesFit:
     seconds: float
     rest: Judged | None = None
     radius_scale: float | None = None
+    draws_radius_scale: float | None = None
 
     @classmethod
     def of(
@@ -172,7 +174,7 @@ class ModesFit:
             ruled_out=self.problem.ruled_out(surface),
             needed=self.problem.config.accepted,
             optimum=optimum,
-            radius_scale=None if method == "draws" else self.radius_scale,  # it was measured on fits of the modes
+            radius_scale=self.draws_radius_scale if method == "draws" else self.radius_scale,
         )
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
@@ -250,8 +252,8 @@ def fit_frame(
 
     fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask)
     known = network.calibration
-    scale = None if known is None else known.noisy_radius_scale if fitted.problem.noisy else known.radius_scale
-    return replace(fitted, seconds=fitted.seconds + asked, radius_scale=scale)
+    scales = (None, None) if known is None else known.radius_scales(fitted.problem.noisy)
+    return replace(fitted, seconds=fitted.seconds + asked, radius_scale=scales[0], draws_radius_scale=scales[1])
 
 
 def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Correspondences:

@@ -50,8 +50,7 @@ class Joints:
     @classmethod
     def of(cls, model: StatisticalModel) -> "Joints":
         """Joints of a model's library."""
-        least = min(len(anchors) for anchors in model.anchors)
-        corners = np.stack([anchors[: min(CORNERS, least)] for anchors in model.anchors])
+        corners = corners_of(model)
         states = positions(model, corners, model.library[:: max(1, len(model.library) // STATES)])
         rotation, translation = segment_poses(model.mean[corners], states)
         return cls(model, corners, branches(model), rotation, translation)
@@ -94,6 +93,12 @@ class Joints:
         translation = (goal - middle @ rotation.transpose(0, 2, 1))[:, 0]
         shift = posed.place(translation)
         return [Posed(posed.rotation @ rotation[i], shift[i], z[i], posed.log_scale) for i in range(len(z))]
+
+
+def corners_of(model: StatisticalModel) -> Int[np.ndarray, "s c"]:
+    """A few anchors of each segment, as many of each."""
+    least = min(len(anchors) for anchors in model.anchors)
+    return np.stack([anchors[: min(CORNERS, least)] for anchors in model.anchors])
 
 
 def positions(

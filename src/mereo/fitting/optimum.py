@@ -12,6 +12,7 @@ from jaxtyping import Float, Float32
 from mereo.fitting.draws_problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws_problem import terms as terms_of_draws
 from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.own_turns import left_open
 from mereo.fitting.posterior import Observed, Posterior, Terms
 from mereo.fitting.priors import Prior
 from mereo.fitting.problem import Problem
@@ -66,7 +67,8 @@ class ModesOptimum:
         """Posterior of pose, scale and coefficients."""
         model = self.problem.model
         material = self.posed.place(model.material(self.posed.z))
-        return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue)
+        turns = turns_left_open(self.problem, material)
+        return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, turns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +115,14 @@ class DrawsOptimum:
             spread.shape[0], *motion.shape[1:]
         )
         material: Float[np.ndarray, "m 3"] = self.fit.placed()
-        return Posterior.of(self.terms.total, self.fit.posed, material, modes)
+        turns = turns_left_open(self.problem.base, material)
+        return Posterior.of(self.terms.total, self.fit.posed, material, modes, turns=turns)
+
+
+def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:
+    """How far turns of single segments that the frame does not tell apart may have moved the material points."""
+    config = problem.config
+    return left_open(problem.model, material, problem.evidence.partners, config.cloud_sigma, config.cloud_worth)
 
 
 Optimum = ModesOptimum | DrawsOptimum

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import eigh
 from scipy.special import chdtri
 from scipy.stats import norm
 
@@ -26,6 +26,9 @@ LEVEL = 0.95
 
 WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
+
+ROUNDED = 4 * float(np.finfo(np.float32).eps)
+"""Share of the greatest precision below which a smaller one is rounding."""
 
 _FREEDOM = np.linspace(1.0, 3.0, 201)
 _QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)
@@ -85,6 +88,8 @@ class Posterior:
         modes: how each of them moves with the coefficients, before the pose.
         factor: p x p, ``factor factor^T`` is the covariance of the parameters.
         residue: root mean square distance of the object's states from what the coefficients can express.
+        turns: motion of the material points with further standard normal numbers, of what is far from Gaussian
+            (``own_turns``), in the camera's axes; None without.
     """
 
     posed: Posed
@@ -92,6 +97,7 @@ class Posterior:
     modes: Float32[np.ndarray, "m 3 k"]
     factor: Float[np.ndarray, "p p"]
     residue: float = 0.0
+    turns: Float32[np.ndarray, "m 3 e"] | None = None
 
     @classmethod
     def of(
@@ -101,9 +107,10 @@ class Posterior:
         material: Float[np.ndarray, "m 3"],
         modes: Float32[np.ndarray, "m 3 k"],
         residue: float = 0.0,
+        turns: Float32[np.ndarray, "m 3 e"] | None = None,
     ) -> "Posterior":
         """Posterior whose precision is the matrix of the normal equations at the optimum."""
-        return cls(posed, material, modes, covariance_factor(normal.matrix), residue)
+        return cls(posed, material, modes, covariance_factor(normal.matrix), residue, turns)
 
     @cached_property
     def _local(self) -> tuple[Float32[np.ndarray, "r p"], Float32[np.ndarray, "k p"]]:
@@ -132,14 +139,24 @@ class Posterior:
 
     def radii(self, follow: PointWeights | None = None) -> Float[np.ndarray, " n"]:
         """Radius of 95 % of all material points, or of points that follow them; scene units."""
-        return self._radii(self.motion if follow is None else follow(self.motion))
+        if follow is None:
+            return self._radii(self.motion, self._turned(slice(None)))
+        return self._radii(follow(self.motion), follow(self._turned(slice(None))))
 
     def radii_of(self, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Radius of 95 % of some material points alone, which costs as little as they are few."""
-        return self._radii(self._motion(rows))
+        return self._radii(self._motion(rows), self._turned(rows))
 
-    def _radii(self, motion: Float32[np.ndarray, "n 3 p"]) -> Float[np.ndarray, " n"]:
-        spread = np.matmul(motion, motion.transpose(0, 2, 1)).astype(np.float64)
+    def _turned(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 e"]:
+        """``turns`` in the object's axes."""
+        if self.turns is None:
+            return np.zeros((len(self._arm[rows]), 3, 0), dtype=np.float32)
+        return np.matmul(self.posed.rotation.T.astype(np.float32), self.turns[rows])
+
+    def _radii(
+        self, motion: Float32[np.ndarray, "n 3 p"], turned: Float32[np.ndarray, "n 3 e"]
+    ) -> Float[np.ndarray, " n"]:
+        spread = sum(np.matmul(part, part.transpose(0, 2, 1)).astype(np.float64) for part in (motion, turned))
         spread[:, range(3), range(3)] += self.residue**2 / 3
         return radius95(spread)
 
@@ -176,10 +193,15 @@ def rigid_motion(arm: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3 7"
 
 
 def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Factor F of an inverse, ``F F^T = precision^-1``; unlike units of the parameters do no harm."""
+    """Factor F of an inverse, ``F F^T = precision^-1``; unlike units of the parameters do no harm.
+
+    Precisions are sums of products in single precision: what these leave open (a scale that nobody knows, beside
+    states that grow) is as unsure as their rounding can tell, and may come out below zero.
+    """
     unit = 1.0 / np.sqrt(np.diag(precision))
-    lower = cholesky(precision * unit[:, None] * unit, lower=True)
-    factor: np.ndarray = unit[:, None] * solve_triangular(lower, np.eye(len(unit)), lower=True).T
+    values, vectors = eigh(precision * unit[:, None] * unit)
+    least = ROUNDED * float(values[-1])
+    factor: np.ndarray = unit[:, None] * vectors / np.sqrt(np.maximum(values, least))
     return factor
 
 

@@ -84,7 +84,7 @@ class Registration:
         needed: least ``explained`` of a frame of this noise to be believed.
         optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
             where the registration was read from a file.
-        radius_scale: factor of the radii by the weights' calibration, which is of fits of the modes; None without one.
+        radius_scale: factor of the radii by the weights' calibration of such fits; None without one.
     """
 
     model: StatisticalModel

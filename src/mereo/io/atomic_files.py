@@ -87,7 +87,12 @@ def _place_new(partial: Path, path: Path) -> None:
 def write_json(path: str | Path, value: Any, *, force: bool = True) -> None:
     """Write ``to_json`` of a value, indented, whole or not at all; ``force`` as in ``atomic_file``."""
     with atomic_file(path, force=force) as partial:
-        partial.write_text(json.dumps(to_json(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n", "utf-8")
+        partial.write_text(json_text(value), "utf-8")
+
+
+def json_text(value: Any) -> str:
+    """Text of ``to_json`` of a value as files have it, indented, with a line's end at its end."""
+    return json.dumps(to_json(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def to_json(value: Any) -> Any:

@@ -6,15 +6,18 @@ Files of earlier versions have none and are taken as they are.
 
 import hashlib
 import json
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
 from mereo.io.errors import reason
+from mereo.io.object_cache import read_cached
+from mereo.io.object_storage import ObjectPath
+from mereo.io.places import Place
 
 HEADER, CHECKSUM = "mereo", "sha256"
 
@@ -27,26 +30,64 @@ def pack_tensors(tensors: Tensors, facts: Mapping[str, Any]) -> bytes:
     return save(whole, metadata={HEADER: json.dumps({**facts, CHECKSUM: _digest(whole, facts)})})
 
 
-def read_tensors(path: Path, dataset: str | None = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Tensors of a file, and its facts, none where it has no header entry.
+def read_content(path: Place, recorded: str | None = None) -> bytes:
+    """Bytes of a file of a dataset; where its SHA-256 is ``recorded``, a local copy will do (``object_cache``).
 
-    Raises ``FileNotFoundError``, and ``ValueError`` (its reason only) where the file is damaged, or states another
-    dataset than the one of this key.
+    Raises ``FileNotFoundError``, ``ValueError`` (its reason only) where a disk cannot read it, and ``StorageError``.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist; it is part of a dataset: check the path")
     try:
-        with safe_open(path, framework="numpy") as file:
-            facts = json.loads((file.metadata() or {}).get(HEADER, "{}"))
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        expected = facts.pop(CHECKSUM, None)
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
+        if isinstance(path, ObjectPath):
+            return read_cached(path, recorded) if recorded else path.read_bytes()
+        return path.read_bytes()
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+        raise FileNotFoundError(f"{path} does not exist; it is part of a dataset: check the path") from None
+    except OSError as error:
+        if isinstance(path, ObjectPath):  # a storage's silence says nothing about the file
+            raise
         raise ValueError(reason(error)) from None
-    if expected is not None and expected != _digest(tensors, facts):
+
+
+def unpack_tensors(
+    content: bytes, dataset: str | None = None, verified: bool = False
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors that ``pack_tensors`` has packed, and their facts, none where there is no header entry.
+
+    Args:
+        content: of the file.
+        dataset: key of the dataset that it should be of; None takes any.
+        verified: its bytes are known to be right, so its checksum need not be compared.
+
+    Raises ``ValueError`` (its reason only) where the file is damaged, or states another dataset.
+    """
+    try:
+        tensors, facts = load(content), _facts(content)
+        expected = facts.pop(CHECKSUM, None)
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(reason(error)) from None
+    if expected is not None and not verified and expected != _digest(tensors, facts):
         raise ValueError("its checksum is another: its bytes have changed")
     if dataset is not None and facts.get("dataset") not in (None, dataset):
         raise ValueError("it is of another dataset")
     return tensors, facts
+
+
+@contextmanager
+def held_against(content: bytes, recorded: str | None) -> Iterator[bool]:
+    """Compare a file's content with its SHA-256 in the dataset's manifest, if that has one; yield whether it is equal.
+
+    What the block has against the file says more: only after it ``ValueError`` (its reason only) is raised.
+    """
+    same = recorded is not None and hashlib.sha256(content).hexdigest() == recorded
+    yield same
+    if recorded is not None and not same:
+        raise ValueError("its SHA-256 is not that in manifest.json: it is another file than was recorded there")
+
+
+def _facts(content: bytes) -> dict[str, Any]:
+    """Header's entry of a file that safetensors has read: 8 bytes with the length of a JSON object, which follows."""
+    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+    facts: dict[str, Any] = json.loads(header.get("__metadata__", {}).get(HEADER, "{}"))
+    return facts
 
 
 def check_tensors(tensors: Tensors, shapes: Mapping[str, str], sizes: Mapping[str, int]) -> None:

@@ -92,7 +92,10 @@ def use_free_cores(watch: FreeCores) -> int:
     stated = os.environ.get(THREAD_VARIABLES[0], "")
     if stated:
         return int(stated) if stated.isdecimal() else cores()
-    count = threads_for(watch.now(), cores())
+    there = cores()
+    count = threads_for(watch.now(), there)
+    if count < there:  # what ran for a moment is over now: only what goes on is counted twice
+        count = max(count, threads_for(FreeCores().now(), there))
     if count < (os.cpu_count() or 1):
         use_threads(count)
     return count

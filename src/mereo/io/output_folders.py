@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from mereo.io.atomic_files import write_json
+from mereo.io.object_storage import ObjectPath
 from mereo.io.scratch_folders import (
     ASIDE,
     REMOVED,
@@ -231,17 +232,18 @@ def claim_directory(directory: Path, name: str, settings: dict[str, Any], kind: 
         raise FileExistsError(f"{directory} is a file; {kind} is a directory: choose another --output")
     remove_all_abandoned(directory)
     if path.is_file():
-        return _read_settings(path)
+        return read_settings(path)
     if directory.is_dir() and any(not file.name.startswith(".") for file in directory.iterdir()):
         raise FileExistsError(f"{directory} is not empty and holds no {name}; choose another --output")
     try:
         write_json(path, settings, force=False)
     except FileExistsError:  # another process came first
-        return _read_settings(path)
+        return read_settings(path)
     return None
 
 
-def _read_settings(path: Path) -> dict[str, Any]:
+def read_settings(path: Path | ObjectPath) -> dict[str, Any]:
+    """Settings that the file of a place of earlier work holds; ``ValueError`` where it holds none."""
     try:
         found = json.loads(path.read_text("utf-8"))
     except ValueError:

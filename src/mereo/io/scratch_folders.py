@@ -29,6 +29,9 @@ ASIDE = ".mereo-old"
 REMOVED = ".mereo-removed"
 """Name of such an output from when its files are being removed: it may lack some, so it is never put back."""
 
+PROTOCOL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
+"""First part of what a path makes of a URL."""
+
 MOST_BYTES = 255 - len("..1a2b3c4d.partial")
 """Length of a name in bytes that leaves room for that of its scratch folder on every usual file system."""
 
@@ -44,6 +47,11 @@ def check_place(path: Path, may_be_link: bool = False) -> None:
         raise ValueError(f"the output {str(path)!r} has bytes that are no UTF-8 text: choose another name") from None
     if "\0" in str(path):
         raise ValueError(f"the output {str(path)!r} has a zero byte, which no name may have: choose another name")
+    if len(path.parts) > 1 and PROTOCOL.fullmatch(path.parts[0]) and not Path(path.parts[0]).exists():
+        raise ValueError(
+            f"the output {path.parts[0]}//{'/'.join(path.parts[1:])} is a URL, and a local path is needed here; only "
+            "datasets go to an object storage: name a folder or file of this machine"
+        )
     if path.name in ("", ".."):
         raise ValueError(f"the output '{path}' has no name of its own, which it needs: name it, as in {path / 'out'}")
     if len(longest.encode()) > MOST_BYTES:

@@ -18,6 +18,8 @@ from mereo.evaluation.metrics import format_score
 from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.fitting.config import FitChoice
+from mereo.io.object_storage import ObjectPath
+from mereo.io.places import Place, place_of
 from mereo.learning import learn as learning
 from mereo.learning.example_frame import FRAME
 from mereo.learning.object_files import scene_for
@@ -37,7 +39,7 @@ from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
 
 def generate(
     scene: str | Path | Scene,
-    output: str | Path,
+    output: str | Path | ObjectPath,
     settings: GenerateConfig | None = None,
     *,
     examples: int,
@@ -46,12 +48,12 @@ def generate(
     shard: tuple[int, int] = (0, 1),
     resume: bool = False,
     test: bool = False,
-) -> Path:
+) -> Place:
     """Labelled examples of a scene in a folder, which is returned: `mereo generate`.
 
     Args:
         scene: a built-in scene's name, a scene file, or a scene.
-        output: folder to create.
+        output: folder to create; a text may be its URL in an object storage, s3://BUCKET/FOLDER or gs://BUCKET/FOLDER.
         settings: how one example is made; ``SENSORS`` of ``mereo.synthesis.config`` has those of depth cameras.
         examples: how many.
         seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
@@ -64,10 +66,11 @@ def generate(
     Raises as ``synthesis.shards.generate`` does.
     """
     made = str(scene) if isinstance(scene, Path) else scene
+    place = place_of(output)
     processes = workers or os.cpu_count() or 1
     shards.generate(
         made,
-        Path(output),
+        place,
         settings or GenerateConfig(),
         examples=examples,
         seed=seed,
@@ -76,14 +79,16 @@ def generate(
         resume=resume,
         test=test,
     )
-    return Path(output)
+    return place
 
 
-def train(dataset: str | Path, output: str | Path, config: TrainConfig | PresetName = "base", **changes: Any) -> Path:
+def train(
+    dataset: str | Path | ObjectPath, output: str | Path, config: TrainConfig | PresetName = "base", **changes: Any
+) -> Path:
     """File of weights, trained on generated examples; the same call again continues a stopped run: `mereo train`.
 
     Args:
-        dataset: folder written by ``generate``.
+        dataset: folder written by ``generate``, or its URL.
         output: folder of the run: config.json, metrics.csv, curves.png, checkpoint.safetensors, weights.safetensors.
         config: the recipe, or the name of a preset.
         changes: fields of ``TrainConfig`` to be changed in it, such as ``init="bunny"`` or ``epochs=20.0``.
@@ -95,7 +100,7 @@ def train(dataset: str | Path, output: str | Path, config: TrainConfig | PresetN
         if config not in PRESETS:
             raise ValueError(f"the preset is {config!r}; it must be one of {', '.join(PRESETS)}: correct the spelling")
         config = PRESETS[config]
-    return trainer.train(Path(dataset), Path(output), replace(config, **changes))
+    return trainer.train(place_of(dataset), Path(output), replace(config, **changes))
 
 
 def evaluate(

@@ -55,6 +55,7 @@ class Calibration(BaseModel, frozen=True):
         radius_scale: factor between the radius that a fit's posterior gives for 95 % and the one that held 95 % of the
             true positions, in frames without noise beyond the paper's.
         noisy_radius_scale: the same of simulated depth cameras' frames.
+        draws_radius_scale, noisy_draws_radius_scale: both, of fits of a scene's own draws instead of the modes.
         temperature: by which logits are divided before they become probabilities (temperature scaling; Guo et al.,
             ICML 2017).
         biases: added to the divided logits of empty space and each segment (with the temperature: vector scaling, but
@@ -67,10 +68,18 @@ class Calibration(BaseModel, frozen=True):
     views: Annotated[int, Field(ge=1)]
     radius_scale: Positive | None = None
     noisy_radius_scale: Positive | None = None
+    draws_radius_scale: Positive | None = None
+    noisy_draws_radius_scale: Positive | None = None
     temperature: Positive | None = None
     biases: tuple[FiniteFloat, ...] | None = None
     ece: tuple[Share, Share] | None = None
     recognizing: Recognizing | None = None
+
+    def radius_scales(self, noisy: bool) -> tuple[float | None, float | None]:
+        """Factors of the radii of a fit of the modes and of one of draws, to a clean or a camera's noisy frame."""
+        if noisy:
+            return self.noisy_radius_scale, self.noisy_draws_radius_scale
+        return self.radius_scale, self.draws_radius_scale
 
     def scaled(self, logits: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
         """Logits divided by the temperature, plus the biases; as they are where there is no temperature.
@@ -103,9 +112,11 @@ def calibration_rows(found: Calibration | None) -> list[tuple[str, str]]:
         kind = "a temperature" if found.biases is None else "a temperature and a bias for each class"
         error = "" if found.ece is None else f"; calibration error {found.ece[0]:.3f}, with it {found.ece[1]:.3f}"
         rows.append(("probabilities", f"{kind} ({found.temperature:.2f}){error}"))
-    if found.radius_scale is not None:
-        noisy = "" if found.noisy_radius_scale is None else f", of noisy frames {found.noisy_radius_scale:.2f}"
-        rows.append(("radii", f"the posterior's times {found.radius_scale:.2f}{noisy}, of fits of the modes"))
+    for what, noisy in (("radii", False), ("radii of noisy frames", True)):
+        modes, draws = found.radius_scales(noisy)
+        if modes is not None:
+            of_draws = "" if draws is None else f", {draws:.2f} of fits of the scene's draws"
+            rows.append((what, f"the posterior's times {modes:.2f} of fits of the modes{of_draws}"))
     if found.recognizing is not None:
         limits = found.recognizing
         rows.append(("recognition", f"unsure above a strangeness of {limits.unsure:.2g}, no from {limits.refused:.2g}"))

@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.io.atomic_files import atomic_file
-from mereo.io.checked_tensors import Tensors, pack_tensors, read_tensors
+from mereo.io.checked_tensors import Tensors, held_against, pack_tensors, read_content, unpack_tensors
+from mereo.io.errors import reason
+from mereo.io.places import Place, write_whole
 from mereo.scenes.pair_distances import PairDistances
 from mereo.scenes.source_frame import SourceFrame
 from mereo.scenes.statistical_model import StatisticalModel
@@ -82,19 +83,36 @@ def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel
 
 def save_statistical_model(model: StatisticalModel, path: Path, dataset: str | None = None) -> None:
     """Write a statistical model as one safetensors file, whole or not at all; ``dataset`` is the key of its dataset."""
+    write_whole(path, statistical_model_bytes(model, dataset))
+
+
+def statistical_model_bytes(model: StatisticalModel, dataset: str | None = None) -> bytes:
+    """Content of the file of a statistical model."""
     tensors, facts = pack_model(model)
-    with atomic_file(path) as partial:
-        partial.write_bytes(pack_tensors(tensors, {**facts, "dataset": dataset}))
+    return pack_tensors(tensors, {**facts, "dataset": dataset})
 
 
-def load_statistical_model(path: Path, dataset: str | None = None) -> StatisticalModel:
-    """Read what ``save_statistical_model`` wrote; ``ValueError`` for another file, or one of another dataset."""
+def load_statistical_model(path: Place, dataset: str | None = None, recorded: str | None = None) -> StatisticalModel:
+    """Read what ``save_statistical_model`` wrote; ``ValueError`` for another file, or one of another dataset.
+
+    ``recorded`` is its SHA-256 in the dataset's manifest. Raises ``StorageError`` where nothing is known of the file.
+    """
     try:
-        return unpack_model(*read_tensors(path, dataset))
-    except (FileNotFoundError, KeyError, TypeError, IndexError, ValueError) as error:
+        return read_statistical_model(read_content(path, recorded), dataset, recorded)
+    except (FileNotFoundError, ValueError) as error:
         raise ValueError(
             f"{path} is no statistical model of mereo ({error}); delete it and run `mereo generate ... --resume`"
         ) from None
+
+
+def read_statistical_model(content: bytes, dataset: str | None, recorded: str | None) -> StatisticalModel:
+    """Statistical model that a file's content holds; ``ValueError`` (its reason only) where it holds none."""
+    with held_against(content, recorded) as verified:
+        tensors, facts = unpack_tensors(content, dataset, verified)
+        try:
+            return unpack_model(tensors, facts)
+        except (KeyError, TypeError, IndexError) as error:
+            raise ValueError(reason(error)) from None
 
 
 def with_fewer_modes(model: StatisticalModel, most: int) -> StatisticalModel:

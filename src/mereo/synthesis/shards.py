@@ -1,7 +1,8 @@
-"""Datasets on disk: shards of 64 examples, each written whole or not at all, the same bits for any number of workers.
+"""Datasets: shards of 64 examples, each written whole or not at all, the same bits for any number of workers.
 
-Example i comes from (seed, i) alone. A dataset is a directory with ``manifest.json``, everything needed to make it
-again, and ``shard-00000.safetensors`` and so on, whose tensors are (e examples, p stored points, q queries):
+Example i comes from (seed, i) alone. A dataset is a directory, or a folder of an object storage (``io.places``), with
+``manifest.json``, everything needed to make it again, and ``shard-00000.safetensors`` and so on, whose tensors are (e
+examples, p stored points, q queries):
 
     cloud f32 [e, p, 3], cloud_count i32 [e], center f64 [e, 3], scale f64 [e],
     positions f32 [e, q, 3], labels u8 [e, q], distances f32 [e, q], directions f16 [e, q, 3], rest f16 [e, q, 3]
@@ -12,6 +13,8 @@ with further observations (``synthesis.observations``), of which each has k,
 
 and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``scenes.rest_pose``), and
 ``statistical_model.safetensors``, the modes of the object's random states (``scenes.statistical_model_file``).
+
+When all are there the manifest gets the SHA-256 of each (``synthesis.dataset_contents``).
 
 Workers only compute; this process alone writes. So one place meets a full disk, and whatever kills a worker leaves
 nothing half-written.
@@ -31,9 +34,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mereo.io.atomic_files import atomic_file
 from mereo.io.checked_tensors import pack_tensors
-from mereo.io.output_folders import claim_directory
+from mereo.io.places import Place, claim, names_in
 from mereo.io.progress import progress
 from mereo.io.scratch_folders import check_place
 from mereo.scenes.random_states import scene_model, states_for
@@ -41,19 +43,19 @@ from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.rest_pose import rest_distances
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.scenes.statistical_model_file import load_statistical_model, save_statistical_model
+from mereo.scenes.statistical_model_file import statistical_model_bytes
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
-from mereo.synthesis.dataset_files import check_space, dataset_key, read_shard, read_template
+from mereo.synthesis.dataset_contents import FILES, DatasetContents, shard_name
+from mereo.synthesis.dataset_files import MANIFEST, check_space, dataset_key
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.observations import Clouds
 from mereo.synthesis.workers import in_processes
 
 SHARD_SIZE = 64
-MANIFEST = "manifest.json"
 LIBRARIES = ("numpy", "scipy", "embreex", "libigl", "manifold3d", "trimesh")
 """Libraries whose versions are in the manifest: others may move last bits, but make no other dataset."""
 
-NOT_COMPARED = ("libraries", "bytes")
+NOT_COMPARED = ("libraries", "bytes", FILES)
 """Manifest entries that may differ when a dataset is resumed."""
 
 
@@ -71,18 +73,14 @@ class _Work:
 class _Shard:
     """One file: examples ``first`` up to ``end``, without the end."""
 
-    path: Path
+    name: str
     first: int
     end: int
-
-    def is_complete(self, dataset: str) -> bool:
-        """Whether the file is there with all its examples, and those of this dataset."""
-        return _is_whole(self.path, lambda path: read_shard(path, dataset, self.first, self.end))
 
 
 def generate(
     scene: str | Scene,
-    output: Path,
+    output: Place,
     settings: GenerateConfig,
     *,
     examples: int,
@@ -92,7 +90,7 @@ def generate(
     resume: bool = False,
     test: bool = False,
 ) -> None:
-    """Make ``examples`` labelled examples of a scene in the directory ``output``.
+    """Make ``examples`` labelled examples of a scene in the folder ``output``, local or of an object storage.
 
     Args:
         scene: a built-in scene's name, a scene file, or a scene (which workers must be able to unpickle).
@@ -110,35 +108,38 @@ def generate(
     Raises:
         ValueError: a number out of its range, a seed of the wrong kind, ``resume`` with other settings.
         FileExistsError: ``output`` holds something and ``resume`` is not set.
-        OSError: the disk is full; complete shards are kept. ``ChildProcessError`` where a worker was killed.
+        OSError: the disk is full, or the storage refuses; complete shards are kept. ``ChildProcessError`` where a
+            worker was killed.
+        ImportError: the storage's library is missing.
     """
-    check_place(output, may_be_link=True)
+    if isinstance(output, Path):
+        check_place(output, may_be_link=True)
     _check_request(examples, seed, workers, shard, test)
     loaded = load_scene(scene) if isinstance(scene, str) else scene
     manifest = make_manifest(loaded, settings, examples, seed)
     check_space(output, examples, manifest["bytes"] // examples, shard[1])
     shards = [
-        _Shard(output / f"shard-{n:05d}.safetensors", n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
+        _Shard(shard_name(n), n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
         for n in range(shard[0], -(-examples // SHARD_SIZE), shard[1])
     ]
-    key = dataset_key(_claim(output, manifest, shards, resume, alone=shard[1] == 1))
-    if not _is_whole(output / TEMPLATE, lambda path: read_template(path, key, len(loaded.rest.segments))):
-        with atomic_file(output / TEMPLATE) as temporary:
-            temporary.write_bytes(pack_tensors({"distance": rest_distances(loaded.rest)}, {"dataset": key}))
+    contents = _claim(output, manifest, shards, resume, alone=shard[1] == 1)
+    key = dataset_key(contents.manifest)
+    if not contents.keeps(TEMPLATE):
+        contents.write(TEMPLATE, pack_tensors({"distance": rest_distances(loaded.rest)}, {"dataset": key}))
     # nothing is trained on a test set
-    if not test and not _is_whole(output / STATISTICAL_MODEL, lambda path: load_statistical_model(path, key)):
+    if not test and not contents.keeps(STATISTICAL_MODEL):
         states = states_for(examples)
         print(f"modes of {states} random states, for registration", flush=True)
-        save_statistical_model(scene_model(loaded, states, quiet=False), output / STATISTICAL_MODEL, key)
-    missing = [item for item in shards if not item.is_complete(key)]
+        contents.write(STATISTICAL_MODEL, statistical_model_bytes(scene_model(loaded, states, quiet=False), key))
+    missing = [item for item in shards if not contents.keeps(item.name)]
     total = sum(item.end - item.first for item in missing)
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile
     work = partial(_make_shard, _Work(loaded if is_yaml(scene) else scene, settings, seed, key))
     with closing(in_processes(work, missing, workers)) as made, progress("generate", total) as shown:
         for item, data in made:
-            with atomic_file(item.path) as temporary:
-                temporary.write_bytes(data)
+            contents.write(item.name, data)
             shown.advance(item.end - item.first)
+    contents.finish()
 
 
 def _check_request(examples: int, seed: int, workers: int, shard: tuple[int, int], test: bool) -> None:
@@ -199,20 +200,18 @@ def example_bytes(settings: GenerateConfig, segments: int) -> int:
     return per_point * settings.points + per_query * settings.sampling.total(segments) + once + seen
 
 
-def _claim(output: Path, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> dict[str, Any]:
-    """Create the directory with its manifest, or check that it is this very dataset; others may write shards there.
-
-    Returns the manifest that it holds.
-    """
-    before = claim_directory(output, MANIFEST, manifest, "a dataset")
+def _claim(output: Place, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> DatasetContents:
+    """Create the folder with its manifest, or check that it is this very dataset; others may write shards there."""
+    before = claim(output, MANIFEST, manifest, "a dataset")
     if before is not None:
-        if not resume and (alone or any(item.path.exists() for item in shards)):
+        there = names_in(output)
+        if not resume and (alone or any(item.name in there for item in shards)):
             raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
         _check_same(output, before, manifest)
-    return manifest if before is None else before
+    return DatasetContents.of(output, SHARD_SIZE)
 
 
-def _check_same(output: Path, before: dict[str, Any], manifest: dict[str, Any]) -> None:
+def _check_same(output: Place, before: dict[str, Any], manifest: dict[str, Any]) -> None:
     # a manifest of an older version may not state everything; settings it lacks were as their defaults are
     default = _flat({"settings": asdict(GenerateConfig()) | {"observations": []}})
     before = default | _flat(before)
@@ -231,18 +230,6 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         if key not in NOT_COMPARED:
             flat |= _flat(item, f"{prefix}{key}.") if isinstance(item, dict) else {prefix + key: item}
     return flat
-
-
-def _is_whole(path: Path, read: Callable[[Path], object]) -> bool:
-    """Whether a file is there and can be read; one that a crash cut off or that was changed since is reported."""
-    if not path.exists():
-        return False
-    try:
-        read(path)
-    except ValueError:
-        print(f"{path.name} is damaged and is made again", flush=True)
-        return False
-    return True
 
 
 # --- the work ---------------------------------------------------------------------------------------------------------

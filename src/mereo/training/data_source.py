@@ -8,9 +8,10 @@ from pathlib import Path
 import torch
 
 from mereo.io.free_memory import free_bytes
-from mereo.synthesis.dataset_files import dataset_key, read_manifest
+from mereo.io.places import Place
+from mereo.synthesis.dataset_files import dataset_key, list_shards, read_manifest, recorded_files
 from mereo.training.config import DataPlace, TrainConfig
-from mereo.training.dataset import Dataset, list_shards, read_part
+from mereo.training.dataset import Dataset, read_part
 from mereo.training.processes import Process, told
 from mereo.training.streaming import StreamingDataset
 
@@ -24,7 +25,7 @@ SETTINGS = "config.json"
 
 
 def open_data(
-    directory: Path, run_dir: Path, config: TrainConfig, device: torch.device, process: Process
+    directory: Place, run_dir: Path, config: TrainConfig, device: torch.device, process: Process
 ) -> tuple[TrainConfig, TrainingData]:
     """Recipe with the place of its examples decided, and the dataset; one that streams is yet to be surveyed.
 
@@ -36,7 +37,7 @@ def open_data(
     return config, data
 
 
-def choose_place(directory: Path, run_dir: Path, wish: DataPlace, device: torch.device) -> DataPlace:
+def choose_place(directory: Place, run_dir: Path, wish: DataPlace, device: torch.device) -> DataPlace:
     """Place of the examples of a training: as wished, as a run that is continued has it, or by the free memory.
 
     Raises as ``Dataset.load`` for a directory that holds no dataset.
@@ -62,13 +63,14 @@ def choose_place(directory: Path, run_dir: Path, wish: DataPlace, device: torch.
     return "stream"
 
 
-def needed_bytes(directory: Path) -> int:
+def needed_bytes(directory: Place) -> int:
     """Memory that all examples of a dataset take, by its first shard; 0 where it has none."""
     manifest = read_manifest(directory)
     shards = list_shards(directory)
     if not shards:
         return 0
-    first = read_part(shards[0], dataset_key(manifest), manifest.get("shard_size"))
+    recorded = recorded_files(manifest).get(shards[0].name)
+    first = read_part(shards[0], dataset_key(manifest), manifest.get("shard_size"), recorded)
     each = sum(tensor.nbytes for tensor in first.values()) / max(1, len(first["cloud"]))
     return int(each * manifest["examples"])
 

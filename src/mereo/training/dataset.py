@@ -6,7 +6,6 @@ Notation: e examples, b of them in a batch, p stored points, n points that the n
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +13,19 @@ import torch
 from jaxtyping import Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 
+from mereo.io.places import Place
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.scenes.statistical_model_file import load_statistical_model
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE
-from mereo.synthesis.dataset_files import OBSERVED, dataset_key, read_manifest, read_shard, read_template
+from mereo.synthesis.dataset_files import (
+    OBSERVED,
+    dataset_key,
+    list_shards,
+    read_manifest,
+    read_shard,
+    read_template,
+    recorded_files,
+)
 from mereo.training.batches import Batch, Draws, augment_batch, choose_points, draw_observations
 from mereo.training.config import AugmentConfig
 from mereo.training.orders import Order, ShuffledOrder
@@ -65,11 +73,13 @@ class Dataset:
         return len(self.cloud)
 
     @classmethod
-    def load(cls, directory: Path, device: torch.device | str = "cpu") -> "Dataset":
+    def load(cls, directory: Place, device: torch.device | str = "cpu") -> "Dataset":
         """Dataset of a directory; ``ValueError`` or ``FileNotFoundError`` when that is not a whole dataset."""
         manifest = read_manifest(directory)
-        key = dataset_key(manifest)
-        parts = [read_part(path, key, manifest.get("shard_size")) for path in list_shards(directory)]
+        key, recorded = dataset_key(manifest), recorded_files(manifest)
+        parts = [
+            read_part(path, key, manifest.get("shard_size"), recorded.get(path.name)) for path in list_shards(directory)
+        ]
         check_whole(directory, manifest, sum(len(part["cloud"]) for part in parts))
         observed = tuple(OBSERVED) if all(OBSERVED.keys() <= part.keys() for part in parts) else ()
         joined = {}
@@ -80,7 +90,7 @@ class Dataset:
             manifest=manifest,
             template=load_template(directory, key, manifest),
             visible_m=visible_m(joined["scale"].min(), joined["scale"].max(), manifest.get("unit_m")),
-            statistical_model=load_modes(directory, key),
+            statistical_model=load_modes(directory, key, manifest),
         )
 
     @property
@@ -169,20 +179,15 @@ class Dataset:
         return cloud, torch.where(further, self.seen_count[index, number], count)
 
 
-def list_shards(directory: Path) -> list[Path]:
-    """Shards of a dataset in the order of their examples."""
-    return sorted(directory.glob("shard-*.safetensors"))
-
-
-def read_part(path: Path, key: str, size: int | None) -> dict[str, Tensor]:
+def read_part(path: Place, key: str, size: int | None, recorded: str | None) -> dict[str, Tensor]:
     """Tensors of the shard that ``path`` names; ``size`` is the number of examples of a whole one, if known.
 
-    Raises ``ValueError`` where it is damaged or of another dataset.
+    ``recorded`` is its SHA-256 in the manifest, where it has one. Raises ``ValueError`` where it is damaged or another's.
     """
     number = path.stem.partition("-")[2]
     first = int(number) * size if size is not None and number.isdecimal() else None
     with _part_of_dataset(path):
-        return {name: torch.from_numpy(value) for name, value in read_shard(path, key, first).items()}
+        return {name: torch.from_numpy(value) for name, value in read_shard(path, key, first, None, recorded).items()}
 
 
 def as_fields(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -195,7 +200,7 @@ def as_fields(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return fields
 
 
-def check_whole(directory: Path, manifest: Mapping[str, Any], have: int) -> None:
+def check_whole(directory: Place, manifest: Mapping[str, Any], have: int) -> None:
     """Raise ``ValueError`` where a dataset has another number of examples than it should."""
     if have != manifest["examples"]:
         raise ValueError(
@@ -230,23 +235,23 @@ def visible_m(least: float | Tensor, most: float | Tensor, unit_m: float | None)
     return None if unit_m is None else (2 * unit_m / float(most), 2 * unit_m / float(least))
 
 
-def load_modes(directory: Path, key: str) -> StatisticalModel | None:
+def load_modes(directory: Place, key: str, manifest: Mapping[str, Any]) -> StatisticalModel | None:
     """Statistical model of a dataset's object; None in older datasets."""
-    path = directory / STATISTICAL_MODEL
-    return load_statistical_model(path, key) if path.exists() else None
+    path, recorded = directory / STATISTICAL_MODEL, recorded_files(manifest).get(STATISTICAL_MODEL)
+    return load_statistical_model(path, key, recorded) if path.exists() else None
 
 
-def load_template(directory: Path, key: str, manifest: Mapping[str, Any]) -> Tensor | None:
+def load_template(directory: Place, key: str, manifest: Mapping[str, Any]) -> Tensor | None:
     """Template of a dataset; None in older ones, ``ValueError`` where it is damaged."""
-    path = directory / TEMPLATE
+    path, recorded = directory / TEMPLATE, recorded_files(manifest).get(TEMPLATE)
     if not path.is_file():
         return None
     with _part_of_dataset(path):
-        return torch.from_numpy(read_template(path, key, len(manifest["segments"]))).float()
+        return torch.from_numpy(read_template(path, key, len(manifest["segments"]), recorded)).float()
 
 
 @contextmanager
-def _part_of_dataset(path: Path) -> Iterator[None]:
+def _part_of_dataset(path: Place) -> Iterator[None]:
     try:
         yield
     except ValueError as error:

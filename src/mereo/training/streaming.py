@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float, Float32, Int, Int64, UInt8
 from torch import Tensor
 
+from mereo.io.places import Place
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis.dataset_files import dataset_key, read_manifest
+from mereo.synthesis.dataset_files import dataset_key, list_shards, read_manifest
 from mereo.training.batches import Batch, Draws
 from mereo.training.config import AugmentConfig
 from mereo.training.dataset import (
@@ -24,7 +25,6 @@ from mereo.training.dataset import (
     as_fields,
     check_whole,
     count_uniform,
-    list_shards,
     load_modes,
     load_template,
     read_part,
@@ -64,7 +64,7 @@ class StreamingDataset:
         recent: latest shards that were asked for by their examples.
     """
 
-    directory: Path
+    directory: Place
     names: tuple[str, ...]
     key: str
     device: torch.device
@@ -82,7 +82,7 @@ class StreamingDataset:
         return count
 
     @classmethod
-    def open(cls, directory: Path, device: torch.device | str = "cpu") -> "StreamingDataset":
+    def open(cls, directory: Place, device: torch.device | str = "cpu") -> "StreamingDataset":
         """Dataset of a directory, of which one shard is read; raises as ``Dataset.load`` does for what that shows."""
         manifest = read_manifest(directory)
         key, size = dataset_key(manifest), manifest.get("shard_size")
@@ -90,7 +90,7 @@ class StreamingDataset:
         whole = -(-manifest["examples"] // size) if size else len(names)
         if len(names) < max(whole, 1):
             check_whole(directory, manifest, min(len(names) * (size or 0), manifest["examples"] - 1))
-        first = read_part(directory / names[0], key, size)
+        first = read_part(directory / names[0], key, size, manifest.get("files", {}).get(names[0]))
         return cls(
             directory=directory,
             names=names,
@@ -101,7 +101,7 @@ class StreamingDataset:
             queries=first["positions"].shape[1],
             further=first["seen"].shape[1] if "seen" in first else 0,
             template=load_template(directory, key, manifest),
-            statistical_model=load_modes(directory, key),
+            statistical_model=load_modes(directory, key, manifest),
         )
 
     @property
@@ -140,8 +140,9 @@ class StreamingDataset:
 
     def read(self, number: int) -> Fields:
         """Tensors of a shard; ``ValueError`` where it is damaged or does not fit the first one."""
-        path = self.directory / self.names[number]
-        tensors = read_part(path, self.key, self.manifest.get("shard_size"))
+        name = self.names[number]
+        path, recorded = self.directory / name, self.manifest.get("files", {}).get(name)
+        tensors = read_part(path, self.key, self.manifest.get("shard_size"), recorded)
         further = tensors["seen"].shape[1] if "seen" in tensors else 0
         shape = tensors["cloud"].shape[1], tensors["positions"].shape[1], further
         if shape != (self.points, self.queries, self.further):

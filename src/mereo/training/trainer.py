@@ -16,6 +16,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from mereo.io.places import Place
 from mereo.io.scratch_folders import check_place
 from mereo.models.config import Device
 from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
@@ -41,7 +42,7 @@ from mereo.training.validation import choose_offsets, held_out, validate
 
 
 def train(
-    dataset_dir: Path,
+    dataset_dir: Place,
     run_dir: Path,
     config: TrainConfig,
     *,

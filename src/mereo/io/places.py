@@ -1,0 +1,86 @@
+"""Places of datasets: local folders, or folders of an object storage, and the files in them, whole or not at all."""
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+from urllib.request import url2pathname
+
+from mereo.io.atomic_files import atomic_file, json_text
+from mereo.io.object_storage import URL, ObjectPath
+from mereo.io.output_folders import claim_directory, read_settings
+
+Place = Path | ObjectPath
+
+
+def place_of(given: str | Path | ObjectPath) -> Place:
+    """Place that a text means: with a protocol a folder of a storage, without one, or with file://, a local one.
+
+    Raises ``ValueError`` for a URL that is none.
+    """
+    if not isinstance(given, str):
+        return given
+    found = URL.fullmatch(given)
+    if found is None:
+        return Path(given)
+    if found["protocol"].lower() == "file":
+        parts = urlsplit(given)
+        if parts.netloc not in ("", "localhost"):
+            raise ValueError(
+                f"{given} names another machine; a file URL has three slashes: write file:///absolute/folder"
+            )
+        return Path(url2pathname(parts.path) if os.name == "nt" else unquote(parts.path))
+    return ObjectPath(given)
+
+
+def names_in(folder: Place) -> list[str]:
+    """Names of what lies in a folder, sorted, but for hidden files; none where it does not exist.
+
+    Raises as the file system or the storage does.
+    """
+    if isinstance(folder, ObjectPath):
+        return folder.names()
+    return sorted(file.name for file in folder.iterdir() if not file.name.startswith(".")) if folder.is_dir() else []
+
+
+def write_whole(place: Place, content: bytes) -> str:
+    """Write a file, whole or not at all, also where the machine loses its power; its SHA-256 is returned.
+
+    Raises as ``atomic_file`` does, or ``StorageError``.
+    """
+    if isinstance(place, ObjectPath):
+        place.write_bytes(content)
+    else:
+        with atomic_file(place) as partial:
+            partial.write_bytes(content)
+            with partial.open("rb+") as file:
+                os.fsync(file.fileno())  # NFS tells of a full disk here, and a name comes after its content
+    return sha256(content)
+
+
+def sha256(content: bytes) -> str:
+    """Digest of a file, as ``sha256sum`` prints it."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
+    """Settings that a place of earlier work holds, or None where it was made with ``settings`` just now.
+
+    As ``claim_directory``, for local folders and for those of a storage, where of several that come at a time one puts
+    its file and the others find that.
+    """
+    if isinstance(folder, Path):
+        return claim_directory(folder, name, settings, kind)
+    path, there = folder / name, folder.names()
+    if name in there:
+        return read_settings(path)
+    if any(not file.startswith(".") for file in there):
+        raise FileExistsError(f"{folder} is not empty and holds no {name}; choose another --output")
+    content = json_text(settings).encode()
+    try:
+        path.write_new(content)
+    except FileExistsError:  # another process came first
+        return read_settings(path)
+    found = read_settings(path)  # a storage without conditional puts took both, and keeps the last
+    return None if json_text(found).encode() == content else found

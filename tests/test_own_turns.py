@@ -1,0 +1,191 @@
+"""Turns of a segment that its shape does not show: found where states make them, and ruled out by what is seen."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtr, ndtri
+from shapes import box
+from test_fitting_theorems import IN_FRONT, said, seen
+
+from mereo.deformation.draw_names import named
+from mereo.deformation.maps import Deformation
+from mereo.fitting.config import MANY_DRAWS
+from mereo.fitting.draws_fit import descend, jump, likely_to_jump
+from mereo.fitting.draws_problem import DrawsProblem, played
+from mereo.fitting.fit import ModesFit
+from mereo.fitting.gauss_newton import Posed
+from mereo.fitting.own_turns import ANGLES, left_open, own_turns
+from mereo.fitting.playback import Drawn, DrawnStates, material_moved
+from mereo.fitting.posterior import Posterior, covariance_factor
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.transforms import transform_points
+from mereo.scenes.random_states import scene_model
+from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.statistical_model import StatisticalModel
+
+
+@dataclass(frozen=True, eq=False)
+class Spun:
+    """Turned about z and leant about x, around the wheel's middle."""
+
+    spin: float
+    lean: float
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        middle = np.array([0.0, 0.0, 8.0])
+        return Rotation.from_euler("zx", [self.spin, self.lean]).apply(points - middle) + middle
+
+
+@dataclass(frozen=True, eq=False)
+class Slid:
+    """Moved along x."""
+
+    way: float
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        return points + np.array([self.way, 0.0, 0.0])
+
+
+def free(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    """The wheel spins, whatever else."""
+    spin, lean, way = (named(rng, name).uniform(-1, 1) for name in ("spin", "lean", "way"))
+    return Slid(0.5 * way), Spun(np.pi * spin, 0.05 * lean)
+
+
+def coupled(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    """The wheel spins only as it leans."""
+    spin = named(rng, "spin").uniform(-1, 1)
+    return Slid(0.0), Spun(np.pi * spin, 2.5 * spin)
+
+
+def held(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    return Slid(0.0), Spun(0.0, 0.1 * named(rng, "lean").uniform(-1, 1))
+
+
+def rest_mesh(sides: int, peg: float) -> SegmentedMesh:
+    """A block, and on it a wheel of so many sides; one of its corners is longer by ``peg``."""
+    wheel = trimesh.creation.cylinder(radius=6.0, height=5.0, sections=sides).subdivide().subdivide()
+    vertices = np.asarray(wheel.vertices)
+    corner = np.array([6.0, 0.0])
+    near = np.exp(-((np.linalg.norm(vertices[:, :2] - corner, axis=1) / 1.5) ** 2))
+    vertices = vertices + peg * near[:, None] * np.array([1.0, 0.0, 0.0]) + np.array([0.0, 0.0, 8.0])
+    segment = Segment("wheel", (200, 60, 60), vertices, np.asarray(wheel.faces, dtype=np.int32))
+    block = box((-9, -7, -5), (8, 6, 5), "block", 0)
+    corners = block.vertices * np.where((block.vertices[:, :2] > 0).all(axis=1), 1.5, 1.0)[:, None]
+    return SegmentedMesh((replace(block, vertices=corners), segment))
+
+
+@cache
+def model_of(move: object, sides: int = 36, peg: float = 0.0) -> StatisticalModel:
+    scene = Scene("wheel", rest_mesh(sides, peg), move, Workspace())  # type: ignore[arg-type]
+    return scene_model(scene, count=80)
+
+
+def test_a_smooth_wheel_that_spins_may_be_turned_anyhow() -> None:
+    (turn,) = own_turns(model_of(free))
+    assert turn.label == 2 and len(turn.angles) == len(ANGLES)
+    assert abs(turn.axis[2]) > 0.999 and turn.plausible.min() > 0.5
+
+
+def test_of_a_wheel_of_six_sides_only_sixths_look_alike() -> None:
+    (turn,) = own_turns(model_of(free, sides=6))
+    degrees = np.rad2deg(turn.angles).round()
+    assert np.isin([60, 120, 180, 240, 300], degrees).all() and not np.isin([30, 90, 150, 210, 270, 330], degrees).any()
+
+
+def test_an_object_without_states_is_at_rest() -> None:
+    model = model_of(free)
+    assert own_turns(model.around(model.mean, np.zeros((len(model.mean), 3, 0), dtype=np.float32))) == ()
+
+
+def test_turns_that_no_state_makes_by_themselves_do_not_count() -> None:
+    assert own_turns(model_of(held)) == ()
+    for turn in own_turns(model_of(coupled)):  # it may stand on its head
+        assert abs(turn.axis[2]) < 0.01
+
+
+def test_a_wheel_with_a_long_peg_is_not_like_itself() -> None:
+    assert own_turns(model_of(free, peg=6.0)) == ()
+
+
+def test_what_is_left_open_has_the_second_moments_of_the_turns() -> None:
+    """Where nothing of the wheel is seen, every turn counts by how often states make it; the block stays."""
+    model = model_of(free, sides=6)
+    material = transform_points(IN_FRONT, model.rest_points)
+    block = material[model.rest_points[:, 2] < 0.0]
+    motion = left_open(model, material, block, 0.2, 1500.0).astype(np.float64)
+    (turn,) = own_turns(model)
+    weight, squared = np.append(turn.plausible, 1.0), np.zeros(len(material))
+    wheel = model.labels == 2
+    for angle, share in zip(turn.angles, weight / weight.sum(), strict=False):
+        moved = Rotation.from_rotvec(angle * turn.axis).apply(model.rest_points[wheel] - turn.center) + turn.center
+        squared[wheel] += share * ((moved - model.rest_points[wheel]) ** 2).sum(axis=1)
+    np.testing.assert_allclose((motion**2).sum(axis=(1, 2)), squared, rtol=1e-4, atol=1e-8)
+
+
+def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
+    """One so small that the shapes are alike; where it is hidden, some turns stay open."""
+    model = model_of(free, sides=6, peg=0.6)
+    assert len(own_turns(model)) == 1
+    material = transform_points(IN_FRONT, model.rest_points)
+    vertices = material[: sum(model.vertex_counts)][model.labels[: sum(model.vertex_counts)] == 2]
+    rest = model.rest_points[: sum(model.vertex_counts)][model.labels[: sum(model.vertex_counts)] == 2]
+    on_peg = rest[:, 0] > 6.1
+    assert on_peg.sum() > 3
+    shown, hidden = (left_open(model, material, vertices[rows], 0.2, 1500.0) for rows in (on_peg, rest[:, 0] < 0.0))
+    farthest = [np.sqrt((motion**2).sum(axis=(1, 2))).max() for motion in (shown, hidden)]
+    assert farthest[0] < 0.1 and farthest[1] > 2.0
+
+
+def test_radii_hold_what_is_left_open() -> None:
+    """Beside what the Gaussian says, and for points that follow the material points too."""
+    model = model_of(free, sides=6)
+    material = transform_points(IN_FRONT, model.rest_points)
+    turns = left_open(model, material, material[model.rest_points[:, 2] < 0.0], 0.2, 1500.0)
+    posed = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.zeros(model.count))
+    factor = 1e-3 * np.eye(7 + model.count)
+    without = Posterior(posed, material, model.modes, factor)
+    radii = replace(without, turns=turns).radii()
+    wheel = model.labels == 2
+    np.testing.assert_allclose(radii[~wheel], without.radii()[~wheel])
+    rim = wheel & (np.linalg.norm(model.rest_points[:, :2], axis=1) > 5.5)
+    assert radii[rim].min() > 8.0 and radii[rim].max() < 20.0
+    follow = model.weights(model.rest_points[:5], model.labels[:5])
+    np.testing.assert_allclose(replace(without, turns=turns).radii(follow), radii[:5], rtol=0.2)
+
+
+def test_a_covariance_that_rounding_has_spoilt_is_as_unsure_as_rounding_tells() -> None:
+    """Single precision may leave a sum of squares a little below zero, as of a unit that nobody knows."""
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    precision = axes @ np.diag([10.0, 5.0, 3.0, 2.0, 1.0, -1e-7]) @ axes.T
+    covariance = covariance_factor(precision) @ covariance_factor(precision).T
+    assert np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[-1] > 1e4
+
+
+def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
+    """A wheel of six sides, found a sixth round: the one draw that turns it brings it to its peg again."""
+    model, scene = model_of(free, 6, 1.2), Scene("wheel", rest_mesh(6, 1.2), free, Workspace())
+    states = DrawnStates.of(scene, model, 30, 1000)
+    drawn = Drawn.of(scene, 1006)
+    truth = drawn.z.copy()
+    deformations = drawn.deformations(scene, truth)
+    assert deformations is not None
+    material = transform_points(IN_FRONT, material_moved(scene, model, deformations))
+    fitted = ModesFit.of(seen(model.mesh(material)), said(model, material), model, 1.0)
+    config = replace(MANY_DRAWS, explained=0.01)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.found, config)
+    wrong = truth.copy()
+    wrong[0] = ndtri((ndtr(truth[0]) + 1 / 6) % 1.0)
+    pose = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.empty(0))
+    start = played(problem, drawn, wrong, pose)
+    assert start is not None
+    start = descend(problem, start, 1)
+    np.testing.assert_array_equal(likely_to_jump(problem, start), [0])
+    found = jump(problem, start)
+    assert abs(ndtr(start.z[0]) - ndtr(truth[0])) > 0.1 and abs(ndtr(found.z[0]) - ndtr(truth[0])) < 0.01
+    assert found.misfit < start.misfit
+    assert jump(replace(problem, config=replace(config, jumps=0)), start) is start

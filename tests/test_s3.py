@@ -1,0 +1,201 @@
+"""Datasets in S3, as a server on this machine speaks it: the same bytes as on a disk, claims, and what can go wrong."""
+
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import count
+from pathlib import Path
+
+import pytest
+from toy_data import make_small_datasets
+from toy_scene import toy_scene
+
+from mereo.__main__ import main
+from mereo.io.object_storage import ObjectPath, StorageError
+from mereo.io.places import claim, names_in, write_whole
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.shards import generate
+from mereo.training.dataset import Dataset
+
+s3fs = pytest.importorskip("s3fs")
+moto_server = pytest.importorskip("moto.server")
+
+SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
+TOY = toy_scene()
+NUMBERS = count()
+
+
+@pytest.fixture(autouse=True)
+def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_small_datasets(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    """Address of a server with a bucket."""
+    server = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    yield f"http://127.0.0.1:{server.get_host_and_port()[1]}"
+    server.stop()
+
+
+@pytest.fixture(autouse=True)
+def environment(endpoint: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """What a user sets; nothing of this machine's user is read."""
+    for name in [name for name in os.environ if name.startswith("AWS_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "testing-id")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "testing-secret")
+    for name in ("AWS_CONFIG_FILE", "AWS_SHARED_CREDENTIALS_FILE"):
+        monkeypatch.setenv(name, str(tmp_path / "none"))
+    s3fs.S3FileSystem.clear_instance_cache()
+    yield
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture
+def folder() -> ObjectPath:
+    system = s3fs.S3FileSystem()
+    if not system.exists("bucket"):
+        system.mkdir("bucket")
+    return ObjectPath(f"s3://bucket/sets/{next(NUMBERS)}")
+
+
+def contents(folder: Path | ObjectPath) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in names_in(folder)}
+
+
+def test_made_shared_damaged_continued_and_read(
+    folder: ObjectPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    generate(TOY, tmp_path / "data", SMALL, examples=4, seed=3)
+    whole = contents(tmp_path / "data")
+    for part in (1, 0):
+        generate(TOY, folder, SMALL, examples=4, seed=3, shard=(part, 2))
+    assert contents(folder) == whole
+    assert main(["dataset", "check", str(folder)]) == 0
+    write_whole(folder / "shard-00001.safetensors", whole["shard-00000.safetensors"])
+    with pytest.raises(ValueError, match=r"s3://bucket/.*/shard-00001.safetensors cannot be read \(it begins with exa"):
+        Dataset.load(folder)
+    assert main(["dataset", "check", str(folder)]) == 2
+    assert "shard-00001.safetensors: it begins with example 0 instead of 2" in capsys.readouterr().out
+    with pytest.raises(FileExistsError, match="holds a dataset; continue it with --resume"):
+        generate(TOY, folder, SMALL, examples=4, seed=3)
+    generate(TOY, folder, SMALL, examples=4, seed=3, resume=True)
+    assert contents(folder) == whole
+    assert (Dataset.load(folder).positions == Dataset.load(tmp_path / "data").positions).all()
+
+
+def test_one_of_two_machines_claims_a_folder(folder: ObjectPath) -> None:
+    """The server decides, not our look at the folder before."""
+    assert not (folder / "manifest.json").exists()
+    (folder / "manifest.json").write_new(b'{"a": 1}')
+    with pytest.raises(FileExistsError, match="manifest.json exists; it is not overwritten"):
+        (folder / "manifest.json").write_new(b'{"a": 2}')
+    assert claim(folder, "manifest.json", {"a": 2}, "a dataset") == {"a": 1}
+    with pytest.raises(FileExistsError, match="is not empty and holds no other.json"):
+        claim(folder, "other.json", {}, "a dataset")
+
+
+def test_machines_that_start_at_once_make_one_dataset(folder: ObjectPath) -> None:
+    found: list[object] = []
+    begun = threading.Barrier(4)
+
+    def start(number: int) -> None:
+        begun.wait()
+        found.append(claim(folder, "manifest.json", {"number": number}, "a dataset"))
+
+    threads = [threading.Thread(target=start, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    there = json.loads((folder / "manifest.json").read_bytes())
+    assert found.count(None) == 1 and all(item in (None, there) for item in found)
+
+
+def test_a_put_that_breaks_off_leaves_what_was_there(folder: ObjectPath, endpoint: str) -> None:
+    """The real server is sent the first half of a put and no more, as by a process that is killed in it."""
+    write_whole(folder / "a", b"before")
+    host, port = endpoint.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port))) as line:
+        head = (
+            f"PUT /bucket/{folder.url.partition('bucket/')[2]}/a HTTP/1.1\r\nHost: {host}\r\nContent-Length: 100000\r\n"
+        )
+        line.sendall(f"{head}Authorization: AWS4-HMAC-SHA256 Credential=x\r\n\r\n".encode() + b"x" * 50_000)
+    time.sleep(0.2)
+    assert (folder / "a").read_bytes() == b"before"
+
+
+@pytest.mark.parametrize(
+    "change, text, sentence",
+    [
+        ({}, "dataset check s3://nobucket/x", "there is no bucket 'nobucket'; make it, or correct the URL"),
+        ({}, "generate rope --examples 1 --output s3://nobucket/x", "there is no bucket 'nobucket'"),
+        ({"AWS_ACCESS_KEY_ID": None}, "dataset check s3://bucket/x", "no credentials were found"),
+        (
+            {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"},
+            "dataset show s3://bucket/x",
+            "the storage cannot be reached",
+        ),
+        ({"AWS_PROFILE": "none"}, "dataset check s3://bucket/x", "(The config profile (none) could not be found)"),
+        ({}, "dataset check s3://bucket/nothing", "s3://bucket/nothing has no manifest.json; a dataset is"),
+    ],
+)
+def test_what_goes_wrong_is_one_sentence_soon_and_without_credentials(
+    folder: ObjectPath,
+    change: dict[str, str | None],
+    text: str,
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, value in change.items():
+        monkeypatch.delenv(name) if value is None else monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()
+    begun = time.monotonic()
+    assert main(text.split()) == 2
+    assert time.monotonic() - begun < 30  # 1 s; a busy machine is no fault
+    said = capsys.readouterr()
+    assert said.err.startswith("mereo: error: s3://") and sentence in said.err and said.err.count("\n") == 1
+    assert "testing-" not in said.err + said.out
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_refusal_is_no_missing_file(folder: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A listing or a look that is refused must not pass for an empty folder."""
+
+    class Refusing(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            body = b"<Error><Code>AccessDenied</Code><Message>Access Denied</Message></Error>"
+            self.send_response(403)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            if self.command == "GET":
+                self.wfile.write(body)
+
+        do_HEAD = do_GET
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Refusing)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+        s3fs.S3FileSystem.clear_instance_cache()
+        for look in (folder.names, folder.exists, folder.read_bytes):
+            with pytest.raises(StorageError, match="the storage refuses the credentials that it was given"):
+                look()
+    finally:
+        server.shutdown()
+        server.server_close()
