@@ -182,7 +182,7 @@ class Dataset:
 def read_part(path: Place, key: str, size: int | None, recorded: str | None) -> dict[str, Tensor]:
     """Tensors of the shard that ``path`` names; ``size`` is the number of examples of a whole one, if known.
 
-    ``recorded`` is its SHA-256 in the manifest, where it has one. Raises ``ValueError`` where it is damaged or another's.
+    ``recorded`` is its SHA-256 in the manifest if it has one. Raises ``ValueError`` where it is damaged, or another's.
     """
     number = path.stem.partition("-")[2]
     first = int(number) * size if size is not None and number.isdecimal() else None

@@ -120,7 +120,7 @@ class Trainer:
         adapt_momentum(self.network, config.accumulate)
         self.module: nn.Module = share_statistics(self.network, process, device)
         if process.world > 1:
-            self.module = nn.parallel.DistributedDataParallel(self.network, broadcast_buffers=False)
+            self.module = nn.parallel.DistributedDataParallel(self.network)
         if config.compile == "on" or (config.compile == "auto" and compiling_pays(device, self.total)):
             self.module = torch.compile(self.module)  # type: ignore[assignment]
         constant = ConstantAnswer.of(*data.first_queries(EXAMPLES), config.supervision.labels)
