@@ -34,8 +34,9 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
+from mereo.training.batches import Batch, Draws, choose_points
 from mereo.training.config import AugmentConfig
-from mereo.training.dataset import Batch, Dataset, choose_points
+from mereo.training.dataset import Dataset
 
 NEAR_CELLS = 1.2
 HELD_OUT = 64
@@ -87,7 +88,7 @@ def rest_errors(model: Model, data: Dataset) -> dict[str, list[float]]:
     network = model.network
     errors: dict[str, list[float]] = {"best rigid motion": [], "alignment": [], "template": []}
     for index in torch.arange(len(data) - HELD_OUT, len(data)).split(8):
-        batch = data.batch(index, network.config.points, 0, AugmentConfig(), torch.Generator())
+        batch = data.batch(index, network.config.points, 0, AugmentConfig(), Draws.of(0))
         code = network.encode(batch.cloud, batch.viewpoint)
         prediction = network.query(code, batch.positions)
         assert code.alignment is not None and prediction.rest is not None, "needs weights with alignment and template"
@@ -111,9 +112,9 @@ def query_scores(model: Model, data: Dataset) -> dict[str, Scores]:
         return network.query(code, batch.positions).logits.softmax(dim=-1)
 
     def averaged(index: Int[Tensor, " b"], batch: Batch) -> Float[Tensor, "b q c"]:
-        rng = torch.Generator().manual_seed(0)
+        draws = Draws.of(0)
         clouds = [
-            choose_points(data.cloud[index], data.count[index], network.config.points, FEWER, rng)
+            choose_points(data.cloud[index], data.count[index], network.config.points, FEWER, draws)
             for _ in range(CLOUDS)
         ]
         return torch.stack([answer(replace(batch, cloud=cloud)) for cloud in clouds]).mean(dim=0)
@@ -128,7 +129,7 @@ def query_scores(model: Model, data: Dataset) -> dict[str, Scores]:
     for name, (examples, way) in ways.items():
         total = np.zeros((classes, classes), dtype=np.int64)
         for index in examples.split(8):
-            batch = data.batch(index, network.config.points, 0, AugmentConfig(), torch.Generator())
+            batch = data.batch(index, network.config.points, 0, AugmentConfig(), Draws.of(0))
             guess = way(index, batch).argmax(dim=-1)
             total += confusion_matrix(batch.labels.numpy(), guess.numpy(), classes)
         found[name] = intersection_over_union(total)

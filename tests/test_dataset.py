@@ -7,8 +7,9 @@ import pytest
 import torch
 from toy_data import write_toy_dataset
 
+from mereo.training.batches import Draws, augment_batch, choose_points
 from mereo.training.config import AugmentConfig
-from mereo.training.dataset import Dataset, augment_batch, choose_points
+from mereo.training.dataset import Dataset
 
 NONE = AugmentConfig()
 FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.01, roll=True)
@@ -30,8 +31,8 @@ def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> 
     assert visible_m == (pytest.approx(0.1, rel=0.1), pytest.approx(0.2, rel=0.1))
 
 
-def rng(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
+def rng(seed: int = 0) -> Draws:
+    return Draws.of(seed)
 
 
 def test_without_augmentation_a_batch_is_the_stored_data(data: Dataset) -> None:

@@ -17,6 +17,7 @@ from training_runs import assert_resumes_exactly, train_in_two_processes
 from mereo.models.weights import load_model
 from mereo.training import trainer
 from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
+from mereo.training.dataset import Dataset
 from mereo.training.examples_seen import seen_before, seen_by, seen_in_training, told
 from mereo.training.run_directory import claim_run, start_network
 
@@ -113,11 +114,11 @@ def test_class_offsets_are_in_the_last_bias_and_nowhere_else(finished: Path) -> 
 
 
 def test_batches_visit_every_example_once_per_pass(dataset: Path, tmp_path: Path) -> None:
-    data = trainer.Dataset.load(dataset)
+    data = Dataset.load(dataset)
     config = replace(SMALL, holdout=4, epochs=4)
     network = start_network(config, data)
     loop = trainer.Trainer(config, data, network, tmp_path, trainer.Process(), torch.device("cpu"))
-    seen = torch.cat([loop._batch_index(step) for step in range(loop.total)])
+    seen = torch.cat([loop.order.index(step) for step in range(loop.total)])
     assert loop.total * 8 == 4 * 60
     assert torch.equal(seen.bincount(), torch.full((60,), 4))
 
@@ -159,7 +160,7 @@ def test_bfloat16_trains(dataset: Path, tmp_path: Path) -> None:
 
 def test_training_starts_from_given_weights(dataset: Path, first: Path, tmp_path: Path) -> None:
     """Without any step, the network is that of the weights; other networks are refused."""
-    data, config = trainer.Dataset.load(dataset), replace(SMALL, init=str(first))
+    data, config = Dataset.load(dataset), replace(SMALL, init=str(first))
     network = start_network(config, data)
     assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
     other_counts = config.network.changed(points=48, neighbors=6)  # the same weights fit
@@ -177,7 +178,7 @@ def test_training_starts_from_given_weights(dataset: Path, first: Path, tmp_path
 
 def test_training_starts_from_another_objects_weights(dataset: Path, first: Path) -> None:
     """All that is not about segments is taken; segments and template are new."""
-    data = trainer.Dataset.load(dataset)
+    data = Dataset.load(dataset)
     manifest = data.manifest | {"segments": [{"name": "whole", "color": [1, 2, 3]}]}
     data = replace(data, manifest=manifest, template=torch.rand(1, 64, 64, 64))
     given = load_file(first)
@@ -196,7 +197,7 @@ def test_a_lookup_may_be_added_to_given_weights(dataset: Path, tmp_path: Path) -
     """Its grid is the dataset's; all else is that of the weights."""
     plain = replace(SMALL, network=SMALL.network.changed(rest_template=False))
     first = trainer.train(dataset, tmp_path / "first", replace(plain, epochs=0.2))
-    data = trainer.Dataset.load(dataset)
+    data = Dataset.load(dataset)
     network = start_network(replace(SMALL, init=str(first)), data)
     state = network.state_dict()
     assert all(torch.equal(state[k], v) for k, v in load_file(first).items())
@@ -230,7 +231,7 @@ def test_only_the_first_process_claims_the_directory(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A process that comes while the first one writes the settings waits instead of refusing the directory."""
-    data, waited = trainer.Dataset.load(dataset), []
+    data, waited = Dataset.load(dataset), []
     monkeypatch.setattr(torch.distributed, "get_backend", lambda: "gloo")
     monkeypatch.setattr(torch.distributed, "broadcast", lambda failed, src: waited.append(src))
     run = tmp_path / "run"
@@ -243,7 +244,7 @@ def test_only_the_first_process_claims_the_directory(
 
 
 def test_batch_must_be_divisible(dataset: Path, tmp_path: Path) -> None:
-    data = trainer.Dataset.load(dataset)
+    data = Dataset.load(dataset)
     with pytest.raises(ValueError, match="batch of 8 cannot be shared by 3 processes"):
         claim_run(tmp_path / "run", SMALL, data, trainer.Process(0, 3))
 

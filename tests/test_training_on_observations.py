@@ -15,8 +15,9 @@ from training_runs import assert_resumes_exactly
 
 from mereo.models.weights import load_model
 from mereo.training import trainer
+from mereo.training.batches import Batch, Draws, draw_observations
 from mereo.training.config import PRESETS, AugmentConfig
-from mereo.training.dataset import Batch, Dataset, draw_observations
+from mereo.training.dataset import Dataset
 from mereo.training.metrics_log import FIELDS, SENSOR_FIELDS
 from mereo.training.model_card import card
 from mereo.training.run_directory import fit_config
@@ -50,8 +51,8 @@ def data(folders: tuple[Path, Path]) -> tuple[Dataset, Dataset]:
     return Dataset.load(folders[0]), Dataset.load(folders[1])
 
 
-def rng(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
+def rng(seed: int = 0) -> Draws:
+    return Draws.of(seed)
 
 
 def batch(data: Dataset, probability: float, observation: torch.Tensor | None = None, seed: int = 0) -> Batch:

@@ -1,15 +1,17 @@
 """Checkpoints of a training run as safetensors: network, averaged network, optimizer and step. No pickles."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from mereo.io.atomic_files import atomic_file
 from mereo.io.errors import reason
+from mereo.training.processes import Process, told
 
 NAME = "checkpoint.safetensors"
 
@@ -35,15 +37,18 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> None:
         partial.write_bytes(save(tensors, metadata={"step": str(checkpoint.step)}))
 
 
-def load_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> int | None:
-    """Fill network, average and optimizer; returns the step, or None when there is no checkpoint yet."""
+def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, process: Process | None = None) -> int | None:
+    """Fill network, average and optimizer; returns the step, or None when there is no checkpoint yet.
+
+    Process 0 reads the file and sends it to the others: machines that share a folder may see an older file for a while.
+    """
     path = run_dir / NAME
-    if not path.is_file():
+    content = told(process or Process(), lambda: path.read_bytes() if path.is_file() else None)
+    if content is None:
         return None
     try:
-        with safe_open(path, framework="pt") as file:
-            step = int((file.metadata() or {})["step"])
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
+        tensors = load(content)
+        step = int(json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]["step"])
         _fill(checkpoint, tensors)
     except (SafetensorError, OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise ValueError(f"{path} cannot be read ({reason(error)}); delete it to train from the start") from None

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 from mereo.io.bounds import (
     Batch,
     BelowOne,
+    Count,
     CountOrNone,
     NotNegative,
     Positive,
@@ -53,6 +54,10 @@ class AugmentConfig:
             )
 
 
+DataPlace = Literal["auto", "memory", "stream"]
+"""Where examples are while a network learns from them."""
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """Settings of a training, its recipe; defaults are the paper's.
@@ -64,6 +69,10 @@ class TrainConfig:
         loss: which terms: cross-entropy, L1 on the distance, cosine on the direction.
         l1_weight: the paper's lambda.
         batch: examples per step, over all processes together.
+        accumulate: parts in which each process takes its share of a batch, one after another, for batches that do not
+            fit into memory at once; only batch normalization sees the parts (docs/clusters.md).
+        data: hold all examples in memory, or read their shards while learning; auto streams what would take more than
+            half of the memory that is free. Both learn from the same examples, in another order.
         queries: query points per example and step, a random subset; 0 means all of them.
         epochs: passes over the dataset.
         learning_rate: peak rate.
@@ -90,6 +99,8 @@ class TrainConfig:
     loss: Loss = "ce+l1"
     l1_weight: NotNegative = 100.0
     batch: Batch = 40
+    accumulate: Count = 1
+    data: DataPlace = "auto"
     queries: CountOrNone = 0
     epochs: Positive = 300.0
     learning_rate: Positive = 5e-4
@@ -110,10 +121,14 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        if self.batch * self.queries == 1:
+        if self.batch % self.accumulate:
             raise ValueError(
-                "batch and queries are both 1; batch normalization needs several values at a time: give more of either"
+                f"accumulate is {self.accumulate} and batch {self.batch}; a batch is learnt in equal parts: give a "
+                "number that divides it"
             )
+        if self.batch * self.queries == self.accumulate:
+            one = "batch and queries are both 1" if self.accumulate == 1 else "a part of a batch has one query"
+            raise ValueError(f"{one}; batch normalization needs several values at a time: give more of either")
 
     @property
     def supervision(self) -> Supervision:
@@ -121,13 +136,17 @@ class TrainConfig:
         return Supervision.of(self.loss)
 
     def to_dict(self) -> dict[str, Any]:
-        """All settings as files hold them, the network's side by side; of observations and codes where they are."""
+        """All settings as files hold them, the network's side by side; those of some runs only where they are used."""
         augment = asdict(self.augment)
         if not self.augment.observations:
             del augment["observations"]
         settings = asdict(self) | {"network": self.network.to_dict(), "augment": augment}
         if self.network.encoder != "autodecoder":
             del settings["code_length"]
+        if self.accumulate == 1:
+            del settings["accumulate"]
+        if self.data != "stream":  # in memory as ever
+            del settings["data"]
         return settings
 
 

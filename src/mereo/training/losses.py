@@ -1,14 +1,19 @@
 """Losses of the paper (section 3.1, equation 1) and their ablations."""
 
+from dataclasses import replace
+
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from mereo.models.config import Supervision
 from mereo.models.decoder import Prediction
+from mereo.models.network import ALIGNED_QUERIES
+from mereo.training.batches import Batch
 from mereo.training.config import TrainConfig
-from mereo.training.dataset import Batch
+from mereo.training.processes import Process
 
 
 def occupancy_loss(
@@ -39,15 +44,18 @@ REST_WEIGHT = 3.0
 """Weight of the rest coordinates by which the decoder looks queries up in the rest pose."""
 
 
-def rest_loss(predicted: Float[Tensor, "b q 3"], rest: Float[Tensor, "b q 3"]) -> Float[Tensor, ""]:
+def rest_loss(
+    predicted: Float[Tensor, "b q 3"], rest: Float[Tensor, "b q 3"], count: Float[Tensor, ""] | None = None
+) -> Float[Tensor, ""]:
     """Mean distance between predicted and true rest coordinates; rows that are NaN (outside) are left out.
 
-    The distance, not its square, so that the ends of wide bends do not outweigh the rest.
+    The distance, not its square, so that the ends of wide bends do not outweigh the rest. ``count`` is the number by
+    which the sum is divided, where it is not that of the rows.
     """
     known = ~rest.isnan().any(dim=-1)
     offset = torch.where(known[..., None], predicted - rest, torch.zeros_like(rest))
     distance = (offset.square().sum(dim=-1) + 1e-8).sqrt()
-    return (distance * known).sum() / known.sum().clamp(min=1)
+    return (distance * known).sum() / (known.sum().clamp(min=1) if count is None else count)
 
 
 def supervised_loss(
@@ -60,10 +68,27 @@ def supervised_loss(
     loss, terms = occupancy_loss(
         prediction, batch.labels, batch.distances, batch.directions, config.supervision, config.l1_weight
     )
+    aligned, everywhere = (None, None) if batch.known is None else batch.known
     if coarse is not None:
-        terms["align"] = rest_loss(coarse, batch.rest[:, : coarse.shape[1]])
+        terms["align"] = rest_loss(coarse, batch.rest[:, : coarse.shape[1]], aligned)
         loss = loss + terms["align"]
     if prediction.rest is not None:
-        terms["rest"] = rest_loss(prediction.rest, batch.rest)
+        terms["rest"] = rest_loss(prediction.rest, batch.rest, everywhere)
         loss = loss + REST_WEIGHT * terms["rest"]
     return loss, terms
+
+
+def with_known(batch: Batch, process: Process, parts: int) -> Batch:
+    """Batch with the numbers of queries by which sums over its parts, of all processes, become means of the whole.
+
+    The mean of parts with their own numbers would be another: they have more or fewer queries inside. ``batch`` is the
+    share of ``process``, which takes it in so many ``parts``.
+    """
+    parts *= process.world
+    if parts == 1:
+        return batch
+    inside = ~batch.rest.isnan().any(dim=-1)
+    known = torch.stack([inside[:, :ALIGNED_QUERIES].sum(), inside.sum()])
+    if process.world > 1:
+        dist.all_reduce(known)
+    return replace(batch, known=known.clamp(min=1) / parts)

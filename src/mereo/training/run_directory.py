@@ -18,11 +18,11 @@ from mereo.models.network import Network
 from mereo.models.weights import load_model
 from mereo.synthesis.config import TEMPLATE
 from mereo.training.config import AugmentConfig, TrainConfig
-from mereo.training.dataset import Dataset
+from mereo.training.data_source import TrainingData
 from mereo.training.processes import Process, meeting
 
 
-def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
+def fit_config(config: TrainConfig, data: TrainingData) -> TrainConfig:
     """Recipe with what the dataset decides: what can be held out, whether a roll is plausible, what else is observed.
 
     Raises ``ValueError`` for settings with which an autodecoder cannot be trained.
@@ -53,7 +53,7 @@ def _check_autodecoder(config: TrainConfig) -> None:
         )
 
 
-def start_network(config: TrainConfig, data: Dataset) -> Network:
+def start_network(config: TrainConfig, data: TrainingData) -> Network:
     """Network to train: random from the seed, or with the weights that ``config.init`` names.
 
     Weights that know other segments give all that is not about segments (docs/design/0002-learning.md). An
@@ -85,7 +85,7 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
 
 def trained_model(
     average: Network,
-    data: Dataset,
+    data: TrainingData,
     config: TrainConfig,
     step: int,
     offsets: Float[Tensor, " c"] | None,
@@ -156,15 +156,16 @@ def _without_segments(given: dict[str, Tensor], network: Network) -> dict[str, T
     return kept
 
 
-def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Process) -> None:
+def claim_run(run_dir: Path, config: TrainConfig, data: TrainingData, process: Process) -> None:
     """Create the run directory, or check that it belongs to the same settings and dataset.
 
     Process 0 does so alone: another one would find the directory that it is just creating, without its settings yet.
     The others wait, and end where process 0 refuses.
     """
-    if config.batch % process.world:
+    if config.batch % (process.world * config.accumulate):
+        parts = f", in {config.accumulate} parts each" if config.accumulate > 1 else ""
         raise ValueError(
-            f"the batch of {config.batch} cannot be shared by {process.world} processes; it must be a multiple: "
+            f"the batch of {config.batch} cannot be shared by {process.world} processes{parts}; it must be a multiple: "
             "change --batch or the number of processes"
         )
     with meeting(process):
@@ -173,11 +174,15 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
             _claim(run_dir, json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()})))
 
 
+NOT_WRITTEN = {"accumulate": 1, "data": "memory"}
+"""Settings that files do not hold where they are so."""
+
+
 def _claim(run_dir: Path, settings: dict[str, Any]) -> None:
     found = claim_directory(run_dir, "config.json", settings, "a training run")
     before = settings if found is None else _with_defaults(run_dir, found)
     if before != settings:
-        odd = _first_difference(before, settings)
+        odd = _first_difference(*(item | {"train": NOT_WRITTEN | item["train"]} for item in (before, settings)))
         raise ValueError(
             f"{run_dir} holds a run with another {odd}; continuing needs equal settings: use them, or another --output"
         )

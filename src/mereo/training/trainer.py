@@ -1,18 +1,17 @@
 """Loop of training, plain over batches; running the same command again continues where it stopped.
 
 Everything random in step t is drawn from (seed, t), and which steps are validated depends on their number alone, so a
-resumed run repeats an uninterrupted one exactly. Under ``torchrun`` each process takes its share of every batch;
-process 0 writes.
+resumed run repeats an uninterrupted one exactly. Under ``torchrun`` each process takes its share of the batches that a
+single one would have taken (docs/clusters.md); process 0 writes.
 """
 
 import copy
 import math
 import time
-from collections.abc import Iterator
-from contextlib import nullcontext
+from collections.abc import Generator
+from contextlib import closing, nullcontext
 from pathlib import Path
 
-import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -24,17 +23,21 @@ from mereo.models.device import compiling_pays, find_device, keep_freed_memory, 
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
 from mereo.models.weights import WEIGHTS, save_model, trained_steps
+from mereo.training.batch_normalization import adapt_momentum, share_statistics
+from mereo.training.batches import Batch, Draws
 from mereo.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from mereo.training.config import TrainConfig
-from mereo.training.dataset import Batch, Dataset
+from mereo.training.data_source import TrainingData, open_data
 from mereo.training.examples_seen import seen_by
 from mereo.training.going_nowhere import EXAMPLES, ConstantAnswer, Judge
-from mereo.training.losses import supervised_loss
+from mereo.training.losses import supervised_loss, with_known
 from mereo.training.metrics_log import MetricsLog
 from mereo.training.optimization import clip_gradients, parameter_groups, rate_share, update_average
-from mereo.training.processes import Process, join_processes, meeting
+from mereo.training.orders import seed_of
+from mereo.training.processes import Process, connected, join_processes, meeting
 from mereo.training.run_directory import claim_run, fit_config, start_network, trained_model
 from mereo.training.steps_shown import StepsShown, steps_between
+from mereo.training.streaming import StreamingDataset
 from mereo.training.validation import choose_offsets, held_out, validate
 
 
@@ -48,18 +51,20 @@ def train(
 ) -> Path:
     """Train on a generated dataset; returns the path of the weights (``run_dir/weights.safetensors``).
 
-    ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors. If it
-    holds a checkpoint of the same settings, training continues from it, and what is missing of a finished run is
-    written. Raises ``ValueError`` for other settings, and at the first step whose loss or gradient is not finite: what
-    was saved before stays.
+    ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors, and
+    survey.json where examples are streamed. If it holds a checkpoint of the same settings, training continues from it,
+    and what is missing of a finished run is written. Raises ``ValueError`` for other settings, and at the first step
+    whose loss or gradient is not finite: what was saved before stays. ``ConnectionError`` where a process is lost.
     """
     check_place(run_dir, may_be_link=True)
     process = join_processes()
     place = find_device(device, process.rank)
-    data = Dataset.load(dataset_dir, place)
+    config, data = open_data(dataset_dir, run_dir, config, place, process)
     config = fit_config(config, data)
     network = start_network(config, data)  # before anything is written: the weights it starts from may be unusable
     claim_run(run_dir, config, data, process)
+    if isinstance(data, StreamingDataset):
+        data = data.surveyed(run_dir, process)
     keep_freed_memory()
     trainer = Trainer(config, data, network, run_dir, process, place)
     if isinstance(network.encoder, Autodecoder):
@@ -68,13 +73,14 @@ def train(
     if trainer.resume():
         trainer.say(f"continuing from step {trainer.step} of {trainer.total}")
     last_save = time.monotonic()
-    with trainer.shown.showing(trainer.step) if process.is_main else nullcontext():
-        for batch in trainer.batches():
-            trainer.train_step(batch)
-            trainer.validate()
-            if trainer.step < trainer.total and trainer.agree(time.monotonic() - last_save > checkpoint_every_s):
-                trainer.save()
-                last_save = time.monotonic()
+    with trainer.shown.showing(trainer.step) if process.is_main else nullcontext(), connected(process):
+        with closing(trainer.batches()) as batches:
+            for batch in batches:
+                trainer.train_step(batch)
+                trainer.validate()
+                if trainer.step < trainer.total and trainer.agree(time.monotonic() - last_save > checkpoint_every_s):
+                    trainer.save()
+                    last_save = time.monotonic()
         trainer.finish()
     if process.world > 1:
         dist.destroy_process_group()
@@ -91,7 +97,7 @@ class Trainer:
     def __init__(
         self,
         config: TrainConfig,
-        data: Dataset,
+        data: TrainingData,
         network: Network,
         run_dir: Path,
         process: Process,
@@ -103,19 +109,22 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(parameter_groups(self.network, config), lr=config.learning_rate, fused=True)
         self.examples = len(data) - config.holdout
         self.before = seen_by(config.init)  # now: the file may be gone when the weights are saved
-        self.orders: dict[int, Tensor] = {}
+        self.order = data.order(self.examples, config.batch, config.seed, process.world)
+        share = config.batch // process.world
+        self.rows = slice(process.rank * share, (process.rank + 1) * share)
         self.total = max(1, math.ceil(config.epochs * self.examples / config.batch))
         self.step = self.saved_step = 0
         self.log = MetricsLog(run_dir, bool(data.further)) if process.is_main else None
         self.unread: list[tuple[int, float, dict[str, Tensor]]] = []
         self.autocast = pick_precision(config.precision, device)
-        self.module: nn.Module = self.network
+        adapt_momentum(self.network, config.accumulate)
+        self.module: nn.Module = share_statistics(self.network, process, device)
         if process.world > 1:
             self.module = nn.parallel.DistributedDataParallel(self.network)
         if config.compile == "on" or (config.compile == "auto" and compiling_pays(device, self.total)):
             self.module = torch.compile(self.module)  # type: ignore[assignment]
-        labels, distances = (values[:EXAMPLES].cpu().numpy() for values in (data.labels, data.distances))
-        self.judge = Judge(ConstantAnswer.of(labels, distances, config.supervision.labels), self.total)
+        constant = ConstantAnswer.of(*data.first_queries(EXAMPLES), config.supervision.labels)
+        self.judge = Judge(constant, self.total)
         self.first_step = 0
         self.shown = StepsShown(config, self.total, len(held_out(data, config)) * (2 if data.further else 1))
 
@@ -132,27 +141,13 @@ class Trainer:
         dist.broadcast(flag, src=0)
         return bool(flag.item())
 
-    def batches(self) -> Iterator[Batch]:
+    def batches(self) -> Generator[Batch, None, None]:
         """Share of this process in every remaining batch."""
-        per_process = self.config.batch // self.process.world
-        while self.step < self.total:
-            index = self._batch_index(self.step)[self.process.rank * per_process :][:per_process]
-            rng = torch.Generator().manual_seed(_seed(self.config.seed, self.step, self.process.rank))
-            yield self.data.batch(index, self.config.network.points, self.config.queries, self.config.augment, rng)
-
-    def _batch_index(self, step: int) -> Tensor:
-        """Batches run through one shuffled pass after another; a batch may straddle two passes."""
-        first = step * self.config.batch
-        positions = range(first, first + self.config.batch)
-        return torch.stack([self._order(p // self.examples)[p % self.examples] for p in positions])
-
-    def _order(self, number: int) -> Tensor:
-        """The shuffled examples of pass ``number``; the two latest are kept."""
-        if number not in self.orders:
-            generator = torch.Generator().manual_seed(_seed(self.config.seed, number, 1 << 20))
-            order = torch.randperm(self.examples, generator=generator)
-            self.orders = {n: kept for n, kept in self.orders.items() if n == number - 1} | {number: order}
-        return self.orders[number]
+        config = self.config
+        for data, index in self.data.pieces(self.order, range(self.step, self.total), self.rows):
+            draws = Draws.of(seed_of(config.seed, self.step, 0), config.batch, self.rows)
+            batch = data.batch(index, config.network.points, config.queries, config.augment, draws)
+            yield with_known(batch, self.process, config.accumulate)
 
     def train_step(self, batch: Batch) -> None:
         """Take one optimizer step."""
@@ -160,18 +155,29 @@ class Trainer:
         part = rate_share(self.config, self.step, self.total)
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * part
-        torch.manual_seed(_seed(self.config.seed, self.step, self.process.rank))  # for dropout
-        loss, terms = self._loss(batch)
+        torch.manual_seed(seed_of(self.config.seed, self.step, self.process.rank))  # for dropout
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        terms = self._gradients(batch)
         norm = clip_gradients(self.network, self.config.clip_norm)
         self.optimizer.step()
         self.step += 1
         update_average(self.average, self.network, self.step, self.config.ema_decay)
-        values = {"norm": norm, **self._of_all({"loss": loss.detach(), **terms})}
+        values = {"norm": norm, **self._of_all(terms)}
         self.unread.append((self.step, self.config.learning_rate * part, values))
         if self.device.type == "cpu" or self.step % READ_EVERY == 0 or self.step == self.total:
             self._read_losses()  # on a CPU that waits for nothing
+
+    def _gradients(self, batch: Batch) -> dict[str, Tensor]:
+        """Add up the gradients of a batch's parts, with the last one over all processes; returns their mean terms."""
+        parts = batch.parts(self.config.accumulate)
+        found: list[dict[str, Tensor]] = []
+        for part in parts:
+            alone = self.process.world > 1 and len(found) + 1 < len(parts)
+            with self.module.no_sync() if alone else nullcontext():  # type: ignore[operator]
+                loss, terms = self._loss(part)
+                (loss / len(parts) if len(parts) > 1 else loss).backward()
+            found.append({"loss": loss.detach(), **terms})
+        return found[0] if len(found) == 1 else {n: torch.stack([row[n] for row in found]).mean(0) for n in found[0]}
 
     def _of_all(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
         """Means over all processes, which so stop at the same step, as DDP has made them of the gradients."""
@@ -213,7 +219,7 @@ class Trainer:
     def _divergence(self, step: int, loss: float, norm: float) -> str:
         """Sentence about a step that is not finite: where it is, what is left, and what may help."""
         what = f"the gradient's norm is {norm}" if math.isfinite(loss) else f"the loss is {loss}"
-        batch = self._batch_index(step - 1).tolist()
+        batch = self.order.index(step - 1).tolist()
         examples = ", ".join(map(str, batch[:8])) + (", ..." if len(batch) > 8 else "")
         kept = (
             f"the checkpoint and weights of step {self.saved_step} are kept" if self.saved_step else "nothing is saved"
@@ -279,7 +285,7 @@ class Trainer:
 
     def resume(self) -> bool:
         """Load the checkpoint when there is one; returns whether there was."""
-        step = load_checkpoint(self.run_dir, Checkpoint(0, self.network, self.average, self.optimizer))
+        step = load_checkpoint(self.run_dir, Checkpoint(0, self.network, self.average, self.optimizer), self.process)
         if step is None:
             return False
         if not all(value.isfinite().all() for value in self.network.parameters()):
@@ -292,8 +298,3 @@ class Trainer:
             if self.log is not None:
                 self.log.read_until(step)
         return True
-
-
-def _seed(*numbers: int) -> int:
-    """One 63-bit seed from several numbers."""
-    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))

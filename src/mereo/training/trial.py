@@ -11,8 +11,9 @@ import torch
 from mereo.io.progress import Progress
 from mereo.models.device import keep_freed_memory, pick_device
 from mereo.models.weights import shipped_names
+from mereo.training.batches import Batch, Draws
 from mereo.training.config import TrainConfig
-from mereo.training.dataset import Batch, Dataset
+from mereo.training.dataset import Dataset
 from mereo.training.processes import Process
 from mereo.training.run_directory import fit_config, start_network
 from mereo.training.trainer import Trainer
@@ -91,7 +92,7 @@ class Trial(Trainer):
         """Trial of a recipe, but for its length and what is held out."""
         config = replace(recipe, holdout=0, epochs=STEPS * recipe.batch / len(data), compile="off")
         config = fit_config(config, data)
-        return cls(config, data, start_network(config, data), folder, Process(), data.cloud.device)
+        return cls(config, data, start_network(config, data), folder, Process(), data.device)
 
     @cached_property
     def times_s(self) -> list[float]:
@@ -124,7 +125,7 @@ class Trial(Trainer):
     def loss_now(self) -> float:
         """Mean loss of the first examples, without a step."""
         self.network.train()
-        config, rng = self.config, torch.Generator().manual_seed(self.config.seed)
+        config = self.config
         index = torch.arange(min(COMPARED, len(self.data)))
-        batch = self.data.batch(index, config.network.points, config.queries, config.augment, rng)
+        batch = self.data.batch(index, config.network.points, config.queries, config.augment, Draws.of(config.seed))
         return float(self._loss(batch)[0])

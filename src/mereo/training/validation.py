@@ -11,15 +11,16 @@ from torch import Tensor
 
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.models.network import Network
+from mereo.training.batches import Batch, Draws
 from mereo.training.config import AugmentConfig, TrainConfig
-from mereo.training.dataset import Batch, Dataset
+from mereo.training.data_source import TrainingData
 from mereo.training.logit_adjustment import class_offsets
 
 SEARCHED = 16
 """Held-out examples of an autodecoder's curve: each one's code must be searched for first."""
 
 
-def held_out(data: Dataset, config: TrainConfig) -> range:
+def held_out(data: TrainingData, config: TrainConfig) -> range:
     """Examples of the validation curve, none of which is trained on."""
     first = len(data) - config.holdout
     count = min(config.holdout, SEARCHED) if config.network.encoder == "autodecoder" else config.holdout
@@ -27,7 +28,7 @@ def held_out(data: Dataset, config: TrainConfig) -> range:
 
 
 @torch.no_grad()
-def validate(network: Network, data: Dataset, config: TrainConfig, further: bool = False) -> Scores:
+def validate(network: Network, data: TrainingData, config: TrainConfig, further: bool = False) -> Scores:
     """IoU and mIoU on the held-out examples' queries (not the paper's grid metric).
 
     With ``further``, of the examples' further observations: example i is seen as its (i mod k)-th of k.
@@ -43,7 +44,7 @@ def validate(network: Network, data: Dataset, config: TrainConfig, further: bool
 
 
 @torch.no_grad()
-def choose_offsets(network: Network, data: Dataset, config: TrainConfig) -> Float[Tensor, " c"] | None:
+def choose_offsets(network: Network, data: TrainingData, config: TrainConfig) -> Float[Tensor, " c"] | None:
     """Class offsets (``logit_adjustment``) from the first training examples; None when off."""
     count, uniform = min(config.offset_examples, len(data) - config.holdout), data.uniform_queries
     if not (count and uniform and config.supervision.labels):
@@ -54,14 +55,13 @@ def choose_offsets(network: Network, data: Dataset, config: TrainConfig) -> Floa
 
 
 def _answers(
-    network: Network, data: Dataset, config: TrainConfig, examples: range, further: bool = False
+    network: Network, data: TrainingData, config: TrainConfig, examples: range, further: bool = False
 ) -> Iterator[tuple[Batch, Float[Tensor, "b q c"], Float[Tensor, "b q"]]]:
     """Logits and distances at all queries of stored examples, encoded as in use, batch by batch."""
     network.eval()
     for start in examples[:: config.batch]:
         index = torch.arange(start, min(start + config.batch, examples.stop))
         observation = 1 + index % data.further if further else torch.zeros_like(index)
-        rng = torch.Generator().manual_seed(0)
-        batch = data.batch(index, config.network.points, 0, AugmentConfig(), rng, observation)
+        batch = data.batch(index, config.network.points, 0, AugmentConfig(), Draws.of(0), observation)
         prediction = network.query(network.encode(batch.cloud, batch.viewpoint), batch.positions)
         yield batch, prediction.logits, prediction.distance

@@ -1,0 +1,128 @@
+"""Two nodes of two processes, started by torchrun on this machine: they train what one process does.
+
+Equal is: to rounding, because sums over processes are added in another order than those of one. Adam turns the rounding
+of a gradient near zero into a step of the size of its rate, so that in single precision runs that differ in one bit
+soon part (docs/clusters.md). These compute in double precision, where equal runs stay together.
+"""
+
+import csv
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from safetensors.torch import load_file
+from toy_data import write_toy_dataset
+
+from mereo.training.processes import SEPARATE
+
+TRAIN = (
+    "--preset tiny --precision float32 --compile off --batch 8 --queries 48 --network.points 64 "
+    "--network.width 48 --network.neighbors 8 --holdout 6 --offset-examples 0"
+)
+
+WORKER = """
+import os, signal, sys
+from dataclasses import fields, replace
+from pathlib import Path
+import torch
+torch.set_default_dtype(torch.float64)
+torch.Tensor.float = torch.Tensor.double
+import mereo.__main__ as command_line
+from mereo.training import metrics_log, trainer
+metrics_log.draw_curves = lambda rows, path: path.write_bytes(b"")
+victim, fallen = os.environ.get("VICTIM"), Path("fallen")
+original = trainer.Trainer.train_step
+def doubled(value):
+    return value.double() if isinstance(value, torch.Tensor) and value.is_floating_point() else value
+def step(self, batch):
+    batch = replace(batch, **{item.name: doubled(getattr(batch, item.name)) for item in fields(batch)})
+    if os.environ.get("RANK", "0") == victim and self.step == 3 and not fallen.exists():
+        fallen.write_text(str(os.getpid()))
+        os.kill(os.getpid(), signal.SIGKILL)
+    original(self, batch)
+trainer.Trainer.train_step = step
+trainer.train.__kwdefaults__["checkpoint_every_s"] = 0.0
+sys.exit(command_line.main(sys.argv[1:]))
+"""
+
+
+def environment(**more: str) -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1", SEPARATE: "1", **more}
+
+
+def train_on_nodes(folder: Path, output: str, options: str, nodes: int = 2, **more: str) -> list[str]:
+    """Train in two processes on each of so many nodes; what each node said."""
+    (folder / "worker.py").write_text(WORKER)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--nnodes", str(nodes), "--nproc-per-node", "2"]
+    launcher += ["--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{port}", "--rdzv-id", "mereo"]
+    launcher += ["--local-addr", "127.0.0.1", "--max-restarts", "2", "worker.py"]
+    command = [*launcher, "train", "data", "--output", output, *f"{TRAIN} {options}".split()]
+    started = [
+        subprocess.Popen(
+            command, cwd=folder, env=environment(**more), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        for _ in range(nodes)
+    ]
+    said = [process.communicate(timeout=280)[0] for process in started]
+    assert [process.returncode for process in started] == [0] * nodes, "\n\n".join(text[-4000:] for text in said)
+    return said
+
+
+def train_alone(folder: Path, output: str, options: str) -> None:
+    (folder / "worker.py").write_text(WORKER)
+    command = [sys.executable, "worker.py", "train", "data", "--output", output, *f"{TRAIN} {options}".split()]
+    done = subprocess.run(command, cwd=folder, env=environment(), capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stderr[-4000:]
+
+
+def differences(folder: Path, one: str, other: str) -> dict[str, float]:
+    """How far two runs are apart: the first loss and the worst, each relative, and weights and their statistics."""
+    tables = []
+    for name in (one, other):
+        with (folder / name / "metrics.csv").open() as file:
+            tables.append([float(row["loss"]) for row in csv.DictReader(file)])
+    apart = [abs(a - b) / abs(a) for a, b in zip(*tables, strict=True)]
+    first, second = (load_file(folder / name / "checkpoint.safetensors") for name in (one, other))
+    assert first.keys() == second.keys()
+    moved = [float((first[name] - second[name]).abs().max()) for name in first if name.startswith("network/")]
+    found = {"first loss": apart[0], "losses": max(apart), "weights": max(moved)}
+    print(one, other, json.dumps(found))
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of 70 examples in shards of 32, 32 and 6."""
+    folder = tmp_path_factory.mktemp("nodes")
+    write_toy_dataset(folder / "data", examples=70)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", ["--data memory", "--data stream", "--data stream --accumulate 2"])
+def test_two_nodes_train_what_one_process_does(folder: Path, options: str) -> None:
+    name = options.replace(" ", "").replace("-", "")
+    train_alone(folder, f"alone{name}", f"{options} --epochs 2")
+    train_on_nodes(folder, f"nodes{name}", f"{options} --epochs 2")
+    apart = differences(folder, f"alone{name}", f"nodes{name}")
+    assert apart["first loss"] < 1e-12 and apart["losses"] < 1e-8 and apart["weights"] < 1e-7, apart
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_started_again_and_ends_with_the_same_result(folder: Path) -> None:
+    """All processes start again, from the latest checkpoint; the first ones end with one sentence."""
+    options = "--data stream --epochs 1"
+    train_on_nodes(folder, "whole", options)
+    said = train_on_nodes(folder, "parts", options, VICTIM="3")
+    assert (folder / "fallen").is_file(), "one was killed"
+    assert any("continuing from step 3 of 8" in text for text in said), said
+    assert not any("this is a fault of mereo" in text for text in said), said
+    apart = differences(folder, "whole", "parts")
+    assert apart["losses"] < 1e-8 and apart["weights"] < 1e-7, apart
