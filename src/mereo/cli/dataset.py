@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
-from mereo.io.places import Place
+from mereo.io.object_storage import Place
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.dataset_contents import DatasetContents
 from mereo.synthesis.dataset_files import recorded_files

@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from tyro.constructors import PrimitiveConstructorSpec
 
-from mereo.io.places import Place, place_of
+from mereo.io.object_storage import Place, place_of
 
 
 class _InOptionsFile:

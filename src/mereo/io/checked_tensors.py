@@ -16,8 +16,7 @@ from safetensors.numpy import load, save
 
 from mereo.io.errors import reason
 from mereo.io.object_cache import read_cached
-from mereo.io.object_storage import ObjectPath
-from mereo.io.places import Place
+from mereo.io.object_storage import ObjectPath, Place
 
 HEADER, CHECKSUM = "mereo", "sha256"
 

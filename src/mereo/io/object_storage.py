@@ -8,14 +8,16 @@ A put of an object is atomic: others see all of it, or what was there before. Cr
 find by themselves (environment, profile, role of the machine); none is taken from a URL, and none is ever printed.
 """
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Any
-
-from mereo.io.errors import reason
+from urllib.parse import unquote, urlsplit
+from urllib.request import url2pathname
 
 LIBRARIES = {"s3": ("s3fs", "storage"), "gs": ("gcsfs", "gcs"), "memory": ("fsspec", "storage")}
 """Library of each protocol, and the extra that has it."""
@@ -162,6 +164,8 @@ class ObjectPath:
             raise self._sentence(error, done) from None
 
     def _sentence(self, error: Exception, done: str) -> Exception:
+        from mereo.io.errors import reason  # loads numpy, which `mereo --help` can do without
+
         code, bucket = _code(error), self.url.split("/")[2]
         kind, why = type(error).__name__, re.sub(r"//[^/@\s]*@", "//...@", reason(error))
         absent = isinstance(error, FileNotFoundError)
@@ -186,6 +190,29 @@ class ObjectPath:
             f"{self} cannot be {done}: the storage cannot be reached ({why}); check the network{settings}, then run "
             "the same command again"
         )
+
+
+Place = Path | ObjectPath
+
+
+def place_of(given: str | Path | ObjectPath) -> Place:
+    """Place that a text means: with a protocol a folder of a storage, without one, or with file://, a local one.
+
+    Raises ``ValueError`` for a URL that is none.
+    """
+    if not isinstance(given, str):
+        return given
+    found = URL.fullmatch(given)
+    if found is None:
+        return Path(given)
+    if found["protocol"].lower() == "file":
+        parts = urlsplit(given)
+        if parts.netloc not in ("", "localhost"):
+            raise ValueError(
+                f"{given} names another machine; a file URL has three slashes: write file:///absolute/folder"
+            )
+        return Path(url2pathname(parts.path) if os.name == "nt" else unquote(parts.path))
+    return ObjectPath(given)
 
 
 def _code(error: BaseException | None) -> str:

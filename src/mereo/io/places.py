@@ -4,34 +4,10 @@ import hashlib
 import os
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
-from urllib.request import url2pathname
 
 from mereo.io.atomic_files import atomic_file, json_text
-from mereo.io.object_storage import URL, ObjectPath
+from mereo.io.object_storage import ObjectPath, Place
 from mereo.io.output_folders import claim_directory, read_settings
-
-Place = Path | ObjectPath
-
-
-def place_of(given: str | Path | ObjectPath) -> Place:
-    """Place that a text means: with a protocol a folder of a storage, without one, or with file://, a local one.
-
-    Raises ``ValueError`` for a URL that is none.
-    """
-    if not isinstance(given, str):
-        return given
-    found = URL.fullmatch(given)
-    if found is None:
-        return Path(given)
-    if found["protocol"].lower() == "file":
-        parts = urlsplit(given)
-        if parts.netloc not in ("", "localhost"):
-            raise ValueError(
-                f"{given} names another machine; a file URL has three slashes: write file:///absolute/folder"
-            )
-        return Path(url2pathname(parts.path) if os.name == "nt" else unquote(parts.path))
-    return ObjectPath(given)
 
 
 def names_in(folder: Place) -> list[str]:

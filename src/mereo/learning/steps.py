@@ -18,8 +18,7 @@ from mereo.evaluation.metrics import format_score
 from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.fitting.config import FitChoice
-from mereo.io.object_storage import ObjectPath
-from mereo.io.places import Place, place_of
+from mereo.io.object_storage import ObjectPath, Place, place_of
 from mereo.learning import learn as learning
 from mereo.learning.example_frame import FRAME
 from mereo.learning.object_files import scene_for

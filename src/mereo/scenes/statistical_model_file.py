@@ -19,7 +19,8 @@ from jaxtyping import Float32, Int
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.checked_tensors import Tensors, held_against, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import reason
-from mereo.io.places import Place, write_whole
+from mereo.io.object_storage import Place
+from mereo.io.places import write_whole
 from mereo.scenes.pair_distances import PairDistances
 from mereo.scenes.source_frame import SourceFrame
 from mereo.scenes.statistical_model import StatisticalModel

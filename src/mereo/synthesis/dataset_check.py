@@ -1,6 +1,6 @@
 """Reading all of a dataset: which of its files are missing or wrong, and why."""
 
-from mereo.io.places import Place
+from mereo.io.object_storage import Place
 from mereo.io.progress import progress
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE
 from mereo.synthesis.dataset_contents import DatasetContents

@@ -12,7 +12,8 @@ from typing import Any
 
 from mereo.io.atomic_files import json_text
 from mereo.io.checked_tensors import read_content
-from mereo.io.places import Place, names_in, sha256, write_whole
+from mereo.io.object_storage import Place
+from mereo.io.places import names_in, sha256, write_whole
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.scenes.statistical_model_file import read_statistical_model
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE

@@ -22,8 +22,8 @@ from pydantic import BaseModel, Field, ValidationError
 
 from mereo.io.checked_tensors import check_tensors, held_against, read_content, unpack_tensors
 from mereo.io.errors import first_problem, reason
-from mereo.io.object_storage import ObjectPath
-from mereo.io.places import Place, names_in
+from mereo.io.object_storage import ObjectPath, Place
+from mereo.io.places import names_in
 from mereo.scenes.rest_pose import TEMPLATE_NODES
 
 MANIFEST = "manifest.json"

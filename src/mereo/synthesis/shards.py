@@ -35,7 +35,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.io.checked_tensors import pack_tensors
-from mereo.io.places import Place, claim, names_in
+from mereo.io.object_storage import Place
+from mereo.io.places import claim, names_in
 from mereo.io.progress import progress
 from mereo.io.scratch_folders import check_place
 from mereo.scenes.random_states import scene_model, states_for

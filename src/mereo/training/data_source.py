@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from mereo.io.free_memory import free_bytes
-from mereo.io.places import Place
+from mereo.io.object_storage import Place
 from mereo.synthesis.dataset_files import dataset_key, list_shards, read_manifest, recorded_files
 from mereo.training.config import DataPlace, TrainConfig
 from mereo.training.dataset import Dataset, read_part

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Float32, Int, Int64, UInt8
 from torch import Tensor
 
-from mereo.io.places import Place
+from mereo.io.object_storage import Place
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.dataset_files import dataset_key, list_shards, read_manifest
 from mereo.training.batches import Batch, Draws
