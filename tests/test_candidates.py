@@ -9,6 +9,8 @@ import pytest
 
 from mereo.evaluation.candidates import RegistrationErrors, find_candidates
 from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.metrics import Scores
+from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scoring import evaluate
 from mereo.evaluation.tables import markdown_table, metrics
 from mereo.fitting.register import Registrar
@@ -96,3 +98,13 @@ def test_an_evaluation_compares_all_who_could_answer(model: Model, tmp_path: Pat
     off = evaluate(model, "engine", examples=2, seed=SEED, cells=24, choice="off")
     assert (off.scores.iou, off.scores.miou) == (values["network"]["iou"], values["network"]["miou"])
     assert "alone" not in markdown_table(off) and metrics(off, {})["registration_error"] is None
+    assert found.known == (True, True) and off.known == ()
+
+
+def test_frames_are_counted_by_whether_they_are_said_to_show_the_object() -> None:
+    scores = Scores(0.9, 0.8, np.array([0.8]))
+    one = Evaluation(("a",), np.array([[9, 1], [1, 9]]), {str(number): scores for number in range(4)})
+    assert metrics(one, {})["known"] is None and "Said to show" not in markdown_table(one)
+    said = replace(one, known=(True, "unsure", True, False))
+    assert metrics(said, {})["known"] == {"true": 0.5, "unsure": 0.25, "false": 0.25}
+    assert "Said to show the object: 50.0%; unsure 25.0%, not 25.0%." in markdown_table(said)

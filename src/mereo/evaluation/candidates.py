@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 
 from mereo.evaluation.coverage import seen_points
 from mereo.fitting.readings import fitted_frame
+from mereo.fitting.recognition import Known, recognized
 from mereo.fitting.register import Registrar
 from mereo.fitting.registration import Registration
 from mereo.geometry.camera import PointCloud
@@ -50,11 +51,13 @@ class Candidates:
         code: what the network made of the cloud.
         each: answers by who gives them.
         default: whose answer a user gets.
+        known: whether the frame is said to show the object; None where no registration was asked for.
     """
 
     code: EncodedCloud
     each: dict[AnswerName, Candidate]
     default: AnswerName
+    known: Known | None = None
 
     @property
     def answer(self) -> Candidate:
@@ -90,7 +93,8 @@ def find_candidates(
     if registrar is None:
         return Candidates(code, each, "network")
     if frame.modes is None:  # too little is found; then the network's answer is what a user gets, whoever is asked
-        return Candidates(code, dict.fromkeys(names_for(registrar), each["network"]), "network")
+        known = recognized(frame, None, model).known
+        return Candidates(code, dict.fromkeys(names_for(registrar), each["network"]), "network", known)
     each["modes"] = _registered(frame.modes.registration(), grid, encoding)
     default: AnswerName = "modes"
     if "full" in names_for(registrar):
@@ -98,9 +102,10 @@ def find_candidates(
         each["full"] = _registered(frame.modes.with_draws(registrar.at_hand), grid, encoding)
         default = "full"
     found = each[default].registration
+    known = recognized(frame, found, model).known
     if found is not None and not registrar.takes(found):
         default = "network"
-    return Candidates(code, each, default)
+    return Candidates(code, each, default, known)
 
 
 def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:

@@ -25,6 +25,7 @@ from mereo.evaluation.coverage import RadiusRatios, seen_points
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.reliability import Reliability
 from mereo.evaluation.results import EvaluatedView, Evaluation, Tally, grid_confusion
+from mereo.fitting.recognition import Known
 from mereo.fitting.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color
@@ -86,6 +87,7 @@ class ScoredCase:
         reliability: of the network's probabilities on this case.
         places: of the registration behind the answer; None without one, or without known places.
         view: labels for a picture; None where none is wanted.
+        known: as ``Candidates`` has it.
     """
 
     name: str
@@ -95,6 +97,7 @@ class ScoredCase:
     reliability: Reliability
     places: RegisteredPlaces | None
     view: EvaluatedView | None
+    known: Known | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +142,7 @@ class Scoring:
             reliability=reliability,
             places=_places(one, found.answer),
             view=_evaluated_view(one, model, found, colors) if index < self.kept else None,
+            known=found.known,
         )
 
 
@@ -198,6 +202,7 @@ class EvaluationTally:
             segmented=self.model.segmented,
             answers={name: tally.scores for name, tally in self.tallies.items()},
             sources=tuple(one.source for one in self.cases),
+            known=tuple(one.known for one in self.cases if one.known is not None),
             errors=RegistrationErrors.together([one.errors for one in places]) if places else None,
             coverage=RadiusRatios.together([one.ratios for one in places]) if places else None,
             radii_calibrated=bool(places) and all(one.calibrated for one in places),

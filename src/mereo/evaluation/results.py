@@ -11,6 +11,7 @@ from mereo.evaluation.coverage import RadiusRatios
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.evaluation.reliability import Reliability
+from mereo.fitting.recognition import Known
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color
@@ -66,6 +67,7 @@ class Evaluation:
         segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
         answers: the same of each that could have answered; ``confusion`` and ``examples`` are of what a user gets.
         sources: where that answer came from, in each example: network, modes or draws.
+        known: whether each example was said to show the object, where a registration was asked for.
         errors: distances of registered points from their true places, where a registration was taken.
         unit_mm: millimetres per scene unit, where they are known.
         coverage: distances of the same points over the radii that are told of them.
@@ -81,6 +83,7 @@ class Evaluation:
     segmented: bool = True
     answers: dict[AnswerName, AnswerScores] = field(default_factory=dict)
     sources: tuple[str, ...] = ()
+    known: tuple[Known, ...] = ()
     errors: RegistrationErrors | None = None
     unit_mm: float | None = None
     coverage: RadiusRatios | None = None

@@ -45,7 +45,8 @@ def answers(evaluation: Evaluation) -> dict[str, Any]:
 
     ``chosen`` has the share of examples by where the scored answer came from, ``better`` the share in which another
     answer would have been better than it by more than ``CLEARLY``. ``registration_error`` and
-    ``coverage95``, the share of true places within the registration's radii, are None where none was taken.
+    ``coverage95``, the share of true places within the registration's radii, are None where none was taken, and so is
+    ``known``, the share of examples by whether they are said to show the object, where no registration was asked for.
     """
     count = max(1, len(evaluation.sources))
     sources = {name: evaluation.sources.count(name) / count for name in ("network", "rest", "modes", "draws")}
@@ -63,7 +64,21 @@ def answers(evaluation: Evaluation) -> dict[str, Any]:
         "better": better,
         "registration_error": errors,
         "coverage95": coverage(evaluation),
+        "known": recognition(evaluation),
     }
+
+
+def recognition(evaluation: Evaluation) -> dict[str, float] | None:
+    """Share of the examples that are said to show the object, not to, and unsure; None where nothing was said."""
+    if not evaluation.known:
+        return None
+    words = [str(one).lower() for one in evaluation.known]
+    return {word: words.count(word) / len(words) for word in ("true", "unsure", "false")}
+
+
+def recognition_line(found: Mapping[str, float]) -> str:
+    """Sentence on ``recognition``."""
+    return f"Said to show the object: {found['true']:.1%}; unsure {found['unsure']:.1%}, not {found['false']:.1%}."
 
 
 def coverage(evaluation: Evaluation) -> dict[str, float | bool | None] | None:
@@ -104,7 +119,7 @@ def markdown_table(evaluation: Evaluation) -> str:
     names = " | ".join(evaluation.names)
     values = " | ".join(format_score(value) for value in scores.per_segment)
     blank = " | ".join("" for _ in evaluation.names)
-    found = coverage(evaluation)
+    found, said = coverage(evaluation), recognition(evaluation)
     return (
         f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
         f"|---|---|---|{'---|' * len(evaluation.names)}\n"
@@ -112,6 +127,7 @@ def markdown_table(evaluation: Evaluation) -> str:
         f"| mean over examples | {format_score(iou)} | {format_score(miou)} | {blank} |\n"
         + _answer_rows(evaluation, blank)
         + ("" if found is None else f"\n{coverage_line(found)}\n")
+        + ("" if said is None else f"\n{recognition_line(said)}\n")
     )
 
 
