@@ -65,6 +65,7 @@ def nodes() -> Iterator[Any]:
     """A head without CPUs and two nodes of one CPU each, all on this machine."""
     from ray.cluster_utils import Cluster as Nodes
 
+    Path("/tmp/ray").mkdir(exist_ok=True)  # where Ray writes the latest cluster's address, wherever its own files are
     with TemporaryDirectory(prefix="ray-", dir="/tmp") as folder:
         head = {"num_cpus": 0, "include_dashboard": False, "temp_dir": folder}
         made = Nodes(initialize_head=True, head_node_args=head)

@@ -67,8 +67,9 @@ class ModesOptimum:
         """Posterior of pose, scale and coefficients."""
         model = self.problem.model
         material = self.posed.place(model.material(self.posed.z))
-        turns = turns_left_open(self.problem, material)
-        return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, turns)
+        with one_blas_thread():
+            turns = turns_left_open(self.problem, material)
+            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, turns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +116,9 @@ class DrawsOptimum:
             spread.shape[0], *motion.shape[1:]
         )
         material: Float[np.ndarray, "m 3"] = self.fit.placed()
-        turns = turns_left_open(self.problem.base, material)
-        return Posterior.of(self.terms.total, self.fit.posed, material, modes, turns=turns)
+        with one_blas_thread():
+            turns = turns_left_open(self.problem.base, material)
+            return Posterior.of(self.terms.total, self.fit.posed, material, modes, turns=turns)
 
 
 def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:

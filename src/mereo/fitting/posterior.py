@@ -20,6 +20,7 @@ from scipy.stats import norm
 
 from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed, Rows
+from mereo.io.cores import one_blas_thread
 
 LEVEL = 0.95
 """Probability with which a true place lies within a radius, and a true number in an interval."""
@@ -139,13 +140,14 @@ class Posterior:
 
     def radii(self, follow: PointWeights | None = None) -> Float[np.ndarray, " n"]:
         """Radius of 95 % of all material points, or of points that follow them; scene units."""
-        if follow is None:
-            return self._radii(self.motion, self._turned(slice(None)))
-        return self._radii(follow(self.motion), follow(self._turned(slice(None))))
+        with one_blas_thread():
+            motion, turned = self.motion, self._turned(slice(None))
+            return self._radii(motion, turned) if follow is None else self._radii(follow(motion), follow(turned))
 
     def radii_of(self, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Radius of 95 % of some material points alone, which costs as little as they are few."""
-        return self._radii(self._motion(rows), self._turned(rows))
+        with one_blas_thread():
+            return self._radii(self._motion(rows), self._turned(rows))
 
     def _turned(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 e"]:
         """``turns`` in the object's axes."""
