@@ -23,6 +23,7 @@ from mereo.io.atomic_files import json_text
 from mereo.io.checked_tensors import pack_tensors
 from mereo.io.object_storage import Place, place_of
 from mereo.io.places import write_whole
+from mereo.synthesis.dataset_contents import shard_name
 from mereo.synthesis.dataset_files import MANIFEST, dataset_key
 from mereo.training.dataset import Dataset
 
@@ -98,7 +99,7 @@ def shard(rng: np.random.Generator) -> dict[str, np.ndarray]:
 def rates(place: Place, manifest: dict[str, Any], shards: list[bytes]) -> tuple[float, float, float]:
     """MB/s of writing, and of reading by the shards' checksums and by the manifest's hashes."""
     megabytes, began = sum(map(len, shards)) / 1e6, time.perf_counter()
-    names = [f"shard-{number:05d}.safetensors" for number in range(len(shards))]
+    names = [shard_name(number) for number in range(len(shards))]
     hashes = {name: write_whole(place / name, content) for name, content in zip(names, shards, strict=True)}
     seconds = [time.perf_counter() - began]
     for files in ({}, {"files": hashes}):

@@ -27,6 +27,7 @@ from mereo.io.checked_tensors import pack_tensors
 from mereo.models.device import keep_freed_memory
 from mereo.scenes.rest_pose import TEMPLATE_NODES
 from mereo.synthesis.config import TEMPLATE
+from mereo.synthesis.dataset_contents import shard_name
 from mereo.synthesis.dataset_files import dataset_key
 from mereo.training.config import PRESETS
 from mereo.training.data_source import open_data
@@ -85,7 +86,7 @@ def make(options: argparse.Namespace) -> None:
         count = min(SHARD, options.examples - first)
         tensors = half_balls(np.random.default_rng((710_000, number)), count, options.points, options.queries)
         content = pack_tensors(tensors, {"dataset": key, "first": first})
-        (options.folder / f"shard-{number:05d}.safetensors").write_bytes(content)
+        (options.folder / shard_name(number)).write_bytes(content)
     template = np.zeros((2, *[TEMPLATE_NODES] * 3), dtype=np.float16)
     (options.folder / TEMPLATE).write_bytes(pack_tensors({"distance": template}, {"dataset": key}))
     (options.folder / "manifest.json").write_text(json.dumps(manifest))
@@ -162,7 +163,7 @@ def mixing(options: argparse.Namespace) -> None:
 def tables(options: argparse.Namespace) -> None:
     """Bytes that grow with the number of shards, and the time to go to a step in the middle."""
     shards = -(-options.examples // SHARD)
-    names = tuple(f"shard-{number:05d}.safetensors" for number in range(shards))
+    names = tuple(shard_name(number) for number in range(shards))
     order = StreamedOrder(np.full(shards, SHARD), 40, 0)
     started = time.monotonic()
     block = next(order.blocks(range(40), range(options.examples // 80, options.examples // 40)))

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file, save_file
-from toy_data import make_small_datasets
+from toy_data import SMALL, make_small_datasets
 from toy_scene import toy_scene
 
 from mereo.io.places import sha256
-from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
 from mereo.training.dataset import Dataset
 
-SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 TOY = toy_scene()
 FILES = ("shard-00001.safetensors", "template.safetensors", "statistical_model.safetensors")
 

@@ -8,17 +8,15 @@ from pathlib import Path
 
 import pytest
 from safetensors import safe_open
-from toy_data import make_small_datasets, write_toy_dataset
+from toy_data import SMALL, make_small_datasets, write_small_dataset, write_toy_dataset
 from toy_scene import toy_scene
 
 from mereo.__main__ import main
 from mereo.io.checked_tensors import pack_tensors, unpack_tensors
 from mereo.scenes.seeds import TEST_SEED_START
-from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
 from mereo.training.dataset import Dataset
 
-SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 TOY = toy_scene()
 FILES = {"template.safetensors", "statistical_model.safetensors", "shard-00000.safetensors", "shard-00001.safetensors"}
 
@@ -31,11 +29,7 @@ def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four examples in two shards."""
-    output = tmp_path_factory.mktemp("whole") / "data"
-    with pytest.MonkeyPatch.context() as patch:
-        make_small_datasets(patch)
-        generate(TOY, output, SMALL, examples=4, seed=3)
-    return output
+    return write_small_dataset(tmp_path_factory.mktemp("whole") / "data")
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-from toy_data import make_small_datasets
+from toy_data import SMALL, make_small_datasets
 from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
@@ -15,12 +15,11 @@ from mereo.cli import commands
 from mereo.geometry.surface_patches import without_strays
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis import observations
-from mereo.synthesis.config import OBSERVATIONS, SENSORS, GenerateConfig, SamplingConfig
+from mereo.synthesis.config import OBSERVATIONS, SENSORS, GenerateConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import Example, _sample_view, synthesize
 from mereo.synthesis.shards import example_bytes, generate, pack
 
-SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 SEEN = replace(SMALL, observations=("all",))
 TOY = toy_scene()
 SEED, EXAMPLES = 3, 5

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
+from toy_data import SMALL
 from toy_scene import toy_scene
 
 from mereo.io import progress
@@ -18,12 +19,11 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis import shards
-from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.shards import example_bytes, generate
 from mereo.training.dataset import Dataset
 
-SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 TOY = toy_scene()
 
 

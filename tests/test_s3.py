@@ -11,20 +11,18 @@ from itertools import count
 from pathlib import Path
 
 import pytest
-from toy_data import make_small_datasets
+from toy_data import SMALL, make_small_datasets
 from toy_scene import toy_scene
 
 from mereo.__main__ import main
 from mereo.io.object_storage import ObjectPath, StorageError
 from mereo.io.places import claim, names_in, write_whole
-from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
 from mereo.training.dataset import Dataset
 
 s3fs = pytest.importorskip("s3fs")
 moto_server = pytest.importorskip("moto.server")
 
-SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 TOY = toy_scene()
 NUMBERS = count()
 

@@ -8,12 +8,10 @@ from analytic import AnalyticModel
 from scene_files import write_bar, write_mesh
 from shapes import ball
 from test_scene_file import CODE
+from toy_data import SMALL
 
 from mereo.evaluation.scoring import trained_scene
-from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
-
-SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 
 
 def made(scene: Path, output: Path, workers: int = 1, examples: int = 2, resume: bool = False) -> dict[str, bytes]:

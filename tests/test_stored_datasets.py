@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_data import make_small_datasets
+from toy_data import SMALL, make_small_datasets, write_small_dataset
 from toy_scene import toy_scene
 
 import mereo
@@ -16,12 +16,10 @@ from mereo.cli.commands import Generate, Train
 from mereo.io.object_cache import CACHE_VARIABLE
 from mereo.io.object_storage import ObjectPath, StorageError
 from mereo.io.places import names_in, write_whole
-from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
 from mereo.training import trainer
 from mereo.training.dataset import Dataset
 
-SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
 TOY = toy_scene()
 NUMBERS = count()
 
@@ -34,11 +32,7 @@ def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four examples in two shards, on a disk."""
-    output = tmp_path_factory.mktemp("whole") / "data"
-    with pytest.MonkeyPatch.context() as patch:
-        make_small_datasets(patch)
-        generate(TOY, output, SMALL, examples=4, seed=3)
-    return output
+    return write_small_dataset(tmp_path_factory.mktemp("whole") / "data")
 
 
 @pytest.fixture

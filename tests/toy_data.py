@@ -11,19 +11,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
+from toy_scene import toy_scene
 
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 from mereo.synthesis import shards
-from mereo.synthesis.config import TEMPLATE
+from mereo.synthesis.config import TEMPLATE, GenerateConfig, SamplingConfig
 
 NAMES = ("left", "right")
 SHARD = 32
+
+SMALL = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
+"""Settings of examples that are made in no time."""
 
 
 def make_small_datasets(patch: pytest.MonkeyPatch) -> None:
     """Let generated shards have two examples, and statistical models twelve states."""
     patch.setattr(shards, "SHARD_SIZE", 2)
     patch.setattr(shards, "states_for", lambda _: 12)
+
+
+def write_small_dataset(output: Path) -> Path:
+    """Generate four examples of the toy scene in two shards, by ``SMALL``, and return their directory."""
+    with pytest.MonkeyPatch.context() as patch:
+        make_small_datasets(patch)
+        shards.generate(toy_scene(), output, SMALL, examples=4, seed=3)
+    return output
 
 
 def write_toy_dataset(

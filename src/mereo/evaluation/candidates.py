@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from mereo.evaluation.coverage import seen_points
 from mereo.fitting.readings import fitted_frame
 from mereo.fitting.recognition import Known, recognized
 from mereo.fitting.register import Registrar
@@ -136,12 +135,18 @@ class RegistrationErrors:
 
     @classmethod
     def of(
-        cls, registration: Registration, truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float
+        cls,
+        registration: Registration,
+        truth: Float[np.ndarray, "m 3"],
+        seen: Bool[np.ndarray, " m"],
+        scene_unit: float,
     ) -> "RegistrationErrors":
-        """Errors at the material points whose true places are given, the first ones, in the cloud's unit."""
+        """Errors at the material points whose true places are given, the first ones, in the registration's unit.
+
+        ``seen`` says which of these the cloud shows (``coverage.seen_points``).
+        """
         error = np.linalg.norm(registration.material[: len(truth)] - truth, axis=1) / scene_unit
-        near = seen_points(truth, cloud, scene_unit)
-        return cls(error[near], error[~near])
+        return cls(error[seen], error[~seen])
 
     @classmethod
     def together(cls, each: list["RegistrationErrors"]) -> "RegistrationErrors":

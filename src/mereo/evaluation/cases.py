@@ -151,10 +151,10 @@ def _places(one: TestCase, answer: Candidate) -> RegisteredPlaces | None:
     if registration is None or one.material is None or one.scene_unit is None:
         return None
     truth = one.material(registration.model)
-    ratios = RadiusRatios.of(registration, truth, seen_points(truth, one.cloud, one.scene_unit))
+    seen = seen_points(truth, one.cloud, one.scene_unit)
     return RegisteredPlaces(
-        RegistrationErrors.of(registration, truth, one.cloud, one.scene_unit),
-        ratios.by(registration.radius_scale),
+        RegistrationErrors.of(registration, truth, seen, one.scene_unit),
+        RadiusRatios.of(registration, truth, seen).by(registration.radius_scale),
         registration.radius_scale is not None,
     )
 

@@ -179,8 +179,8 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
         if explained(problem, [fit], config.explained):
             break
         each = [likely_places(problem, fit, int(number), sigma) for number in likely_to_jump(problem, fit)]
-        likely = sorted((other for places in each for other in places), key=lambda other: misfit(problem, other, sigma))
-        found = [descend(problem, other, config.first_rounds) for other in likely[: config.kept + 1]]
+        likely = sorted((place for places in each for place in places), key=lambda place: place[0])
+        found = [descend(problem, other, config.first_rounds) for _, other in likely[: config.kept + 1]]
         best = min(found, key=by_misfit, default=fit)
         if best.misfit >= fit.misfit:
             break
@@ -188,15 +188,16 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     return fit
 
 
-def likely_places(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[DrawsFit]:
-    """A state with one draw at other places of its range: all of them, or the best where there are many draws."""
-    config, others = problem.config, []
+def likely_places(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
+    """A state with one draw at other places of its range: all, or the best where there are many draws, with misfits."""
+    config, there = problem.config, list[tuple[float, DrawsFit]]()
     for turn in range(1, config.places):
         z = fit.z.copy()
         z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.places) % 1.0, SMALLEST, 1 - SMALLEST))
-        others.append(played(problem, fit.drawn, z, fit.posed))
-    there = sorted((other for other in others if other is not None), key=lambda one: misfit(problem, one, sigma))
-    return there[: config.places_kept]
+        other = played(problem, fit.drawn, z, fit.posed)
+        if other is not None:
+            there.append((misfit(problem, other, sigma), other))
+    return sorted(there, key=lambda place: place[0])[: config.places_kept]
 
 
 def likely_to_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:

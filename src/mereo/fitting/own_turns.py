@@ -173,12 +173,13 @@ def left_open(
         return motion
     vertices = sum(model.vertex_counts)
     owner = model.labels[cKDTree(material[:vertices]).query(partners)[1]]
+    segments = model.mesh(material).segments
     for number, turn in enumerate(turns):
         rows = np.flatnonzero(model.labels == turn.label)
         T = fit_rigid(model.rest_points[rows], material[rows])
         center, axis = T[:3, :3] @ turn.center + T[:3, 3], T[:3, :3] @ turn.axis
         seen = partners[owner == turn.label]
-        worse = _worse(model, material, turn, seen, center, axis, sigma) * worth / len(partners)
+        worse = _worse(segments[turn.label - 1], turn.angles, seen, center, axis, sigma) * worth / len(partners)
         weight = np.append(turn.plausible * np.exp(-0.5 * COUNTED * np.maximum(worse, 0.0)), 1.0)
         angle = np.append(turn.angles, 0.0)
         steps = np.stack([np.sin(angle), 1.0 - np.cos(angle)])
@@ -191,9 +192,8 @@ def left_open(
 
 
 def _worse(
-    model: StatisticalModel,
-    material: Float[np.ndarray, "m 3"],
-    turn: OwnTurn,
+    segment: Segment,
+    angles: Float[np.ndarray, " a"],
     seen: Float[np.ndarray, "n 3"],
     center: Float[np.ndarray, "3"],
     axis: Float[np.ndarray, "3"],
@@ -201,11 +201,10 @@ def _worse(
 ) -> Float[np.ndarray, " a"]:
     """By how much more the points seen on a segment are off where it is turned, in the loss of a fit."""
     if len(seen) == 0:
-        return np.zeros(len(turn.angles))
-    surface = model.mesh(material).segments[turn.label - 1]
-    back = Rotation.from_rotvec(-np.append(0.0, turn.angles)[:, None] * axis).as_matrix()
+        return np.zeros(len(angles))
+    back = Rotation.from_rotvec(-np.append(0.0, angles)[:, None] * axis).as_matrix()
     points = ((seen - center) @ back.transpose(0, 2, 1)).reshape(-1, 3) + center
-    squared = igl.point_mesh_squared_distance(points, surface.vertices, surface.faces)[0]
+    squared = igl.point_mesh_squared_distance(points, segment.vertices, segment.faces)[0]
     loss = robust_square(np.sqrt(squared), sigma).reshape(len(back), -1).sum(axis=1)
     worse: np.ndarray = loss[1:] - loss[0]
     return worse

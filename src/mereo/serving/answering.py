@@ -201,9 +201,8 @@ class Answerer:
         started = time.perf_counter()
         body = json_of(found, begun.told) if request.media == JSON else glb_of(found, request)
         seconds = {"read": begun.read_s, **found.reconstruction.timings_s, "write": time.perf_counter() - started}
-        known = found.recognition.known
         headers = {
-            "Mereo-Known": known if isinstance(known, str) else str(known).lower(),
+            "Mereo-Known": str(found.recognition.known).lower(),
             "Mereo-Answer": "registration" if found.taken else "network",
         }
         return Reply(200, body, request.media, headers, seconds)

@@ -111,9 +111,13 @@ def dataset_key(manifest: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def recorded_files(manifest: Mapping[str, Any]) -> dict[str, str]:
-    """SHA-256 of a dataset's files by their names; none where a manifest of an earlier version has none."""
-    return dict(manifest.get("files", {}))
+def recorded_files(manifest: Mapping[str, Any]) -> Mapping[str, str]:
+    """SHA-256 of a dataset's files by their names; none where a manifest of an earlier version has none.
+
+    The manifest's own, not a copy: it is asked for each file, of which there may be a hundred thousand.
+    """
+    found: Mapping[str, str] = manifest.get("files", {})
+    return found
 
 
 def list_shards(directory: Place) -> list[Place]:

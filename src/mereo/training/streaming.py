@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mereo.io.object_storage import Place
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis.dataset_files import dataset_key, list_shards, read_manifest
+from mereo.synthesis.dataset_files import dataset_key, list_shards, read_manifest, recorded_files
 from mereo.training.batches import Batch, Draws
 from mereo.training.config import AugmentConfig
 from mereo.training.dataset import (
@@ -90,7 +90,7 @@ class StreamingDataset:
         whole = -(-manifest["examples"] // size) if size else len(names)
         if len(names) < max(whole, 1):
             check_whole(directory, manifest, min(len(names) * (size or 0), manifest["examples"] - 1))
-        first = read_part(directory / names[0], key, size, manifest.get("files", {}).get(names[0]))
+        first = read_part(directory / names[0], key, size, recorded_files(manifest).get(names[0]))
         return cls(
             directory=directory,
             names=names,
@@ -141,7 +141,7 @@ class StreamingDataset:
     def read(self, number: int) -> Fields:
         """Tensors of a shard; ``ValueError`` where it is damaged or does not fit the first one."""
         name = self.names[number]
-        path, recorded = self.directory / name, self.manifest.get("files", {}).get(name)
+        path, recorded = self.directory / name, recorded_files(self.manifest).get(name)
         tensors = read_part(path, self.key, self.manifest.get("shard_size"), recorded)
         further = tensors["seen"].shape[1] if "seen" in tensors else 0
         shape = tensors["cloud"].shape[1], tensors["positions"].shape[1], further
