@@ -1,7 +1,7 @@
 """Is it my object, in a state that I know: how well the answer tells, and how reliable probabilities are.
 
     python benchmarks/recognition.py [OBJECT ...] [--views N] [--strangers N] [--seed S] [--calibration-views N]
-                                     [--fit modes|auto] [--output table.md]
+                                     [--fit modes|auto] [--output FOLDER]
 
 For each object, with its shipped weights or a file of weights: the area under the receiver operating characteristic
 (AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from N views of every other shipped
@@ -10,16 +10,24 @@ and from the object's own views as a network of the preset `tiny` understands th
 clean and of simulated cameras' views that are "unsure" and refused; and the expected calibration error of the network's
 probabilities as they are and calibrated. Weights without a calibration are calibrated here, on training seeds, and not
 written. Test seeds begin at 1,000,000: tune on others.
+
+With `--output` each object's row is kept in FOLDER/OBJECT.json as soon as it is measured and FOLDER/table.md has all
+rows that are there, so that a run that was cut off goes on where it was: rows of the same settings are not measured
+again, and those of others are refused.
 """
 
 import argparse
+import json
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
+import torch
 
 from mereo.evaluation.calibrate import VIEWS, calibrate
 from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, own_views, strange_frames
@@ -31,6 +39,7 @@ from mereo.fitting.readings import fitted_frame
 from mereo.fitting.recognition import Recognition, recognized
 from mereo.fitting.register import Registrar
 from mereo.geometry.camera import PointCloud
+from mereo.io.atomic_files import atomic_file
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
@@ -132,25 +141,50 @@ def calibration_error(model: Model, views: Sequence[CalibrationView]) -> tuple[f
     return Scaling().ece(*every), scaling.ece(*every)
 
 
-def row(name: str, found: Found) -> str:
-    """Row of the table."""
+def row(name: str, found: Found, seconds: float) -> dict[str, str | float | list[float]]:
+    """Row of the table: what was found, in numbers."""
     own = [one.strangeness for one in found.own]
-    areas = [auroc(own, [one.strangeness for one in found.strange[kind]]) for kind in KINDS]
-    told = [
-        share(found.own, "unsure"),
-        share(found.own, False),
-        share(found.noisy, "unsure"),
-        share(found.noisy, False),
-    ]
-    passed = [share(found.strange[kind], True) for kind in KINDS]
-    cells = [*(f"{area:.3f} ({rate:.0%})" for area, rate in zip(areas, passed, strict=True))]
-    cells += [*(f"{rate:.0%}" for rate in told), *(f"{error:.3f}" for error in found.ece)]
-    return f"| {name} | {' | '.join(cells)} |"
+    shares = [share(views, said) for views in (found.own, found.noisy) for said in ("unsure", False)]
+    return {
+        "object": name,
+        "auroc": [auroc(own, [one.strangeness for one in found.strange[kind]]) for kind in KINDS],
+        "passed": [share(found.strange[kind], True) for kind in KINDS],
+        "frames": [len(found.own), len(found.noisy), *(len(found.strange[kind]) for kind in KINDS)],
+        "told": shares,
+        "ece": list(found.ece),
+        "seconds": round(seconds),
+    }
+
+
+def line(one: dict[str, Any]) -> str:
+    """Row as a line of the table."""
+    cells = [f"{area:.3f} ({rate:.0%})" for area, rate in zip(one["auroc"], one["passed"], strict=True)]
+    cells += [f"{rate:.0%}" for rate in one["told"]] + [f"{error:.3f}" for error in one["ece"]]
+    cells += [", ".join(str(count) for count in one["frames"]), str(one["seconds"])]
+    return f"| {one['object']} | {' | '.join(cells)} |"
 
 
 def share(said: Sequence[Recognition], known: object) -> float:
     """Share of frames of which this was said."""
     return sum(one.known == known for one in said) / len(said) if said else float("nan")
+
+
+def kept_row(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
+    """The object's row: that in the folder, where one is, or else measured and kept there."""
+    place = None if arguments.output is None else arguments.output / f"{Path(name).stem}.json"
+    settings = {key: str(value) for key, value in vars(arguments).items() if key not in ("objects", "output")}
+    if place is not None and place.is_file():
+        kept: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
+        if kept["settings"] != settings:
+            raise SystemExit(f"{place} has a row of other settings ({kept['settings']}): name another folder")
+        return kept
+    started = time.perf_counter()
+    found: dict[str, Any] = {**row(name, measured(name, arguments), time.perf_counter() - started)}
+    found["settings"] = settings
+    if place is not None:
+        with atomic_file(place) as partial:
+            partial.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    return found
 
 
 def main() -> None:
@@ -164,15 +198,19 @@ def main() -> None:
     parser.add_argument("--fit", default="modes", choices=("modes", "auto"))
     parser.add_argument("--output", type=Path, default=None)
     arguments = parser.parse_args()
+    torch.set_num_threads(1)
     heads = [f"{kind} (known)" for kind in KINDS]
     heads += ["own unsure", "own refused", "cameras' unsure", "refused", "ECE", "calibrated"]
+    heads += ["frames: own, cameras', each kind", "seconds"]
     lines = [f"| AUROC against | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
     print("\n".join(lines), flush=True)
+    if arguments.output is not None:
+        arguments.output.mkdir(parents=True, exist_ok=True)
     for name in arguments.objects:
-        lines.append(row(name, measured(name, arguments)))
+        lines.append(line(kept_row(name, arguments)))
         print(lines[-1], flush=True)
         if arguments.output is not None:
-            arguments.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            (arguments.output / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
