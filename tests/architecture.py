@@ -34,6 +34,9 @@ ROOMS = (
 )
 """From the ground up: a room imports only from itself and from those before it."""
 
+SUBROOMS = {"fitting": ("config", "problem", "modes", "draws", "uncertainty", "registration", "tracking")}
+"""Rooms whose sub-rooms, and modules beside them, have an order too: all of the room lies in one of these."""
+
 DATA_FOLDERS = ("frames", "states", "weights")
 """They travel with the package and hold no code."""
 
@@ -182,15 +185,19 @@ def _module_of(name: str, modules: Mapping[str, str]) -> str:
 
 
 def upward_imports(package: Package) -> list[Import]:
-    """Imports from a later room or from the root: lazy ones, those for type checkers and names in strings included."""
+    """Imports from a later room or sub-room, or from the root: lazy ones, for type checkers and in strings included."""
     inside = [i for i in package if i.target in package.trees and i.source not in ROOT_MODULES]
     return [i for i in inside if _height(i.target) > _height(i.source)]
 
 
-def _height(module: str) -> int:
-    """Place of the module's room in ``ROOMS``; what lies in none of them comes after all."""
-    room = module.partition("/")[0]
-    return ROOMS.index(room) if room in ROOMS else len(ROOMS)
+def _height(module: str) -> tuple[int, int]:
+    """Place of the module's room in ``ROOMS``, then of its sub-room; what lies in none of them comes after all."""
+    room, inside, *_ = *module.split("/"), ""
+    return _place(room, ROOMS), _place(inside, SUBROOMS.get(room, ()))
+
+
+def _place(name: str, order: tuple[str, ...]) -> int:
+    return order.index(name) if name in order else len(order)
 
 
 def differences(upward: Iterable[Import], exceptions: Collection[str]) -> list[str]:
@@ -269,15 +276,22 @@ def _init_fault(tree: ast.Module | None) -> str:
 
 
 def misplaced(package: Package) -> list[str]:
-    """Folders that are neither a room nor data, code among the data, and modules at the root that belong in a room."""
+    """Folders that are neither a room nor data, code among the data, and modules that belong in a room or sub-room."""
     strange = [folder for folder in _folders(package) if folder not in (*ROOMS, *DATA_FOLDERS)]
     code = [module for module in package.trees if module.startswith(tuple(f"{d}/" for d in DATA_FOLDERS))]
     loose = [module for module in package.trees if "/" not in module and module not in ROOT_MODULES]
+    homeless = [module for module in package.trees if _in_no_subroom(module)]
     return [
         *(f"{folder}/ is neither a room nor a folder of data" for folder in strange),
         *(f"{module}.py is code in a folder of data" for module in code),
         *(f"{module}.py lies at the root and not in a room" for module in loose),
+        *(f"{module}.py lies in no sub-room" for module in homeless),
     ]
+
+
+def _in_no_subroom(module: str) -> bool:
+    room, inside, *_ = *module.split("/"), ""
+    return room in SUBROOMS and inside not in (*SUBROOMS[room], "__init__")
 
 
 def _folders(package: Package) -> list[str]:
