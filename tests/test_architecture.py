@@ -10,18 +10,17 @@ from architecture import (
     MOST_LINES,
     ROOMS,
     SUBROOMS,
-    Package,
     bad_init_files,
     cycles,
     differences,
     heavy_settings,
     long_files,
     misplaced,
-    read_package,
     rooms_unlike_readme,
     torch_imports,
     upward_imports,
 )
+from package_imports import Package, read_package
 
 TOP = Path(__file__).parents[1]
 
