@@ -25,10 +25,10 @@ import numpy as np
 
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
-from mereo.fitting.register import Registrar
-from mereo.fitting.registration import Registration
-from mereo.fitting.track_config import TrackConfig
-from mereo.fitting.tracker import Followed, Tracker
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
+from mereo.fitting.tracking.config import TrackConfig
+from mereo.fitting.tracking.tracker import Followed, Tracker
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid

@@ -35,9 +35,9 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.probability_scaling import Scaling
 from mereo.evaluation.reliability import AskedCells
 from mereo.evaluation.scoring import trained_scene
-from mereo.fitting.readings import fitted_frame
-from mereo.fitting.recognition import Recognition, recognized
-from mereo.fitting.register import Registrar
+from mereo.fitting.registration.readings import fitted_frame
+from mereo.fitting.registration.recognition import Recognition, recognized
+from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.io.atomic_files import atomic_file
 from mereo.models.model import Model

@@ -9,11 +9,20 @@ from toy_scene import Shear, toy_scene
 from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
 from mereo.evaluation.recognition_gauge import RecognitionGauge, usual_of
 from mereo.evaluation.sample_views import load_view
-from mereo.fitting.answer import answer
-from mereo.fitting.noise import ACCEPTED
-from mereo.fitting.recognition import CLIPPED, CONSERVATIVE, MOST, NOT_ASKED, Recognition, Signs, recognize, strangeness
-from mereo.fitting.register import Registrar
-from mereo.fitting.registration import Registration
+from mereo.fitting.problem.noise import ACCEPTED
+from mereo.fitting.registration.answer import answer
+from mereo.fitting.registration.recognition import (
+    CLIPPED,
+    CONSERVATIVE,
+    MOST,
+    NOT_ASKED,
+    Recognition,
+    Signs,
+    recognize,
+    strangeness,
+)
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.models.calibration import Calibration, Recognizing, Usual
 from mereo.models.weights import load_model

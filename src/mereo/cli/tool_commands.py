@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
-from mereo.fitting.track_config import StreamFit
+from mereo.fitting.tracking.config import StreamFit
 from mereo.io.bounds import Cells, Count, CountOrNone, Port, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
 from mereo.io.cores import workers_for

@@ -14,9 +14,9 @@ from mereo.evaluation.probability_gauge import ProbabilityGauge
 from mereo.evaluation.radius_gauge import RadiusGauge
 from mereo.evaluation.recognition_gauge import RecognitionGauge
 from mereo.evaluation.scoring import check_names, trained_scene
-from mereo.fitting.readings import FittedFrame, fitted_frame
-from mereo.fitting.register import Registrar, registrar_for
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration.readings import FittedFrame, fitted_frame
+from mereo.fitting.registration.register import Registrar, registrar_for
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.io.progress import progress
 from mereo.models.calibration import Calibration

@@ -9,8 +9,8 @@ from mereo.evaluation.calibration_views import CalibrationView
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.probability_scaling import Scaling, fit_scaling
 from mereo.evaluation.reliability import AskedCells
-from mereo.fitting.readings import FittedFrame
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration.readings import FittedFrame
+from mereo.fitting.registration.registration import Registration
 from mereo.models.model import Model
 
 CELLS = 60

@@ -6,10 +6,10 @@ import numpy as np
 
 from mereo.evaluation.calibration_views import CalibrationView
 from mereo.evaluation.coverage import RadiusRatios, seen_points
-from mereo.fitting.readings import FittedFrame
-from mereo.fitting.recognition import is_noisy
-from mereo.fitting.register import Registrar
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration.readings import FittedFrame
+from mereo.fitting.registration.recognition import is_noisy
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
 
 FIELDS = ("radius_scale", "noisy_radius_scale", "draws_radius_scale", "noisy_draws_radius_scale")
 """Fields of ``Calibration``: of modes, clean and noisy, and of draws."""

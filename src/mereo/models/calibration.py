@@ -14,7 +14,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 SignName = Literal["size", "unexplained", "ruled_out", "beyond", "unusual", "displaced"]
-"""Signs that a frame does not show the object in a state that was learned; ``mereo.fitting.recognition`` tells them."""
+"""Signs that a frame does not show the object in a state that was learned; ``fitting.registration`` tells them."""
 
 
 class Usual(BaseModel, frozen=True):
@@ -25,7 +25,7 @@ class Usual(BaseModel, frozen=True):
 
 
 class Recognizing(BaseModel, frozen=True):
-    """What tells the object in learned states from other things and states (``mereo.fitting.recognition``).
+    """What tells the object in learned states from other things and states (``fitting.registration.recognition``).
 
     Attributes:
         clean: usual signs of views without noise beyond the paper's.

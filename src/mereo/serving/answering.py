@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from mereo.fitting.register import Registrar, registrar_for
+from mereo.fitting.registration.register import Registrar, registrar_for
 from mereo.io.atomic_files import to_json
 from mereo.io.foreseen import is_foreseen
 from mereo.io.sensor_frame import read_frame

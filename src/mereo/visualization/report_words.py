@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mereo.fitting.recognition import told_of
+from mereo.fitting.registration.recognition import told_of
 from mereo.geometry.radii import level_told
 from mereo.visualization.units import Unit, rounded
 

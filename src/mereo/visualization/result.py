@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mereo.fitting.answer import Answer
-from mereo.fitting.carry import Carried
-from mereo.fitting.register import Registrar, describe
-from mereo.fitting.registration_state import write_state
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.carry import Carried
+from mereo.fitting.registration.register import Registrar, describe
+from mereo.fitting.registration.state import write_state
 from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import atomic_file

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from mereo.evaluation.sample_views import load_frame, shipped_views
-from mereo.fitting.register import statistical_model_of
-from mereo.fitting.registration_state import played_state, restored
-from mereo.fitting.state_file import RegistrationState, is_state, read_state
+from mereo.fitting.registration.register import statistical_model_of
+from mereo.fitting.registration.state import played_state, restored
+from mereo.fitting.registration.state_file import RegistrationState, is_state, read_state
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.models.config import InferenceConfig
