@@ -20,6 +20,7 @@ class CalibrateCommand:
         output: file to write; by default the weights' own, which --force replaces.
         scene: the scene's name or file, where it is not the built-in one that the weights were trained on.
         views: of the object, half of them clean; about as many frames of other things come on top.
+        radius_views: further clean views of the object for the radii alone; 0 for none.
         seed: a training seed, below 1,000,000, other than that of the weights' examples.
         force: replace an existing file.
         threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
@@ -29,6 +30,7 @@ class CalibrateCommand:
     output: Path | None = None
     scene: str | None = None
     views: Count = 48
+    radius_views: CountOrNone = 32
     seed: CountOrNone = 900_000
     force: bool = False
     threads: Threads = 0
@@ -38,5 +40,11 @@ class CalibrateCommand:
         from mereo.cli.calibration import calibrate_weights
 
         calibrate_weights(
-            self.weights, self.output, scene=self.scene, views=self.views, seed=self.seed, force=self.force
+            self.weights,
+            self.output,
+            scene=self.scene,
+            views=self.views,
+            radius_views=self.radius_views,
+            seed=self.seed,
+            force=self.force,
         )

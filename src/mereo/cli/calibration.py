@@ -10,7 +10,7 @@ from mereo.scenes.registry import files_of
 
 
 def calibrate_weights(
-    weights: str, output: Path | None, *, scene: str | None, views: int, seed: int, force: bool
+    weights: str, output: Path | None, *, scene: str | None, views: int, radius_views: int, seed: int, force: bool
 ) -> None:
     """Calibrate weights, write them to ``output`` or, with ``force``, in their own place, and print what was found.
 
@@ -19,7 +19,7 @@ def calibrate_weights(
     path = find_weights(weights)
     place = path if output is None else output
     with atomic_file(place, force=force, inputs=[] if scene is None else files_of(scene)) as partial:
-        found = calibrate(load_model(weights), scene, views=views, seed=seed, quiet=False)
+        found = calibrate(load_model(weights), scene, views=views, seed=seed, radius_views=radius_views, quiet=False)
         partial.write_bytes(with_calibration(path, found))
     for title, value in calibration_rows(found):
         print(f"{title:<14} {value}")

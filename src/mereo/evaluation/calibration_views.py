@@ -81,10 +81,19 @@ class StrangeFrame:
 def own_views(scene: Scene, count: int, seed: int) -> Iterator[CalibrationView]:
     """Views of a scene; view i is made from (seed, i) alone."""
     for index in range(count):
-        camera = CAMERAS[index % len(CAMERAS)]
-        view = sample_view(scene.for_seed(seed), GenerateConfig(sensor=SENSORS[camera]), example_rng(seed, index))
         scene_unit = 1.0 if index // len(CAMERAS) % 2 == 0 else None
-        yield CalibrationView(view.mesh, view.depth.to_points(), camera, scene_unit, partial(true_material, view))
+        yield _own_view(scene, seed, index, CAMERAS[index % len(CAMERAS)], scene_unit)
+
+
+def clean_views(scene: Scene, count: int, seed: int, first: int) -> Iterator[CalibrationView]:
+    """Views of a scene by the paper's camera, with the unit known, from view ``first`` on."""
+    for index in range(first, first + count):
+        yield _own_view(scene, seed, index, "paper", 1.0)
+
+
+def _own_view(scene: Scene, seed: int, index: int, camera: Sensor, scene_unit: float | None) -> CalibrationView:
+    view = sample_view(scene.for_seed(seed), GenerateConfig(sensor=SENSORS[camera]), example_rng(seed, index))
+    return CalibrationView(view.mesh, view.depth.to_points(), camera, scene_unit, partial(true_material, view))
 
 
 def strange_frames(scene: Scene, each: int, seed: int) -> Iterator[StrangeFrame]:

@@ -154,7 +154,7 @@ def _places(one: TestCase, answer: Candidate) -> RegisteredPlaces | None:
     seen = seen_points(truth, one.cloud, one.scene_unit)
     return RegisteredPlaces(
         RegistrationErrors.of(registration, truth, seen, one.scene_unit),
-        RadiusRatios.of(registration, truth, seen).by(registration.radius_scale),
+        RadiusRatios.of(registration, truth, seen),
         registration.radius_scale is not None,
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from mereo.evaluation.calibration_views import CalibrationView
 from mereo.fitting.registration.readings import FittedFrame
-from mereo.fitting.registration.recognition import CLIPPED, CONSERVATIVE, LEAST, Signs, is_noisy, strangeness
+from mereo.fitting.registration.recognition import CONSERVATIVE, LEAST, Signs, displaced_of, is_noisy, strangeness
 from mereo.fitting.registration.registration import Registration
 from mereo.models.calibration import Recognizing, SignName, Usual
 
@@ -79,7 +79,7 @@ class RecognitionGauge:
 def signs_of(frame: FittedFrame, registration: Registration) -> Signs:
     """Signs of a registration of a frame whose unit says nothing."""
     assert frame.modes is not None
-    return Signs.of(registration, frame.modes.displaced(registration, CLIPPED))
+    return Signs.of(registration, displaced_of(frame.modes, registration))
 
 
 def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:

@@ -1,5 +1,6 @@
 """Calibration of weights: what was measured, on training seeds, of how far their answers can be trusted."""
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Literal
 
@@ -46,6 +47,41 @@ class Recognizing(BaseModel, frozen=True):
         return self
 
 
+MISFITTING = 2.0
+"""Power of a frame's misfit, over the usual one, by which its radii are wider: a fit that leaves more is farther off than
+in proportion. Of views of the rope at 1.4 to 1.8 times the usual misfit, places were 2.2 to 2.7 times as far off."""
+
+
+@dataclass(frozen=True)
+class RadiusFactors:
+    """What makes radii of the parts that a fit's posterior gives, in frames of one kind.
+
+    Attributes:
+        scale: factor of the Gaussian's radii; None where it was not measured.
+        misfit: usual misfit of the cloud (``ModesFit.misfit_of``), above which they are wider; None without one.
+        displaced: how far network and registered model are apart in most views (``ModesFit.displaced``), above which
+            every place is as unsure as they are farther apart; None where that says nothing.
+    """
+
+    scale: float | None = None
+    misfit: float | None = None
+    displaced: float | None = None
+
+    def widening(self, misfit: float) -> float:
+        """Factor of the scale in a frame of this misfit, 1 and more."""
+        return 1.0 if self.misfit is None else max(misfit / self.misfit, 1.0) ** MISFITTING
+
+    def scale_at(self, misfit: float) -> float | None:
+        """Scale in a frame of this misfit."""
+        return None if self.scale is None else self.scale * self.widening(misfit)
+
+    def beside(self, displaced: float | None) -> float:
+        """Radius that every place has beside, where network and model are so far apart; in shares of half the length."""
+        if self.displaced is None or displaced is None:
+            return 0.0
+        return float(np.sqrt(max(displaced**2 - self.displaced**2, 0.0)))
+
+
 class Calibration(BaseModel, frozen=True):
     """What views of training seeds showed about the answers of these weights; parts that were not measured are None.
 
@@ -56,6 +92,8 @@ class Calibration(BaseModel, frozen=True):
             true positions, in frames without noise beyond the paper's.
         noisy_radius_scale: the same of simulated depth cameras' frames.
         draws_radius_scale, noisy_draws_radius_scale: both, of fits of a scene's own draws instead of the modes.
+        usual_misfit, draws_usual_misfit: ``RadiusFactors.misfit`` of the first and the third of these scales.
+        usual_displaced, draws_usual_displaced: ``RadiusFactors.displaced`` of the same.
         temperature: by which logits are divided before they become probabilities (temperature scaling; Guo et al.,
             ICML 2017).
         biases: added to the divided logits of empty space and each segment (with the temperature: vector scaling, but
@@ -70,16 +108,22 @@ class Calibration(BaseModel, frozen=True):
     noisy_radius_scale: Positive | None = None
     draws_radius_scale: Positive | None = None
     noisy_draws_radius_scale: Positive | None = None
+    usual_misfit: Positive | None = None
+    draws_usual_misfit: Positive | None = None
+    usual_displaced: Positive | None = None
+    draws_usual_displaced: Positive | None = None
     temperature: Positive | None = None
     biases: tuple[FiniteFloat, ...] | None = None
     ece: tuple[Share, Share] | None = None
     recognizing: Recognizing | None = None
 
-    def radius_scales(self, noisy: bool) -> tuple[float | None, float | None]:
-        """Factors of the radii of a fit of the modes and of one of draws, to a clean or a camera's noisy frame."""
+    def radii(self, *, draws: bool, noisy: bool) -> RadiusFactors:
+        """What makes the radii of a fit of draws, or of the modes, to a camera's noisy frame, or to a clean one."""
         if noisy:
-            return self.noisy_radius_scale, self.noisy_draws_radius_scale
-        return self.radius_scale, self.draws_radius_scale
+            return RadiusFactors(self.noisy_draws_radius_scale if draws else self.noisy_radius_scale)
+        if draws:
+            return RadiusFactors(self.draws_radius_scale, self.draws_usual_misfit, self.draws_usual_displaced)
+        return RadiusFactors(self.radius_scale, self.usual_misfit, self.usual_displaced)
 
     def scaled(self, logits: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
         """Logits divided by the temperature, plus the biases; as they are where there is no temperature.
@@ -113,7 +157,7 @@ def calibration_rows(found: Calibration | None) -> list[tuple[str, str]]:
         error = "" if found.ece is None else f"; calibration error {found.ece[0]:.3f}, with it {found.ece[1]:.3f}"
         rows.append(("probabilities", f"{kind} ({found.temperature:.2f}){error}"))
     for what, noisy in (("radii", False), ("radii of noisy frames", True)):
-        modes, draws = found.radius_scales(noisy)
+        modes, draws = (found.radii(draws=each, noisy=noisy).scale for each in (False, True))
         if modes is not None:
             of_draws = "" if draws is None else f", {draws:.2f} of fits of the scene's draws"
             rows.append((what, f"the posterior's times {modes:.2f} of fits of the modes{of_draws}"))

@@ -56,6 +56,24 @@ def radius_by_moments(first: Float[np.ndarray, " n"], second: Float[np.ndarray, 
 
 
 @dataclass(frozen=True, eq=False)
+class RadiusParts:
+    """Radii of 95 % in two parts, whose squares add: views of the object say how far the first is to be trusted.
+
+    Attributes:
+        gaussian: by the Gaussian around the optimum, which a calibration scales.
+        open: by what else the frame leaves open, far from it (``Posterior.open``), which is as it is.
+    """
+
+    gaussian: Float[np.ndarray, " n"]
+    open: Float[np.ndarray, " n"]
+
+    def radii(self, scale: float = 1.0, beside: float = 0.0) -> Float[np.ndarray, " n"]:
+        """Radii with a scale of the Gaussian, and a radius that all points have beside; in the parts' unit."""
+        result: np.ndarray = np.sqrt((scale * self.gaussian) ** 2 + self.open**2 + beside**2)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
 class Terms:
     """What a fit's normal equations at its optimum are made of.
 
@@ -89,8 +107,8 @@ class Posterior:
         modes: how each of them moves with the coefficients, before the pose.
         factor: p x p, ``factor factor^T`` is the covariance of the parameters.
         residue: root mean square distance of the object's states from what the coefficients can express.
-        turns: motion of the material points with further standard normal numbers, of what is far from Gaussian
-            (``own_turns``), in the camera's axes; None without.
+        open: motion of the material points with further standard normal numbers, by the second moments of what is far
+            from Gaussian (``own_turns``, a state beside rest), in the camera's axes; None without.
     """
 
     posed: Posed
@@ -98,7 +116,7 @@ class Posterior:
     modes: Float32[np.ndarray, "m 3 k"]
     factor: Float[np.ndarray, "p p"]
     residue: float = 0.0
-    turns: Float32[np.ndarray, "m 3 e"] | None = None
+    open: Float32[np.ndarray, "m 3 e"] | None = None
 
     @classmethod
     def of(
@@ -108,10 +126,10 @@ class Posterior:
         material: Float[np.ndarray, "m 3"],
         modes: Float32[np.ndarray, "m 3 k"],
         residue: float = 0.0,
-        turns: Float32[np.ndarray, "m 3 e"] | None = None,
+        open: Float32[np.ndarray, "m 3 e"] | None = None,  # noqa: A002 (as the attribute)
     ) -> "Posterior":
         """Posterior whose precision is the matrix of the normal equations at the optimum."""
-        return cls(posed, material, modes, covariance_factor(normal.matrix), residue, turns)
+        return cls(posed, material, modes, covariance_factor(normal.matrix), residue, open)
 
     @cached_property
     def _local(self) -> tuple[Float32[np.ndarray, "r p"], Float32[np.ndarray, "k p"]]:
@@ -138,29 +156,27 @@ class Posterior:
             moved += self.modes[rows].reshape(-1, len(state)) @ state
         return moved.reshape(-1, 3, moved.shape[1])
 
-    def radii(self, follow: PointWeights | None = None) -> Float[np.ndarray, " n"]:
-        """Radius of 95 % of all material points, or of points that follow them; scene units."""
+    def radii(self, follow: PointWeights | None = None) -> "RadiusParts":
+        """Radii of 95 % of all material points, or of points that follow them; scene units."""
         with one_blas_thread():
-            motion, turned = self.motion, self._turned(slice(None))
-            return self._radii(motion, turned) if follow is None else self._radii(follow(motion), follow(turned))
+            motion, beside = self.motion, self._open(slice(None))
+            return self._radii(motion, beside) if follow is None else self._radii(follow(motion), follow(beside))
 
-    def radii_of(self, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Radius of 95 % of some material points alone, which costs as little as they are few."""
+    def radii_of(self, rows: Int[np.ndarray, " n"]) -> "RadiusParts":
+        """Radii of 95 % of some material points alone, which cost as little as they are few."""
         with one_blas_thread():
-            return self._radii(self._motion(rows), self._turned(rows))
+            return self._radii(self._motion(rows), self._open(rows))
 
-    def _turned(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 e"]:
-        """``turns`` in the object's axes."""
-        if self.turns is None:
+    def _open(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 e"]:
+        """``open`` in the object's axes."""
+        if self.open is None:
             return np.zeros((len(self._arm[rows]), 3, 0), dtype=np.float32)
-        return np.matmul(self.posed.rotation.T.astype(np.float32), self.turns[rows])
+        return np.matmul(self.posed.rotation.T.astype(np.float32), self.open[rows])
 
-    def _radii(
-        self, motion: Float32[np.ndarray, "n 3 p"], turned: Float32[np.ndarray, "n 3 e"]
-    ) -> Float[np.ndarray, " n"]:
-        spread = sum(np.matmul(part, part.transpose(0, 2, 1)).astype(np.float64) for part in (motion, turned))
-        spread[:, range(3), range(3)] += self.residue**2 / 3
-        return radius95(spread)
+    def _radii(self, motion: Float32[np.ndarray, "n 3 p"], beside: Float32[np.ndarray, "n 3 e"]) -> "RadiusParts":
+        near, far = (np.matmul(part, part.transpose(0, 2, 1)).astype(np.float64) for part in (motion, beside))
+        near[:, range(3), range(3)] += self.residue**2 / 3
+        return RadiusParts(radius95(near), radius95(far))
 
     def motion_of(self, gradient: Float[np.ndarray, "c v 3"]) -> Float[np.ndarray, "c p"]:
         """Change of c numbers with each of p independent standard normal ones.

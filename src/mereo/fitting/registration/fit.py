@@ -24,16 +24,20 @@ from mereo.fitting.problem.correspondences import Correspondences, find_correspo
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import Surface
+from mereo.fitting.problem.residuals import Surface, robust_square
 from mereo.fitting.problem.scene_unit import agree, estimate_unit
 from mereo.fitting.registration.registration import Method, Registration
 from mereo.fitting.uncertainty.optimum import DrawsOptimum, ModesOptimum, Optimum
 from mereo.geometry.camera import PointCloud
 from mereo.io.cores import one_blas_thread
+from mereo.models.calibration import Calibration
 from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.statistical_model import StatisticalModel
 
 KNOWN_SCALE_STD = 1e-6
+
+CLIPPED = 0.5
+"""Largest distance of one place that counts in ``ModesFit.displaced``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +51,7 @@ class ModesFit:
         posed: coefficients and pose.
         seconds: that it took.
         rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
-        radius_scale, draws_radius_scale: factors of the radii of the modes' uncertainty, and of that of draws, by the
-            network's calibration.
+        calibration: the network's, by which radii are scaled.
     """
 
     problem: Problem
@@ -57,8 +60,7 @@ class ModesFit:
     posed: Posed
     seconds: float
     rest: Judged | None = None
-    radius_scale: float | None = None
-    draws_radius_scale: float | None = None
+    calibration: Calibration | None = None
 
     @classmethod
     def of(
@@ -125,7 +127,8 @@ class ModesFit:
     def registration(self) -> Registration:
         """The answer of the modes, or the rest model where the frame speaks for that."""
         if self.rest is not None:
-            end = ModesOptimum(of_rest(self.problem, self.found), self.rest.posed, self.unit)
+            bent = self.posed.place(self.problem.model.material(self.posed.z))
+            end = ModesOptimum(of_rest(self.problem, self.found), self.rest.posed, self.unit, bent)
             return self._registration("rest", self.problem.model.rest_z, end, self.rest.posed, self.surface)
         end = ModesOptimum(self.problem, self.posed, self.unit)
         return self._registration("modes", self.posed.z, end, self.posed, self.surface)
@@ -160,6 +163,7 @@ class ModesFit:
     ) -> Registration:
         distance = surface.nearest(self.problem.evidence.partners)[0]
         explained = float((distance <= self.tolerance).mean())
+        scale, beside = self._radius_factors(method, surface)
         return Registration(
             model=self.problem.model,
             material=surface.material * self.unit,
@@ -174,8 +178,22 @@ class ModesFit:
             ruled_out=self.problem.ruled_out(surface),
             needed=self.problem.config.accepted,
             optimum=optimum,
-            radius_scale=self.draws_radius_scale if method == "draws" else self.radius_scale,
+            radius_scale=scale,
+            radius_beside=beside,
         )
+
+    def _radius_factors(self, method: Method, surface: Surface) -> tuple[float | None, float]:
+        """``Registration.radius_scale`` and ``radius_beside``."""
+        if self.calibration is None:
+            return None, 0.0
+        factors = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy)
+        scale = factors.scale if factors.misfit is None else factors.scale_at(self.misfit_of(surface))
+        displaced = None if factors.displaced is None else self.displaced(surface.material)
+        return scale, self.problem.model.half * factors.beside(displaced)
+
+    def misfit_of(self, surface: Surface) -> float:
+        """The cloud's misfit, in squared standard deviations of a partner."""
+        return float(robust_square(self.problem.met(surface)[0], self.problem.config.cloud_sigma).mean())
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
         """Whether a fit explains enough of the points; less is enough where the network sees the same segments there.
@@ -195,14 +213,20 @@ class ModesFit:
         model = self.problem.model
         return float((model.labels[model.faces[surface.facing[face], 0]] == seen.labels).mean())
 
-    def displaced(self, registration: Registration, most: float) -> float | None:
-        """``Signs.displaced`` of a registration of this frame; None where the network was not asked."""
+    def displaced(self, material: Float[np.ndarray, "m 3"]) -> float | None:
+        """How far the network has the places of the object from where they are, as a share of half its length.
+
+        Root mean square, each ``CLIPPED`` at most; None where the network was not asked.
+
+        Args:
+            material: places of the material points in this frame, scene units.
+        """
         if len(self.found.points) == 0:
             return None
         model = self.problem.model
-        place = model.weights(self.found.rest, self.found.labels)(registration.material) / self.unit
+        place = model.weights(self.found.rest, self.found.labels)(material)
         apart = np.linalg.norm(place - self.found.points, axis=1) / model.half
-        return float(np.sqrt((np.minimum(apart, most) ** 2).mean()))
+        return float(np.sqrt((np.minimum(apart, CLIPPED) ** 2).mean()))
 
 
 def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:
@@ -251,9 +275,7 @@ def fit_frame(
         return _asked(network, model, network.encode(PointCloud(points)))
 
     fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask)
-    known = network.calibration
-    scales = (None, None) if known is None else known.radius_scales(fitted.problem.noisy)
-    return replace(fitted, seconds=fitted.seconds + asked, radius_scale=scales[0], draws_radius_scale=scales[1])
+    return replace(fitted, seconds=fitted.seconds + asked, calibration=network.calibration)
 
 
 def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Correspondences:

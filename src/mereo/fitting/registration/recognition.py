@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.readings import FittedFrame
 from mereo.fitting.registration.registration import BELIEVED, Registration
 from mereo.models.calibration import Calibration, Recognizing, SignName, Usual
@@ -64,9 +65,6 @@ CONSERVATIVE = Recognizing(
 LEAST_LEFT = 0.01
 """Smallest share of the points that a believed fit may leave unexplained, whatever a caller has set."""
 
-CLIPPED = 0.5
-"""Largest distance of one place that counts in ``Signs.displaced``."""
-
 
 @dataclass(frozen=True)
 class Signs:
@@ -80,8 +78,8 @@ class Signs:
         ruled_out: share of the model's surface that the frame rules out.
         beyond: how far the state lies outside all that were learned, scene units; None at rest.
         unusual: mean square of the state's coefficients; None at rest.
-        displaced: root mean square distance between where the network and the registered model have the same places of
-            the object, each ``CLIPPED`` at most, as a share of half its length; None where the network was not asked.
+        displaced: how far apart network and registered model have the same places of the object, as a share of half its
+            length (``ModesFit.displaced``); None where the network was not asked.
     """
 
     size: float | None = None
@@ -205,11 +203,16 @@ def recognize(
     return Recognition(known, reason, total, signs, own is not None)
 
 
+def displaced_of(modes: ModesFit, registration: Registration) -> float | None:
+    """``Signs.displaced`` of a registration made of a fit of the modes."""
+    return modes.displaced(registration.material / modes.unit)
+
+
 def recognized(
     found: FittedFrame, registration: Registration | None, model: Model, stated_unit: float | None = None
 ) -> Recognition:
     """Whether a frame shows the object that ``registration``, made of it, is of."""
-    displaced = None if registration is None or found.modes is None else found.modes.displaced(registration, CLIPPED)
+    displaced = None if registration is None or found.modes is None else displaced_of(found.modes, registration)
     refusal = None if found.error is None else str(found.error)
     return recognize(registration, model.calibration, displaced, stated_unit, refusal)
 

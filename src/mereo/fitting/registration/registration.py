@@ -84,7 +84,8 @@ class Registration:
         needed: least ``explained`` of a frame of this noise to be believed.
         optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
             where the registration was read from a file.
-        radius_scale: factor of the radii by the weights' calibration of such fits; None without one.
+        radius_scale: factor of the radii by the weights' calibration of such fits to such frames; None without one.
+        radius_beside: radius that every place has beside that, as ``Uncertainty.beside``; scene units.
     """
 
     model: StatisticalModel
@@ -102,6 +103,7 @@ class Registration:
     needed: float = BELIEVED
     optimum: Optimum | None = None
     radius_scale: float | None = None
+    radius_beside: float = 0.0
 
     def __repr__(self) -> str:
         trust = "" if self.accepted else "not believed, "
@@ -178,7 +180,9 @@ class Registration:
     @cached_property
     def uncertainty(self) -> Uncertainty | None:
         """How far the true places may be from the registered ones; None where the registration was read from a file."""
-        return None if self.optimum is None else Uncertainty(self.optimum, self.model, self.radius_scale)
+        if self.optimum is None:
+            return None
+        return Uncertainty(self.optimum, self.model, self.radius_scale, self.radius_beside)
 
     def radius95(
         self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Literal["camera", "rest"]

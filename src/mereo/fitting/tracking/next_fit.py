@@ -28,6 +28,7 @@ from mereo.fitting.registration.fit import KNOWN_SCALE_STD, ModesFit
 from mereo.fitting.tracking.config import TrackConfig
 from mereo.geometry.downsampling import means_along_sight
 from mereo.io.cores import one_blas_thread
+from mereo.models.calibration import Calibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ class Track:
         unsure: how far the velocity may be off because little is known yet, scene units per second.
         noise: of the frames, smoothed, scene units.
         clean: constants of frames without noise; ``problem`` has those for ``noise``.
-        radius_scale: as ``ModesFit`` has it.
+        calibration: as ``ModesFit`` has it.
     """
 
     problem: Problem
@@ -54,7 +55,7 @@ class Track:
     unsure: float
     noise: float
     clean: FitConfig
-    radius_scale: float | None = None
+    calibration: Calibration | None = None
 
     @classmethod
     def of(
@@ -72,7 +73,7 @@ class Track:
         share_surfaces(base, problem)
         still, noise = np.zeros(POSE + model.count), fitted.problem.noise_beside(fitted.surface)
         unit, unsure = fitted.unit * scale, config.first_speed
-        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, fitted.radius_scale)
+        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, fitted.calibration)
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
@@ -144,7 +145,7 @@ def next_fit(
         passed = max(time_s - track.time_s, 0.0)
         posed = descend(problem, start, Expectation.of(track, start, passed, config), config)
     seconds = time.perf_counter() - started
-    fitted = ModesFit(problem, nothing(), track.unit, posed, seconds, radius_scale=track.radius_scale)
+    fitted = ModesFit(problem, nothing(), track.unit, posed, seconds, calibration=track.calibration)
     return fitted, followed(track, fitted, time_s, config)
 
 
@@ -157,7 +158,7 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     noise = track.noise + config.smoothing * (fitted.problem.noise_beside(fitted.surface) - track.noise)
     problem = replace(fitted.problem, config=constants_for(noise, track.clean))
     share_surfaces(fitted.problem, problem)
-    return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise, track.clean, track.radius_scale)
+    return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise, track.clean, track.calibration)
 
 
 def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:

@@ -28,11 +28,14 @@ class ModesOptimum:
         problem: everything the fit worked on.
         posed: coefficients and pose.
         unit: length of a scene unit in the input's unit, before the fit's own scale.
+        bent: places of the material points by a fit of the modes, where the answer is the rest model: an object that
+            is hardly bent may pass for one at rest. None else.
     """
 
     problem: Problem
     posed: Posed
     unit: float
+    bent: Float[np.ndarray, "m 3"] | None = None
 
     @property
     def tolerance(self) -> float:
@@ -57,10 +60,15 @@ class ModesOptimum:
             )
 
     @cached_property
+    def surface(self) -> Surface:
+        """The posed surface."""
+        return Surface.of(self.problem.model, self.posed)
+
+    @cached_property
     def observed(self) -> Observed:
         """Observed points beside the surface."""
         points = self.problem.evidence.points
-        return points, Surface.of(self.problem.model, self.posed).nearest(points)[0]
+        return points, self.surface.nearest(points)[0]
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -68,8 +76,10 @@ class ModesOptimum:
         model = self.problem.model
         material = self.posed.place(model.material(self.posed.z))
         with one_blas_thread():
-            turns = turns_left_open(self.problem, material)
-            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, turns)
+            beside = turns_left_open(self.problem, material)
+            if self.bent is not None:
+                beside = np.concatenate([beside, (self.bent - material)[:, :, None].astype(np.float32)], axis=2)
+            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, beside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +108,11 @@ class DrawsOptimum:
             return terms_of_draws(self.problem, self.fit, self._motion, self.problem.base.config.cloud_sigma)
 
     @property
+    def surface(self) -> Surface:
+        """The posed surface."""
+        return self.fit.surface
+
+    @property
     def _motion(self) -> Float32[np.ndarray, "a 3 d"]:
         assert self.fit.motion is not None
         return self.fit.motion
@@ -118,7 +133,7 @@ class DrawsOptimum:
         material: Float[np.ndarray, "m 3"] = self.fit.placed()
         with one_blas_thread():
             turns = turns_left_open(self.problem.base, material)
-            return Posterior.of(self.terms.total, self.fit.posed, material, modes, turns=turns)
+            return Posterior.of(self.terms.total, self.fit.posed, material, modes, open=turns)
 
 
 def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mereo.fitting.problem.posterior import WITHIN, Posterior, radius95
+from mereo.fitting.problem.posterior import WITHIN, Posterior, RadiusParts, radius95
 from mereo.fitting.uncertainty.explanation import Decided, Weighing
 from mereo.fitting.uncertainty.optimum import Optimum
 from mereo.geometry.mesh import SegmentedMesh
@@ -50,13 +50,15 @@ class Uncertainty:
     Attributes:
         optimum: where the fit has ended.
         model: statistical model of the object.
-        scale: factor by which views of training seeds showed the posterior's radii to be too small; None where that
-            was not measured, and then they are as the posterior has them.
+        scale: factor by which views of training seeds showed the posterior's radii to be too small, in frames like
+            this; None where that was not measured, and then they are as the posterior has them.
+        beside: radius that every place has beside that, because the network has the object elsewhere; scene units.
     """
 
     optimum: Optimum
     model: StatisticalModel
     scale: float | None = None
+    beside: float = 0.0
 
     @property
     def calibrated(self) -> bool:
@@ -69,19 +71,27 @@ class Uncertainty:
         return self.optimum.posterior
 
     @property
-    def _factor(self) -> float:
-        return self.optimum.unit * (1.0 if self.scale is None else self.scale)
+    def _scale(self) -> float:
+        return 1.0 if self.scale is None else self.scale
+
+    def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
+        return self.optimum.unit * parts.radii(self._scale, self.beside)
+
+    @cached_property
+    def parts(self) -> RadiusParts:
+        """Parts of the ``radius95`` of all material points, as the posterior has them; scene units."""
+        return self.posterior.radii()
 
     @cached_property
     def material(self) -> Float[np.ndarray, " m"]:
         """``radius95`` of all material points of the model: vertices of all segments, then interior points."""
-        return self._factor * self.posterior.radii()
+        return self._of(self.parts)
 
     @cached_property
     def outline(self) -> Float[np.ndarray, " w"]:
         """``radius95`` of a few hundred vertices, evenly spread: quicker than of all."""
         rows = self.model.witnesses[:: max(1, len(self.model.witnesses) // OUTLINE)]
-        return self._factor * self.posterior.radii_of(rows)
+        return self._of(self.posterior.radii_of(rows))
 
     @property
     def vertices(self) -> tuple[Float[np.ndarray, " v"], ...]:
@@ -99,7 +109,7 @@ class Uncertainty:
         result = np.empty(len(points))
         for first in range(0, len(points), AT_ONCE):
             rows = slice(first, first + AT_ONCE)
-            result[rows] = self._factor * self.posterior.radii(self.model.weights(points[rows], labels[rows]))
+            result[rows] = self._of(self.posterior.radii(self.model.weights(points[rows], labels[rows])))
         return result
 
     @cached_property
@@ -113,12 +123,12 @@ class Uncertainty:
     @cached_property
     def segments(self) -> tuple[SegmentUncertainty, ...]:
         """Each segment's, of the volume that belongs to it, without that of segments nested in it."""
-        scale, cubed = 1.0 if self.scale is None else self.scale, self.optimum.unit**3
+        unit, scale = self.optimum.unit, self._scale
         result = []
         for name, volume, motion in zip(self.model.rest.names, *self._own, strict=True):
             off = WITHIN * scale * float(np.linalg.norm(motion[0]))
-            radius = self._factor * float(radius95((motion[1:] @ motion[1:].T)[None])[0])
-            between = (max(float(volume) - off, 0.0) * cubed, (float(volume) + off) * cubed)
+            radius = unit * float(np.hypot(scale * radius95((motion[1:] @ motion[1:].T)[None])[0], self.beside))
+            between = (max(float(volume) - off, 0.0) * unit**3, (float(volume) + off) * unit**3)
             result.append(SegmentUncertainty(name, radius, between))
         return tuple(result)
 
