@@ -13,7 +13,8 @@ from test_fitting_theorems import IN_FRONT, said, seen
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.fitting.config import MANY_DRAWS
-from mereo.fitting.draws_fit import descend, jump, likely_to_jump
+from mereo.fitting.draws_descent import descend
+from mereo.fitting.draws_fit import jump, likely_to_jump
 from mereo.fitting.draws_problem import DrawsProblem, played
 from mereo.fitting.fit import ModesFit
 from mereo.fitting.gauss_newton import Posed

@@ -108,6 +108,9 @@ class DrawsConfig:
             draws fitted to that shape again.
         jumps: how often one draw may jump to one of ``places`` places, of which the ``places_kept`` best are compared.
         sliding: most share of a draw's motion that may leave the surface; 1 lets all draws jump.
+        turned_worse: misfit by which a state may be worse with segments stiffly turned that look alike turned
+            (``turned_segments``), for that shape to be tried.
+        turned_sieve: ``sieve`` for it; one start is then fitted to the frame.
         asked_again: whether the network's answer is a start too, where the cloud is not explained.
         few: scenes with more draws than this get ``MANY_DRAWS`` instead: every set of differences plays each draw once.
         near: how many states count as near where draws are guessed from the modes.
@@ -139,6 +142,8 @@ class DrawsConfig:
     places: int = 6
     places_kept: int = 5
     sliding: float = 1.0
+    turned_worse: float = 25.0
+    turned_sieve: tuple[tuple[int, int], ...] = ((1, 4), (1, 1))
     asked_again: bool = True
     few: int = 30
     near: int = 100

@@ -124,6 +124,17 @@ def played(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], pose
     if deformations is None:
         return None
     material = material_moved(problem.scene, problem.model, deformations)
+    return beside(problem, drawn, z, posed, material)
+
+
+def beside(
+    problem: DrawsProblem,
+    drawn: Drawn,
+    z: Float[np.ndarray, " d"],
+    posed: Posed,
+    material: Float[np.ndarray, "m 3"],
+) -> DrawsFit | None:
+    """Material points beside the frame as those of a state; None where no face of them is seen."""
     rigid = replace(posed, z=np.empty(0))
     surface = Surface.through(problem.model, rigid.place(material))
     if len(surface.facing) == 0:

@@ -5,7 +5,7 @@ normal. Played back in the order of the calls, the same shares give the same sta
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -163,6 +163,7 @@ class DrawnStates:
         z: their draws, standard normal; NaN of states with other calls than the first that was not drawn again.
         modes: their coefficients in the statistical model.
         played: points whose motion is played for derivatives.
+        recorded: what ``drawn`` has recorded so far.
     """
 
     scene: Scene
@@ -171,6 +172,13 @@ class DrawnStates:
     z: Float[np.ndarray, "n d"]
     modes: Float[np.ndarray, "n k"]
     played: Played
+    recorded: dict[int, Drawn] = field(default_factory=dict)
+
+    def drawn(self, seed: int) -> Drawn:
+        """``Drawn.of`` one of the seeds, recorded once: frames share their starts."""
+        if seed not in self.recorded:
+            self.recorded[seed] = Drawn.of(self.scene, seed)
+        return self.recorded[seed]
 
     @classmethod
     def of(
@@ -201,7 +209,7 @@ class DrawnStates:
         ridge = RIDGE * weight.sum() * float((motion**2).mean()) * np.eye(basis.shape[1])
         ridge[0, 0] = 0.0
         answer = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ self.z[usable])[0]
-        like = Drawn.of(self.scene, self.seeds[usable[0]])
+        like = self.drawn(self.seeds[usable[0]])
         return replace(like, z=np.where(like.smooth, np.clip(answer, -MOST, MOST), like.z))
 
 

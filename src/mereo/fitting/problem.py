@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.correspondences import Correspondences
-from mereo.fitting.evidence import PARTNERS, Evidence
+from mereo.fitting.evidence import MORE_PARTNERS, PARTNERS, Evidence
 from mereo.fitting.gauss_newton import NormalEquations, Posed, Rows
 from mereo.fitting.joints import Joints
 from mereo.fitting.noise import SHARED, constants_for, is_noise, noise_of, shared
@@ -131,6 +131,14 @@ class Problem:
         if cloud < UNEXPLAINED:
             return False
         return cloud > TAILS * (self.noise_beside(surface) / self.config.cloud_sigma) ** 2
+
+    @property
+    def by_every_point(self) -> "Problem":
+        """The problem with as many partners as a noisy frame has; the same where they are all of them already."""
+        evidence = self.evidence
+        if len(evidence.partners) >= min(len(evidence.points), MORE_PARTNERS):
+            return self
+        return replace(self, evidence=evidence.with_more_partners)
 
     def with_network(self, found: Correspondences) -> "Problem":
         """The problem with other correspondences."""
