@@ -129,14 +129,16 @@ def test_a_step_never_leads_up() -> None:
         assert lower(problem, start, motion, 0.2, damping)[0].misfit <= start.misfit
 
 
-def test_the_answer_is_fitted_to_every_point_and_judged_by_as_many_as_others() -> None:
+def test_the_answer_is_fitted_to_every_point_and_judged_by_them() -> None:
     problem = problem_of(TRUTH)
     assert len(problem.base.evidence.points) > PARTNERS
     dense = problem.base.by_every_point
     assert len(dense.evidence.partners) == len(problem.base.evidence.points) and dense.by_every_point is dense
     found = by_sight(problem, state(problem, TRUTH + 0.02))
-    again = played(replace(problem, by_sight=True), found.drawn, found.z, found.posed)
+    again = played(replace(problem, by_sight=True, base=dense), found.drawn, found.z, found.posed)
     assert again is not None and found.misfit == again.misfit and len(found.distance) == PARTNERS
     assert found.motion is not None
     few = problem_of(TRUTH, points=300)
     assert few.base.by_every_point is few.base
+    sparing = replace(problem, config=replace(problem.config, every_point=False))
+    assert sparing.last is problem.base and problem.last is not problem.base

@@ -112,6 +112,7 @@ class DrawsConfig:
             (``turned_segments``), for that shape to be tried.
         turned_sieve: ``sieve`` for it; one start is then fitted to the frame.
         asked_again: whether the network's answer is a start too, where the cloud is not explained.
+        every_point: whether the answer is fitted to every observed point in the end.
         few: scenes with more draws than this get ``MANY_DRAWS`` instead: every set of differences plays each draw once.
         near: how many states count as near where draws are guessed from the modes.
         start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
@@ -145,6 +146,7 @@ class DrawsConfig:
     turned_worse: float = 25.0
     turned_sieve: tuple[tuple[int, int], ...] = ((1, 4), (1, 1))
     asked_again: bool = True
+    every_point: bool = True
     few: int = 30
     near: int = 100
     start_sigma: float = 0.03
@@ -164,5 +166,6 @@ MANY_DRAWS = DrawsConfig(
     places_kept=1,
     sliding=0.2,
     asked_again=False,
+    every_point=False,
 )
 """Constants for scenes with many draws."""

@@ -56,10 +56,10 @@ def by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """The state brought to what the lines of sight meet, by every observed point.
 
     Nearest places lead there from afar, and noise takes them a little beside it; over more points it averages out. The
-    answer has its misfit by as many points as all other states, so that they can be compared.
+    answer has the partners of all other states, but its misfit by every point: those it was fitted to.
     """
     sighted = replace(problem, by_sight=True)
-    dense = replace(sighted, base=sighted.base.by_every_point)
+    dense = replace(sighted, base=problem.last)
     start = played(dense, fit.drawn, fit.z, fit.posed)
     if start is None:
         return fit
@@ -68,7 +68,7 @@ def by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
         return found
     end = played(sighted, found.drawn, found.z, found.posed)
     assert end is not None  # it was played before
-    return replace(end, motion=found.motion)
+    return replace(end, motion=found.motion, misfit=found.misfit)
 
 
 def like_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:

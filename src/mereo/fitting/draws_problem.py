@@ -51,6 +51,11 @@ class DrawsProblem:
         return self.base.model
 
     @property
+    def last(self) -> Problem:
+        """``base`` with the points of the last descent."""
+        return self.base.by_every_point if self.config.every_point else self.base
+
+    @property
     def scene(self) -> Scene:
         """Scene whose draws are played."""
         return self.states.scene

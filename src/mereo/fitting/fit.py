@@ -206,8 +206,8 @@ class ModesFit:
 
 
 def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:
-    """Whether a state of the draws is to be preferred to the modes."""
-    gain = drawn.misfit - problem.base.misfit(modes).total
+    """Whether a state of the draws is to be preferred to the modes, by the points that the answer was fitted to."""
+    gain = drawn.misfit - problem.last.misfit(modes).total
     return gain < 0 or gain < modes_narrowing(problem.base, modes) - draws_narrowing(problem, drawn)
 
 
