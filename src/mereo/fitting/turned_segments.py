@@ -42,7 +42,8 @@ def twins(model: StatisticalModel) -> tuple[Twins, ...]:
         touch[a, b] = a in single and b in single
     count, group = connected_components(touch, directed=False)
     members = [
-        [single[label] for label in np.flatnonzero(group == number) if label in single] for number in range(count)
+        [single[label] for label in np.flatnonzero(group == number).tolist() if label in single]
+        for number in range(count)
     ]
     return tuple(tuple(some) for some in members if len(some) > 1)
 
