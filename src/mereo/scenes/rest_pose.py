@@ -4,6 +4,8 @@ Rest coordinates are ``(rest - centre) / half`` of the joint rest box, ``half`` 
 the object fills [-1, 1] along its longest side.
 """
 
+import hashlib
+
 import numpy as np
 from jaxtyping import Float, Float16
 
@@ -34,6 +36,15 @@ def at_rest(scene: Scene, before: Played) -> Played:
 def is_at_rest(played: Played) -> bool:
     """Whether a state is that of ``at_rest``."""
     return all(isinstance(deformation, Identity) for deformation in played.deformations)
+
+
+def rest_digest(rest: SegmentedMesh) -> str:
+    """SHA-256 of the segments' vertices and faces, the same on every machine."""
+    digest = hashlib.sha256()
+    for segment in rest.segments:
+        for array, dtype in ((segment.vertices, "<f8"), (segment.faces, "<i8")):
+            digest.update(np.ascontiguousarray(array, dtype=dtype).tobytes())
+    return digest.hexdigest()
 
 
 def rest_distances(rest: SegmentedMesh) -> Float16[np.ndarray, "s n n n"]:
