@@ -114,7 +114,7 @@ def test_a_scene_that_has_changed_is_told(change: Callable[[Path], None], tmp_pa
     (tmp_path / "bar.yaml").write_text("# a comment\n" + (tmp_path / "bar.yaml").read_text())
     assert scene_of_result(tmp_path) is not None
     change(tmp_path)
-    with pytest.raises(ValueError, match=r"bar.yaml, which has changed since, or its meshes: bring it back, or reg"):
+    with pytest.raises(ValueError, match=r"bar.yaml; that or its meshes have changed since: bring them back"):
         scene_of_result(tmp_path)
 
 

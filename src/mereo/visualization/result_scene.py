@@ -66,7 +66,7 @@ def scene_of_result(path: Path) -> Scene | None:
         )
     scene = load_scene(told.path)
     if _digest(scene) != told.sha256:
-        raise ValueError(f"{made}, which has changed since, or its meshes: bring it back, or register the frame again")
+        raise ValueError(f"{made}; that or its meshes have changed since: bring them back, or register the frame again")
     return scene
 
 
