@@ -5,12 +5,12 @@ import pytest
 from test_fitting_theorems import IN_FRONT, SCENE, said, seen, shown
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.evidence import Evidence
-from mereo.fitting.fit import KNOWN_SCALE_STD, ModesFit, fit_correspondences
-from mereo.fitting.gauss_newton import NormalEquations, Posed
-from mereo.fitting.playback import DrawnStates
-from mereo.fitting.problem import Problem
-from mereo.fitting.rest_fit import narrowing
+from mereo.fitting.draws.playback import DrawnStates
+from mereo.fitting.modes.rest import narrowing
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.gauss_newton import NormalEquations, Posed
+from mereo.fitting.problem.problem import Problem
+from mereo.fitting.registration.fit import KNOWN_SCALE_STD, ModesFit, fit_correspondences
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 

@@ -47,6 +47,9 @@ def train_in_two_processes(dataset: Path, folder: Path, module: str, config: str
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         f"from {module} import SMALL\nfrom mereo.training.trainer import train\n"
         f"train(Path(sys.argv[1]), Path(sys.argv[2]), {config})\n"
+        # threads of the group would outlive the interpreter, and may then wait forever
+        "threads = [name.read_text() for name in Path('/proc/self/task').glob('*/comm')]\n"
+        "assert not any('gloo' in name for name in threads), threads\n"
     )
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}

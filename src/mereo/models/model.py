@@ -27,6 +27,7 @@ from mereo.models.config import Precision, Supervision
 from mereo.models.decoder import Code, Prediction
 from mereo.models.device import pick_precision
 from mereo.models.network import Network
+from mereo.models.threads import MOST, in_threads
 from mereo.scenes.statistical_model import StatisticalModel
 
 SURE_LOGIT = 20.0
@@ -87,7 +88,7 @@ class Model:
     """Trained network with everything needed to use it.
 
     Attributes:
-        network: in evaluation mode; not to be changed once the model has been asked.
+        network: in evaluation mode, not to be changed once the model has been asked.
         names, colors: of the segments; label i + 1 is names[i].
         provenance: how it was trained: scene, seeds, dataset, recipe, versions.
         loss: the terms it was trained with; what none of them taught is not answered.
@@ -181,16 +182,11 @@ class Model:
 
         def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             logits, distance, direction = self.respond(prediction, queries)
-            scaled = logits if self.calibration is None else self.calibration.scaled(logits)
+            scaled = logits if self.calibration is None else self.calibration.scaling.scaled(logits)
             return logits.argmax(dim=-1).to(torch.uint8), scaled.softmax(dim=-1), distance, direction
 
         label, probability, distance, direction = self._chunked(code, points, answer)
-        return Answer(
-            label=label,
-            probability=probability,
-            distance=distance / np.float32(code.normalizer.scale),
-            direction=direction,
-        )
+        return Answer(label, probability, distance / np.float32(code.normalizer.scale), direction)
 
     def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
         """Class logits at each point, without the rest of the answer: what surface extraction needs."""
@@ -268,12 +264,15 @@ class Model:
     ) -> list[np.ndarray]:
         """Parts of the answers at all points, asked chunk by chunk."""
         normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
-        size = CUDA_QUERY_CHUNK if self.device.type == "cuda" else CPU_QUERY_CHUNK
-        chunks = []
-        with self.answering():
-            for start in range(0, max(len(normalized), 1), size):
+        size, most = (CUDA_QUERY_CHUNK, 1) if self.device.type == "cuda" else (CPU_QUERY_CHUNK, MOST)
+        network = self.inference  # made by one thread, this one
+
+        def part(start: int) -> list[Tensor]:
+            with self.answering():
                 queries = torch.from_numpy(normalized[start : start + size])[None].to(self.device)
-                chunks.append([part[0].cpu() for part in answer(self.inference.query(code.code, queries), queries)])
+                return [found[0].cpu() for found in answer(network.query(code.code, queries), queries)]
+
+        chunks = in_threads(part, range(0, max(len(normalized), 1), size), most)
         return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
 
 

@@ -1,5 +1,6 @@
 """Processes that train together, which torchrun starts; the first one writes, and where one fails all end."""
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,6 +40,18 @@ def join_processes() -> Process:
     with connected(process):
         dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
     return process
+
+
+def leave_processes(process: Process) -> None:
+    """Leave the group that ``join_processes`` joined, after whatever held on to it in this process is out of use.
+
+    A network that was trained together holds the group, in a cycle. Threads of a group that lives until the interpreter
+    ends may wait for it forever then (torch's issue 190489), and torchrun for them; so it is freed here.
+    """
+    if process.world == 1:
+        return
+    gc.collect()
+    dist.destroy_process_group()
 
 
 SEPARATE = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
@@ -100,6 +113,15 @@ def together(process: Process) -> Iterator[None]:
         dist.all_reduce(first, dist.ReduceOp.MIN)
         if first.item() < process.world and first.item() != process.rank:
             raise SystemExit(USER_ERROR)
+
+
+def agreed(process: Process, wish: bool) -> bool:
+    """Wish of process 0, which decides for all: clocks differ, and validation is collective."""
+    if process.world == 1:
+        return wish
+    flag = torch.tensor([float(wish)], device=collective_device(process))
+    dist.broadcast(flag, src=0)
+    return bool(flag.item())
 
 
 def told(process: Process, find: Callable[[], T]) -> T:

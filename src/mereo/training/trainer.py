@@ -34,7 +34,7 @@ from mereo.training.losses import supervised_loss, with_known
 from mereo.training.metrics_log import MetricsLog
 from mereo.training.optimization import clip_gradients, parameter_groups, rate_share, update_average
 from mereo.training.orders import seed_of
-from mereo.training.processes import Process, connected, join_processes, meeting
+from mereo.training.processes import Process, agreed, connected, join_processes, leave_processes, meeting
 from mereo.training.run_directory import claim_run, fit_config, start_network, trained_model
 from mereo.training.steps_shown import StepsShown, steps_between
 from mereo.training.streaming import StreamingDataset
@@ -58,7 +58,14 @@ def train(
     """
     check_place(run_dir, may_be_link=True)
     process = join_processes()
-    place = find_device(device, process.rank)
+    _train(dataset_dir, run_dir, config, find_device(device, process.rank), checkpoint_every_s, process)
+    leave_processes(process)
+    return run_dir / WEIGHTS
+
+
+def _train(
+    dataset_dir: Place, run_dir: Path, config: TrainConfig, place: torch.device, save_every_s: float, process: Process
+) -> None:
     config, data = open_data(dataset_dir, run_dir, config, place, process)
     config = fit_config(config, data)
     network = start_network(config, data)  # before anything is written: the weights it starts from may be unusable
@@ -78,13 +85,10 @@ def train(
             for batch in batches:
                 trainer.train_step(batch)
                 trainer.validate()
-                if trainer.step < trainer.total and trainer.agree(time.monotonic() - last_save > checkpoint_every_s):
+                if trainer.step < trainer.total and agreed(process, time.monotonic() - last_save > save_every_s):
                     trainer.save()
                     last_save = time.monotonic()
         trainer.finish()
-    if process.world > 1:
-        dist.destroy_process_group()
-    return run_dir / WEIGHTS
 
 
 READ_EVERY = 20
@@ -132,14 +136,6 @@ class Trainer:
         """Print a line, in process 0 only."""
         if self.process.is_main:
             print(text, flush=True)
-
-    def agree(self, wish: bool) -> bool:
-        """Wish of process 0, which decides for all: clocks differ, and validation is collective."""
-        if self.process.world == 1:
-            return wish
-        flag = torch.tensor([float(wish)], device=self.device)
-        dist.broadcast(flag, src=0)
-        return bool(flag.item())
 
     def batches(self) -> Generator[Batch, None, None]:
         """Share of this process in every remaining batch."""
@@ -274,7 +270,7 @@ class Trainer:
         """Write all that a run leaves at its end, unless an earlier process has, which may have been killed before."""
         there = self.log is not None and self.log.is_written(self.step)
         there = there and self.saved_step == self.step == trained_steps(self.run_dir / WEIGHTS)
-        if not self.agree(there):
+        if not agreed(self.process, there):
             if self.first_step == self.total:  # no step was taken in this process, so none was validated
                 self.validate()
             self.save(finished=True)

@@ -5,7 +5,7 @@ points exactly the farthest-point sample of size m, so the centres of every set-
 nothing, and "the first K neighbours in order" are a well-spread subset of a crowded ball.
 """
 
-from functools import cache
+from functools import cache, lru_cache
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
@@ -122,8 +122,15 @@ def _(queries: Tensor, points: Tensor, count: int) -> Tensor:
 def _by_tree(queries: Float[np.ndarray, "q d"], points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, "q k"]:
     workers = torch.get_num_threads() if len(queries) >= THREADED_QUERIES else 1
     ranks = np.arange(1, count + 1)  # a list keeps the last axis where one number would drop it
-    found: np.ndarray = KDTree(points).query(queries, ranks, workers=workers)[1]
+    tree = _tree(points.tobytes(), points.dtype.str, points.shape[1])
+    found: np.ndarray = tree.query(queries, ranks, workers=workers)[1]
     return found.astype(np.int64, copy=False)
+
+
+@lru_cache(maxsize=16)
+def _tree(data: bytes, dtype: str, axes: int) -> KDTree:
+    """Tree of points; the latest are kept, as a cloud's is asked again for every chunk of its queries."""
+    return KDTree(np.frombuffer(data, dtype).reshape(-1, axes))
 
 
 def squared_distances(a: Float[Tensor, "b m d"], b: Float[Tensor, "b n d"]) -> Float[Tensor, "b m n"]:
