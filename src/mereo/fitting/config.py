@@ -108,7 +108,9 @@ class DrawsConfig:
         hopeless: the same, above which the next starts are tried, in at most ``batches`` of them.
         passes: while it is above ``hopeless``, how often the modes are refined from where the draws ended, and the
             draws fitted to that shape again.
-        jumps: how often one draw may jump to one of ``places`` places, of which the ``places_kept`` best are compared.
+        jumps: how often one draw may jump to another place of its range.
+        places, places_kept: into how many even steps its range is divided, so that there is one place fewer to jump to;
+            and how many of these, the best, are compared: all where None.
         sliding: most share of a draw's motion that may leave the surface; 1 lets all draws jump.
         asked_again: whether the network's answer is a start too, where the cloud is not explained.
         few: scenes with more draws than this get ``MANY_DRAWS`` instead: every set of differences plays each draw once.
@@ -139,7 +141,7 @@ class DrawsConfig:
     passes: int = 0
     jumps: int = 2
     places: int = 6
-    places_kept: int = 5
+    places_kept: int | None = None
     sliding: float = 1.0
     asked_again: bool = True
     few: int = 30

@@ -47,9 +47,9 @@ LARGEST = 4.0
 class Playback(Recorder):
     """A generator whose draws are given in the order of the calls; more or other ones raise ``OutOfDraws``."""
 
-    def __init__(self, seed: int, shares: Sequence[np.ndarray]) -> None:
+    def __init__(self, seed: int, shares: Sequence[np.ndarray], checked: bool) -> None:
         super().__init__(seed, {})
-        self._shares, self._next = shares, 0
+        self._shares, self._next, self.checked = shares, 0, checked
 
     def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any) -> Shares:
         if self._next >= len(self._shares) or len(self._shares[self._next]) != int(np.prod(shape)):
@@ -86,10 +86,12 @@ class Drawn:
         smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in calls])
         return cls(seed, ndtri(np.concatenate([call.shares for call in calls])), sizes, smooth)
 
-    def deformations(self, scene: Scene, z: Float[np.ndarray, " d"]) -> tuple[Deformation, ...] | None:
-        """Deformations of the state with other draws; None where the scene refuses it."""
+    def deformations(
+        self, scene: Scene, z: Float[np.ndarray, " d"], checked: bool = True
+    ) -> tuple[Deformation, ...] | None:
+        """Deformations of the state with other draws; None where the scene refuses it, ``unchecked`` ones hardly."""
         try:
-            return scene.sample_deformations(Playback(self.seed, shares_of(z, self.sizes)))
+            return scene.sample_deformations(Playback(self.seed, shares_of(z, self.sizes), checked))
         except (OutOfDraws, ValueError):
             return None
 
