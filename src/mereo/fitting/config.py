@@ -39,6 +39,7 @@ class FitConfig:
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface,
             in scene units.
         turned: whether the network is asked again, with the camera turned, where much is unexplained: seconds a frame.
+        turned_anyway: whether it is, however much noise that may be: for frames that nothing else explains.
         agreed, accepted_agreed: where the network and the fit give as large a share of the correspondences on the
             object's surface the same segment, this smaller share is enough.
     """
@@ -78,6 +79,7 @@ class FitConfig:
     accepted: float = 0.95
     tolerance: float = 0.45
     turned: bool = True
+    turned_anyway: bool = False
     agreed: float = 0.8
     accepted_agreed: float = 0.85
 

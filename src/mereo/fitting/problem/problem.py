@@ -130,6 +130,8 @@ class Problem:
         """Whether a misfit of the cloud, much greater than its noise, says that the fit is likely wrong."""
         if cloud < UNEXPLAINED:
             return False
+        if self.config.turned_anyway:
+            return not self.leaves_noise(surface)
         return cloud > TAILS * (self.noise_beside(surface) / self.config.cloud_sigma) ** 2
 
     @property

@@ -106,6 +106,11 @@ class ModesFit:
         return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
 
     @property
+    def asks_draws(self) -> bool:
+        """Whether draws may be the answer: beside the rest model only under noise, where modes may miss what moved."""
+        return self.rest is None or self.problem.noisy
+
+    @property
     def tolerance(self) -> float:
         """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
         return self.problem.config.tolerance
@@ -136,13 +141,13 @@ class ModesFit:
         Modes can imitate what they do not hold, with more of them than a scene has draws; the evidence counts that.
         It does not speak against draws, which have the states that there really are.
         """
-        if self.rest is not None:
+        if not self.asks_draws:
             return self.registration()
         started = time.perf_counter()
         with one_blas_thread():
             problem = DrawsProblem.of(self.problem, states, self.found)
             drawn = fit_draws(problem, self.posed)
-            taken = drawn is not None and is_drawn(problem, drawn, self.posed)
+            taken = drawn is not None and is_drawn(problem, drawn, self.posed, self.rest)
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
             return replace(self.registration(), seconds=seconds)
@@ -151,12 +156,7 @@ class ModesFit:
         return replace(found, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
 
     def _registration(
-        self,
-        method: Method,
-        z: Float[np.ndarray, " k"],
-        optimum: Optimum,
-        posed: Posed,
-        surface: Surface,
+        self, method: Method, z: Float[np.ndarray, " k"], optimum: Optimum, posed: Posed, surface: Surface
     ) -> Registration:
         distance = surface.nearest(self.problem.evidence.partners)[0]
         explained = float((distance <= self.tolerance).mean())
@@ -205,8 +205,14 @@ class ModesFit:
         return float(np.sqrt((np.minimum(apart, most) ** 2).mean()))
 
 
-def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:
-    """Whether a state of the draws is to be preferred to the modes, by the points that the answer was fitted to."""
+def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: Judged | None = None) -> bool:
+    """Whether a state of the draws is to be preferred to the modes, or to the rest model, where that is given.
+
+    By the points that the answer was fitted to.
+    """
+    if rest is not None:
+        unbent = of_rest(problem.last, problem.found).misfit(rest.posed).total
+        return drawn.misfit + draws_narrowing(problem, drawn) < unbent
     gain = drawn.misfit - problem.last.misfit(modes).total
     return gain < 0 or gain < modes_narrowing(problem.base, modes) - draws_narrowing(problem, drawn)
 
