@@ -20,6 +20,7 @@ import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from mereo.geometry.solids import label_grid
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.synthesis.config import SENSORS
+from mereo.synthesis.config import SENSORS, Occluder
 from mereo.synthesis.depth_rendering import add_depth_noise
 from mereo.synthesis.sequence_config import SequenceConfig
 from mereo.synthesis.sequences import Moment, sequence
@@ -185,7 +186,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=value)
     for name, value in (("seconds", 5.0), ("noise", SequenceConfig.noise_std), ("noise-end", 0.0)):
         parser.add_argument(f"--{name}", type=float, default=value)
-    parser.add_argument("--occluder", choices=("tool", "hand", "none"), default="tool")
+    parser.add_argument("--occluder", choices=get_args(Occluder), default="tool")
     parser.add_argument("--sensor", choices=tuple(SENSORS), default="paper")
     parser.add_argument("--change", type=float, default=SequenceConfig.change)
     parser.add_argument("--motion", choices=("pose", "velocity"), default=TrackConfig.motion)

@@ -30,9 +30,9 @@ import numpy as np
 import torch
 
 from mereo.evaluation.calibrate import VIEWS, calibrate
-from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, own_views, strange_frames
+from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.probability_scaling import Scaling
+from mereo.evaluation.probability_scaling import ece_of
 from mereo.evaluation.reliability import AskedCells
 from mereo.evaluation.scoring import trained_scene
 from mereo.fitting.registration.readings import fitted_frame
@@ -115,7 +115,7 @@ def measured(name: str, arguments: argparse.Namespace) -> Found:
     for index, view in enumerate(clean):
         wrong = PointCloud(view.seen.points * FACTORS[index % len(FACTORS)])
         found.strange["wrong unit"].append(said_of(wrong, model, registrar))
-    for strange in strange_frames(scene, arguments.strangers, seed):
+    for strange in strange_frames(scene, other_objects(scene), arguments.strangers, seed):
         found.strange[strange.kind].append(said_of(strange.cloud, model, registrar, stated=None))
     for strange in frames_beyond(scene, arguments.views, seed):
         found.strange[strange.kind].append(said_of(strange.cloud, model, registrar))
@@ -136,9 +136,8 @@ def calibration_error(model: Model, views: Sequence[CalibrationView]) -> tuple[f
         truth.append(cells.truth)
     calibration = model.calibration
     assert calibration is not None and calibration.temperature is not None
-    scaling = Scaling(calibration.temperature, calibration.biases)
     every = np.concatenate(logits), np.concatenate(truth)
-    return Scaling().ece(*every), scaling.ece(*every)
+    return ece_of(*every), ece_of(*every, calibration.scaling)
 
 
 def row(name: str, found: Found, seconds: float) -> dict[str, str | float | list[float]]:

@@ -88,7 +88,7 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
     problem = DrawsProblem.of(fitted.problem, states, fitted.found)
     drawn = fit_draws(problem, fitted.posed)
     assert drawn is not None
-    modes = problem.base.misfit(fitted.posed).total
+    modes = problem.last.misfit(fitted.posed).total
     bought = modes_narrowing(problem.base, fitted.posed) - draws_narrowing(problem, drawn)
     assert bought > 1.0
     for gain, taken in ((-5.0, True), (0.9 * bought, True), (1.1 * bought, False)):

@@ -12,9 +12,9 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.registration.state import state_of
 from mereo.scenes.parameters import Played, parameters, random_state
 from mereo.scenes.random_states import scene_model
-from mereo.scenes.rounds import blend, smooth_round
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.walks import blend, smooth_round
 from mereo.visualization.viewer.freedom import DrawnShapes, ModeShapes
 from mereo.visualization.viewer.wishes import STEPS, Wishes
 

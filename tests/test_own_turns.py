@@ -13,13 +13,14 @@ from test_fitting_theorems import IN_FRONT, said, seen
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.fitting.config import MANY_DRAWS
-from mereo.fitting.draws.fit import descend, jump, likely_to_jump
+from mereo.fitting.draws.descent import descend
+from mereo.fitting.draws.fit import jump, likely_to_jump
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsProblem, played
 from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.own_turns import ANGLES, left_open, own_turns
 from mereo.fitting.problem.posterior import Posterior, covariance_factor
 from mereo.fitting.registration.fit import ModesFit
-from mereo.fitting.uncertainty.own_turns import ANGLES, left_open, own_turns
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.random_states import scene_model
@@ -148,13 +149,18 @@ def test_radii_hold_what_is_left_open() -> None:
     posed = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.zeros(model.count))
     factor = 1e-3 * np.eye(7 + model.count)
     without = Posterior(posed, material, model.modes, factor)
-    radii = replace(without, turns=turns).radii()
+    alone, parts = without.radii(), replace(without, open=turns).radii()
+    radii = parts.radii()
+    np.testing.assert_allclose(parts.gaussian, alone.gaussian)
+    assert not alone.open.any()
     wheel = model.labels == 2
-    np.testing.assert_allclose(radii[~wheel], without.radii()[~wheel])
+    np.testing.assert_allclose(radii[~wheel], alone.radii()[~wheel])
     rim = wheel & (np.linalg.norm(model.rest_points[:, :2], axis=1) > 5.5)
     assert radii[rim].min() > 8.0 and radii[rim].max() < 20.0
     follow = model.weights(model.rest_points[:5], model.labels[:5])
-    np.testing.assert_allclose(replace(without, turns=turns).radii(follow), radii[:5], rtol=0.2)
+    np.testing.assert_allclose(replace(without, open=turns).radii(follow).radii(), radii[:5], rtol=0.2)
+    np.testing.assert_allclose(parts.radii(1e-9)[rim], parts.open[rim])  # how far a turn goes no calibration scales
+    np.testing.assert_allclose(parts.radii(2.0, 3.0) ** 2, 4 * parts.gaussian**2 + parts.open**2 + 9)
 
 
 def test_a_covariance_that_rounding_has_spoilt_is_as_unsure_as_rounding_tells() -> None:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from mereo.evaluation.coverage import RadiusRatios
-from mereo.evaluation.radius_gauge import LEAST, RadiusGauge
+from mereo.evaluation.radius_gauge import LEAST, Measured, RadiusGauge, factors_of
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.radii import Radii, rounded_to
+from mereo.models.calibration import RadiusFactors
 from mereo.visualization.vertex_colors import radius_scale
 
 
@@ -42,16 +43,43 @@ def test_the_scale_of_radii_ends_at_all_but_a_twentieth() -> None:
     assert scale.words[1].endswith(" mm")
 
 
-def test_a_scale_is_measured_on_views_whose_fit_is_in_the_right_state() -> None:
-    """One that is elsewhere would decide it alone; of too few views nothing is said."""
+def measured(off: np.ndarray, misfit: float = 0.1, displaced: float = 0.04) -> Measured:
+    """A view whose radii are all 1, and whose points are so far off."""
+    one = np.ones(len(off))
+    return Measured(RadiusRatios(np.abs(off), one, 0 * one, one > 0), misfit, displaced, half=20.0)
+
+
+def test_a_scale_is_measured_on_all_clean_views() -> None:
+    """Those that are elsewhere too; of noisy ones only on those that are not, and on too few views not at all."""
     rng = np.random.default_rng(0)
-    right = [RadiusRatios(*np.abs(rng.normal(size=(2, 100))), *np.ones((2, 100))) for _ in range(LEAST)]
-    elsewhere = RadiusRatios(*(30.0 + rng.random((2, 100))), *np.ones((2, 100)))
+    right = [measured(rng.normal(size=200)) for _ in range(20)]
+    elsewhere = measured(30.0 + rng.random(200))
     gauge = RadiusGauge()
-    gauge.ratios["radius_scale"] = [*right[1:], elsewhere]
-    gauge.ratios["noisy_draws_radius_scale"] = [one.by(0.5) for one in right]
-    scale = pytest.approx(RadiusRatios.together(right).scale())
-    assert list(gauge.fields()) == ["noisy_draws_radius_scale"]
-    gauge.ratios["radius_scale"].append(right[0])
-    assert gauge.fields() == {"radius_scale": scale, "noisy_draws_radius_scale": 2 * gauge.fields()["radius_scale"]}
-    assert gauge.fields()["radius_scale"] == pytest.approx(1.96, abs=0.25)
+    gauge.clean[0].extend(right[: LEAST - 1])
+    gauge.noisy[1].extend([*right[:LEAST], elsewhere])
+    alone = RadiusRatios.together([one.ratios for one in right[:LEAST]]).scale()
+    assert gauge.fields() == {"noisy_draws_radius_scale": pytest.approx(alone)}
+    gauge.clean[0].extend([*right[LEAST - 1 :], elsewhere])
+    fields = gauge.fields()
+    assert fields["radius_scale"] > 2.2 > 1.96 > alone - 0.3  # 99 % and more of the right ones
+    assert (fields["usual_misfit"], fields["usual_displaced"]) == (0.1, 0.04)
+
+
+def test_a_frame_that_is_misfitted_or_where_the_network_is_elsewhere_has_wider_radii() -> None:
+    """By how much more than usual; so the lost frame of many does not widen the others' radii."""
+    rng = np.random.default_rng(0)
+    right = [measured(rng.normal(size=400)) for _ in range(18)]
+    lost = [measured(3.0 * rng.normal(size=400), misfit=0.2), measured(4.0 + rng.random(400), displaced=0.4)]
+    factors = factors_of([*right, *lost])
+    assert factors.scale == pytest.approx(1.96, rel=0.05)
+    plain = RadiusRatios.together([one.ratios for one in (*right, *lost)]).scale()
+    assert plain > 4.0
+    assert factors.widening(0.2) == pytest.approx(4.0) and factors.widening(0.05) == 1.0
+    assert (
+        factors.beside(0.04) == 0.0
+        and factors.beside(None) == 0.0
+        and factors.beside(0.4) == pytest.approx(0.398, 1e-2)
+    )
+    widened = lost[1].widened(factors)
+    assert (widened.radii > 5.0).all() and (widened.ratios == 0.0).all()
+    assert RadiusFactors(2.0).scale_at(9.9) == 2.0 and RadiusFactors().scale_at(1.0) is None

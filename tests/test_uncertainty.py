@@ -98,7 +98,7 @@ def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
     posterior = Posterior.of(normal, posed, rng.normal(size=(7, 3)), modes)
     variance = 1.0 / (1.0 + float((modes.astype(float) ** 2).sum()) / sigma**2)
     lengths = np.linalg.norm(modes[..., 0], axis=1)
-    np.testing.assert_allclose(posterior.radii(), lengths * np.sqrt(variance * chi2.ppf(0.95, 1)), rtol=1e-3)
+    np.testing.assert_allclose(posterior.radii().radii(), lengths * np.sqrt(variance * chi2.ppf(0.95, 1)), rtol=1e-3)
 
 
 def test_the_factor_is_that_of_the_inverse() -> None:
@@ -140,7 +140,7 @@ def test_more_noise_never_makes_a_radius_smaller(found: Registration) -> None:
         jacobian, residual, weight = optimum.terms.cloud
         terms = replace(optimum.terms, cloud=(jacobian, residual, weight * (0.2 / sigma) ** 2))
         posterior = optimum.posterior
-        radii = Posterior.of(terms.total, optimum.posed, posterior.material, posterior.modes).radii()
+        radii = Posterior.of(terms.total, optimum.posed, posterior.material, posterior.modes).radii().gaussian
         assert problem.config.cloud_sigma == sigma
         assert (radii >= before * (1 - 1e-4)).all()
         before = radii
@@ -218,16 +218,20 @@ def test_the_scale_is_that_which_holds_95_percent(found: Registration, material:
     """Ratios of radii that are too small by a known factor, and what is said of them with it."""
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
     one = RadiusRatios.of(found, material, shown)
-    assert len(one.seen) == shown.sum() and len(one.all) == len(material)
-    calibrated = RadiusRatios.of(replace(found, radius_scale=7.0), material, shown)
-    np.testing.assert_allclose(calibrated.all, one.all)
-    both = RadiusRatios.together([one, calibrated])
+    np.testing.assert_array_equal(one.seen, shown)
+    calibrated = RadiusRatios.of(replace(found, radius_scale=7.0, radius_beside=0.05), material, shown)
+    np.testing.assert_allclose(calibrated.radii, one.by(7.0).with_beside(0.05).radii)
+    np.testing.assert_allclose(calibrated.ratios, one.by(7.0).with_beside(0.05).ratios, atol=1e-12)
+    off = np.linalg.norm(found.material - material, axis=1)
+    assert found.uncertainty is not None
+    np.testing.assert_array_equal(one.ratios <= 1.0, off <= found.uncertainty.material)
+    both = RadiusRatios.together([one, RadiusRatios.of(found, material, shown)])
     scale = both.scale()
     said = both.by(scale).summary(unit_mm=2.0)
     assert said["all"] == pytest.approx(0.95, abs=1e-3)
-    assert both.by(None).summary()["all"] == pytest.approx((one.all <= 1).mean())
-    assert said["radius_seen"] == pytest.approx(scale * np.median(one.radii_seen))
-    assert said["radius_hidden_mm"] == pytest.approx(2.0 * scale * np.median(one.radii_hidden))
+    assert both.by(None).summary()["all"] == pytest.approx((one.ratios <= 1).mean())
+    assert said["radius_seen"] == pytest.approx(scale * np.median(one.gaussian[shown]))
+    assert said["radius_hidden_mm"] == pytest.approx(2.0 * scale * np.median(one.gaussian[~shown]))
 
 
 def test_a_registration_from_a_file_has_no_radii(found: Registration, material: np.ndarray) -> None:

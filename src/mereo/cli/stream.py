@@ -22,7 +22,7 @@ from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, Summary, sentence, stream
+from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, Summary, frame_error, stream
 from mereo.reconstruction.stream_sources import STANDARD_INPUT, frames_of, watched_frames
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 
@@ -151,7 +151,7 @@ class SurfaceFolder:
                 write_segments_glb(partial, outcome.result.surfaces, viewer_rotation(axes))
             self._frames[name] = outcome.name
         except Exception as problem:
-            return replace(outcome, result=None, error=sentence(problem, outcome.name))
+            return replace(outcome, result=None, error=frame_error(problem, outcome.name))
         return outcome
 
 

@@ -93,8 +93,8 @@ def calibrate(
         gauges = (*gauges, RecognitionGauge(), radii)
     more = radius_views if radii is not None else 0
     each = max(1, round(views / 24)) if strangers and registrar is not None else 0
-    others = len(other_objects(scene)) if each else 0
-    with progress("calibrate", views + more + each * (others + 8), "views", quiet=quiet) as shown:
+    others = other_objects(scene) if each else []
+    with progress("calibrate", views + more + each * (len(others) + 8), "views", quiet=quiet) as shown:
         for view in own_views(scene, views, seed):
             frame, registration = _fitted(bare, registrar, view.seen, view.scene_unit)
             for gauge in gauges:
@@ -104,7 +104,7 @@ def calibrate(
             assert radii is not None
             radii.add(view, *_fitted(bare, registrar, view.seen, view.scene_unit))
             shown.advance()
-        for strange in strange_frames(scene, each, seed) if each else ():
+        for strange in strange_frames(scene, others, each, seed):
             frame, registration = _fitted(bare, registrar, strange.cloud, None)
             for gauge in gauges:
                 gauge.add_strange(frame, registration)

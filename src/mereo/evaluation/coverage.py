@@ -76,7 +76,7 @@ class RadiusRatios:
         return np.hypot(self.gaussian, self.beside)
 
     def scale(self) -> float:
-        """Factor of the Gaussian's radii with which 95 % of the true places lie within: ``Calibration.radius_scale``."""
+        """Factor of the Gaussian's radii that holds 95 % of the true places: ``Calibration.radius_scale``."""
         return float(np.quantile(self.ratios, LEVEL))
 
     def by(self, scale: float | None) -> "RadiusRatios":
@@ -97,7 +97,9 @@ class RadiusRatios:
         units, and in mm where ``unit_mm``, millimetres per scene unit, is known.
         """
         named = {"all": np.ones(len(self.seen), dtype=bool), "seen": self.seen, "hidden": ~self.seen}
-        result = {name: float((self.ratios[rows] <= 1.0).mean()) if rows.any() else None for name, rows in named.items()}
+        result = {
+            name: float((self.ratios[rows] <= 1.0).mean()) if rows.any() else None for name, rows in named.items()
+        }
         for name in ("seen", "hidden"):
             median = float(np.median(self.radii[named[name]])) if named[name].any() else None
             result[f"radius_{name}"] = median

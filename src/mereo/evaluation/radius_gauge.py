@@ -25,8 +25,8 @@ NOISY = 16
 """Noisy views that are enough: their draws take longest."""
 
 ELSEWHERE = 5.0
-"""Radii by which half of a noisy view's points are off where its fit has ended in a wrong state. One such view in twenty
-would be all that the scale is made of, and of a camera's views there are more; recognition is to tell them."""
+"""Radii by which half of a noisy view's points are off where its fit has ended in a wrong state. One such view in
+twenty would be all that the scale is made of, and of a camera's views there are more; recognition is to tell them."""
 
 USUALLY = 0.9
 """Share of the views in which network and registered model are no farther apart than usual. A few views may hold none
@@ -39,8 +39,8 @@ class Measured:
 
     Attributes:
         ratios: to the posterior's own radii.
-        misfit: ``ModesFit.misfit_of``.
-        displaced: ``ModesFit.displaced``.
+        misfit: ``Problem.cloud_misfit``.
+        displaced: ``Correspondences.displaced``.
         half: of the object's length, scene units.
     """
 
@@ -56,7 +56,7 @@ class Measured:
         ratios = RadiusRatios.of(registration, truth, seen_points(truth, view.seen, 1.0))
         assert registration.optimum is not None
         displaced = displaced_of(modes, registration)
-        misfit = modes.misfit_of(registration.optimum.surface)
+        misfit = modes.problem.cloud_misfit(registration.optimum.surface)
         return cls(ratios, misfit, displaced or 0.0, registration.model.half)
 
     def widened(self, factors: RadiusFactors) -> RadiusRatios:

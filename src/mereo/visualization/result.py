@@ -26,6 +26,7 @@ from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.visualization.result_files import write_files, write_one
 from mereo.visualization.result_html import result_html
+from mereo.visualization.result_scene import scene_facts
 from mereo.visualization.units import UNKNOWN, Unit
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ class Result(Answer):
     def write(self, directory: Path, files: FilesConfig = DEFAULT_FILES, carried: Sequence[Carried] = ()) -> None:
         """Write what `mereo reconstruct` does into a directory that is there."""
         frame = self.seen.frame
-        facts = self.facts(carried)
+        facts = self.facts(carried) | scene_facts(None if self.registrar is None else self.registrar.given)
         write_files(
             directory,
             self.reconstruction,

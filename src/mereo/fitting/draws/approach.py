@@ -32,6 +32,9 @@ ENOUGH = 0.02
 HELD = 1e6
 """Precision of draws that move nothing here: they stay."""
 
+SAME = 1e-4
+"""Distance, in scene units, below which two plays are of one state; rest points are in single precision."""
+
 STILL = 1e-9
 """Motion, in scene units for a standard deviation, below which a draw moves nothing."""
 
@@ -115,13 +118,19 @@ def near(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.ndarray, "
 def derivatives(
     states: DrawnStates, drawn: Drawn, z: Float[np.ndarray, " d"], here: Float[np.ndarray, "a 3"]
 ) -> Float32[np.ndarray, "a 3 d"]:
-    """Motion of the played points, which are ``here``, for a standard deviation of each draw."""
+    """Motion of the played points, which are ``here``, for a standard deviation of each draw.
+
+    Neighbours are played without the scene's own test where this state is the same without it: it is not where a scene
+    refuses and draws again in a way that ``Drawn`` does not see through.
+    """
     change = np.zeros((*here.shape, len(z)), dtype=np.float32)
+    untested = drawn.deformations(states.scene, z, checked=False)
+    checked = untested is None or float(np.abs(states.played.moved(untested) - here).max()) > SAME
     for number in np.flatnonzero(drawn.smooth):
         step = DIFFERENCE * (-1.0 if z[number] > 0 else 1.0)
         other = z.copy()
         other[number] += step
-        moved = drawn.deformations(states.scene, other)
+        moved = drawn.deformations(states.scene, other, checked)
         if moved is not None:
             change[:, :, number] = (states.played.moved(moved) - here) / step
     return change

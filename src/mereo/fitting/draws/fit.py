@@ -8,17 +8,19 @@ from dataclasses import replace
 
 import igl
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float, Int
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.fitting.draws.approach import Near, Shape, approach, derivatives, near, secant
+from mereo.fitting.draws.approach import Near, Shape, approach, near
+from mereo.fitting.draws.descent import descend, first_sigma
 from mereo.fitting.draws.discrete import chosen_otherwise
 from mereo.fitting.draws.playback import Drawn
-from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, misfit, normal_equations, played
+from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, beside, misfit, played
+from mereo.fitting.draws.turned_segments import turned, twins
 from mereo.fitting.modes.fit import refine
 from mereo.fitting.modes.hypotheses import robust_poses
-from mereo.fitting.problem.gauss_newton import POSE, Posed
+from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.residuals import robust_square
 
 MOST_DRAWS = 120
@@ -46,24 +48,33 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     if problem.config.asked_again and not explained(problem, found, problem.config.explained):
         camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
         found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
-    best = min(found, key=lambda fit: fit.misfit, default=None)
-    return None if best is None else by_sight(problem, jump(problem, best))
+    best = min(found, key=by_misfit, default=None)
+    return None if best is None else by_sight(problem, jump(problem, with_twins_turned(problem, best)))
 
 
 def by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """The state brought to what the lines of sight meet.
+    """The state brought to what the lines of sight meet, by every observed point.
 
-    Nearest places lead there from afar, and noise takes them a little beside it.
+    Nearest places lead there from afar, and noise takes them a little beside it; over more points it averages out. The
+    answer has the partners of all other states, but its misfit by every point: those it was fitted to.
     """
     sighted = replace(problem, by_sight=True)
-    start = played(sighted, fit.drawn, fit.z, fit.posed)
-    return fit if start is None else descend(sighted, start, problem.config.last_rounds)
+    dense = replace(sighted, base=problem.last)
+    start = played(dense, fit.drawn, fit.z, fit.posed)
+    if start is None:
+        return fit
+    found = descend(dense, start, problem.config.last_rounds)
+    if dense.base is sighted.base:
+        return found
+    end = played(sighted, found.drawn, found.z, found.posed)
+    assert end is not None  # it was played before
+    return replace(end, motion=found.motion, misfit=found.misfit)
 
 
 def like_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:
     """States that explain the frame, from starts like a fit of the modes, and from ``others``."""
     guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
-    return fitted(problem, modes, shape_of_modes(problem, modes), [guess, *others])
+    return fitted(problem, modes, shape_of(problem, problem.model.material(modes.z)), [guess, *others])
 
 
 def second_pass(problem: DrawsProblem, best: DrawsFit | None) -> list[DrawsFit]:
@@ -86,11 +97,10 @@ def explained(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool
     return problem.base.explained(min(misfits), best.surface, most)
 
 
-def shape_of_modes(problem: DrawsProblem, modes: Posed) -> Shape:
-    """Shape that the fit of the modes has found, unposed: dense and smooth."""
+def shape_of(problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> Shape:
+    """Shape of material points, unposed: dense and smooth."""
     config, few = problem.config, problem.states.played.index
-    points = problem.model.material(modes.z)[few]
-    return Shape.of(points, config.shape_std * problem.model.half, config.shape_worth, np.ones(len(few)))
+    return Shape.of(material[few], config.shape_std * problem.model.half, config.shape_worth, np.ones(len(few)))
 
 
 def shape_of_network(problem: DrawsProblem, log_scale: float) -> Shape:
@@ -106,7 +116,7 @@ def fitted(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Draw
     While what is found is far from explaining the cloud, the next starts are tried.
     """
     config, states = problem.config, problem.states
-    drawn = [Drawn.of(states.scene, seed) for seed in alike(problem, shape)] + guesses
+    drawn = [states.drawn(seed) for seed in alike(problem, shape)] + guesses
     found = [near(states, shape, one, one.z) for one in drawn]
     here = sorted((one for one in found if one is not None), key=lambda one: one.misfit)
     batch, fits = config.sieve[0][1], list[DrawsFit]()
@@ -162,6 +172,22 @@ def alike(problem: DrawsProblem, shape: Shape) -> list[int]:
     return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
 
 
+def with_twins_turned(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
+    """The state, or one with segments turned that look alike turned, where that explains the frame better.
+
+    A forearm by half a turn, for which several draws change at once. Only where the shape, stiffly turned, explains
+    the frame nearly as well: what is seen of a right one mostly tells.
+    """
+    config = problem.config
+    few = replace(problem, config=replace(config, sieve=config.turned_sieve, kept=1, batches=1))
+    for together in twins(problem.model):
+        material = turned(problem.model, fit.material, together)
+        stiff = beside(problem, fit.drawn, fit.z, fit.posed, material)
+        if stiff is not None and stiff.misfit < fit.misfit + config.turned_worse:
+            fit = min([fit, *fitted(few, fit.posed, shape_of(problem, material), [])], key=by_misfit)
+    return fit
+
+
 def posed_on(frame: Posed, here: Near) -> Posed:
     """Pose in the camera frame of a state that lies on a shape whose own pose there is ``frame``."""
     translation = frame.place(here.translation[None])[0]
@@ -215,47 +241,3 @@ def likely_to_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"
     moved, off = (motion**2).sum(axis=(0, 1)), (np.einsum("ac,acd->ad", normal, motion) ** 2).sum(axis=0)
     farthest = np.sqrt((motion**2).sum(axis=1).max(axis=0, initial=0.0))
     return smooth[(off < problem.config.sliding * moved) & (farthest > SLIDES * model.half)]
-
-
-def first_sigma(problem: DrawsProblem) -> float:
-    """The cloud's first standard deviation, scene units."""
-    return max(problem.config.start_sigma * problem.model.half, problem.base.config.cloud_sigma)
-
-
-def descend(
-    problem: DrawsProblem, fit: DrawsFit, fresh: int, motion: Float32[np.ndarray, "a 3 d"] | None = None
-) -> DrawsFit:
-    """Levenberg and Marquardt's method on played states, by ``fresh`` sets of differences after the given one."""
-    config, least = problem.config, problem.base.config.cloud_sigma
-    index, sigma, damping = problem.states.played.index, first_sigma(problem), config.damping
-    for number in range(fresh + (motion is not None)):
-        if number or motion is None:
-            motion = derivatives(problem.states, fit.drawn, fit.z, fit.material[index])
-        start = fit.misfit
-        for _ in range(config.steps):
-            before = misfit(problem, fit, sigma)
-            fit, motion, damping = lower(problem, fit, motion, sigma, damping)
-            gain = before - misfit(problem, fit, sigma)
-            if gain == 0 or (gain < config.gain * before and sigma <= least):
-                break
-            sigma = max(sigma * config.cooling, least)
-        if sigma <= least and start - fit.misfit < config.gain * start:
-            break
-        damping = min(damping, 1.0)
-    return replace(fit, motion=motion)
-
-
-def lower(
-    problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float, damping: float
-) -> tuple[DrawsFit, Float32[np.ndarray, "a 3 d"], float]:
-    """A state of lower misfit, or the same; what was learnt of the motion; the next damping."""
-    index, least = problem.states.played.index, misfit(problem, fit, sigma)
-    for _ in range(problem.config.tries):
-        step = normal_equations(problem, fit, motion, sigma).step(damping)
-        tried = played(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))
-        if tried is not None:
-            motion = secant(motion, step[POSE:], (tried.material - fit.material)[index])
-            if misfit(problem, tried, sigma) < least:
-                return tried, motion, max(damping / 6.0, 1e-3)
-        damping *= 6.0
-    return fit, motion, damping

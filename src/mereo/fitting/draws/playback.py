@@ -5,7 +5,7 @@ normal. Played back in the order of the calls, the same shares give the same sta
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -47,9 +47,9 @@ LARGEST = 4.0
 class Playback(Recorder):
     """A generator whose draws are given in the order of the calls; more or other ones raise ``OutOfDraws``."""
 
-    def __init__(self, seed: int, shares: Sequence[np.ndarray]) -> None:
+    def __init__(self, seed: int, shares: Sequence[np.ndarray], checked: bool) -> None:
         super().__init__(seed, {})
-        self._shares, self._next = shares, 0
+        self._shares, self._next, self.checked = shares, 0, checked
 
     def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any) -> Shares:
         if self._next >= len(self._shares) or len(self._shares[self._next]) != int(np.prod(shape)):
@@ -86,10 +86,12 @@ class Drawn:
         smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in calls])
         return cls(seed, ndtri(np.concatenate([call.shares for call in calls])), sizes, smooth)
 
-    def deformations(self, scene: Scene, z: Float[np.ndarray, " d"]) -> tuple[Deformation, ...] | None:
-        """Deformations of the state with other draws; None where the scene refuses it."""
+    def deformations(
+        self, scene: Scene, z: Float[np.ndarray, " d"], checked: bool = True
+    ) -> tuple[Deformation, ...] | None:
+        """Deformations of the state with other draws; None where the scene refuses it, ``unchecked`` ones hardly."""
         try:
-            return scene.sample_deformations(Playback(self.seed, shares_of(z, self.sizes)))
+            return scene.sample_deformations(Playback(self.seed, shares_of(z, self.sizes), checked))
         except (OutOfDraws, ValueError):
             return None
 
@@ -163,6 +165,7 @@ class DrawnStates:
         z: their draws, standard normal; NaN of states with other calls than the first that was not drawn again.
         modes: their coefficients in the statistical model.
         played: points whose motion is played for derivatives.
+        recorded: what ``drawn`` has recorded so far.
     """
 
     scene: Scene
@@ -171,6 +174,13 @@ class DrawnStates:
     z: Float[np.ndarray, "n d"]
     modes: Float[np.ndarray, "n k"]
     played: Played
+    recorded: dict[int, Drawn] = field(default_factory=dict)
+
+    def drawn(self, seed: int) -> Drawn:
+        """``Drawn.of`` one of the seeds, recorded once: frames share their starts."""
+        if seed not in self.recorded:
+            self.recorded[seed] = Drawn.of(self.scene, seed)
+        return self.recorded[seed]
 
     @classmethod
     def of(
@@ -201,7 +211,7 @@ class DrawnStates:
         ridge = RIDGE * weight.sum() * float((motion**2).mean()) * np.eye(basis.shape[1])
         ridge[0, 0] = 0.0
         answer = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ self.z[usable])[0]
-        like = Drawn.of(self.scene, self.seeds[usable[0]])
+        like = self.drawn(self.seeds[usable[0]])
         return replace(like, z=np.where(like.smooth, np.clip(answer, -MOST, MOST), like.z))
 
 

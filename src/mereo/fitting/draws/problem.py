@@ -51,6 +51,11 @@ class DrawsProblem:
         return self.base.model
 
     @property
+    def last(self) -> Problem:
+        """``base`` with the points of the last descent."""
+        return self.base.by_every_point if self.config.every_point else self.base
+
+    @property
     def scene(self) -> Scene:
         """Scene whose draws are played."""
         return self.states.scene
@@ -124,6 +129,17 @@ def played(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], pose
     if deformations is None:
         return None
     material = material_moved(problem.scene, problem.model, deformations)
+    return beside(problem, drawn, z, posed, material)
+
+
+def beside(
+    problem: DrawsProblem,
+    drawn: Drawn,
+    z: Float[np.ndarray, " d"],
+    posed: Posed,
+    material: Float[np.ndarray, "m 3"],
+) -> DrawsFit | None:
+    """Material points beside the frame as those of a state; None where no face of them is seen."""
     rigid = replace(posed, z=np.empty(0))
     surface = Surface.through(problem.model, rigid.place(material))
     if len(surface.facing) == 0:

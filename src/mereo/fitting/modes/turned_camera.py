@@ -55,14 +55,14 @@ def with_turns(start: Understood, ask: Ask | None) -> Understood:
     problem, _, modes = start
     if ask is None or not problem.config.turned or not problem.wants_turns(modes.misfit.cloud, modes.surface):
         return start
-    points = problem.evidence.points
+    points, anyway = problem.evidence.points, problem.config.turned_anyway
     best, waiting = start, turns(points.mean(axis=0))
     while rounds := list(islice(waiting, ROUND)):
         for problem, found in likely([seen_turned(start[0], points, turn, ask) for turn in rounds]):
             modes = Judged.of(problem, refine(problem, fit_whole(problem)))
             if modes.misfit.without_network < best[2].misfit.without_network:
                 best = problem, found, modes
-        if best[2].misfit.cloud < UNEXPLAINED:
+        if best[2].misfit.cloud < UNEXPLAINED or (anyway and best[0].leaves_noise(best[2].surface)):
             break
     return best if best is start else (best[0], best[1], explored(best[0], best[2]))
 

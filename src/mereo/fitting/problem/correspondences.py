@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.deformation.moving_least_squares import spread
 from mereo.models.model import EncodedCloud, Model
+from mereo.scenes.statistical_model import StatisticalModel
 
 SIGHT_LINES = 256
 """Lines of sight along which the hidden inside is asked for."""
@@ -21,6 +22,9 @@ DEPTHS = np.concatenate([np.arange(0.04, 0.6, 0.08), np.arange(0.6, 2.4, 0.15)])
 
 OBSERVED = 400
 """Observed points that are asked for."""
+
+CLIPPED = 0.5
+"""Largest distance of one place that counts in ``Correspondences.displaced``."""
 
 EACH = 125
 """Correspondences kept of the observed points, and of the inside."""
@@ -56,6 +60,20 @@ class Correspondences:
     def turned(self, rotation: Float[np.ndarray, "3 3"]) -> "Correspondences":
         """Correspondences in a camera frame that is turned about its origin."""
         return replace(self, points=self.points @ rotation.T)
+
+    def displaced(self, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> float | None:
+        """How far the places of the object are from where a model's state has them, as a share of half its length.
+
+        Root mean square, each ``CLIPPED`` at most; None without correspondences, as where a frame is tracked.
+
+        Args:
+            model: statistical model of the object.
+            material: its posed material points, in the unit of ``points``, which is that of scenes.
+        """
+        if len(self.points) == 0:
+            return None
+        apart = np.linalg.norm(model.weights(self.rest, self.labels)(material) - self.points, axis=1) / model.half
+        return float(np.sqrt((np.minimum(apart, CLIPPED) ** 2).mean()))
 
     def evenly(self, each: int = EACH) -> "Correspondences":
         """Even subset: at most ``each`` observed and as many inside, evenly spread in space."""

@@ -126,7 +126,7 @@ class Posterior:
         material: Float[np.ndarray, "m 3"],
         modes: Float32[np.ndarray, "m 3 k"],
         residue: float = 0.0,
-        open: Float32[np.ndarray, "m 3 e"] | None = None,  # noqa: A002 (as the attribute)
+        open: Float32[np.ndarray, "m 3 e"] | None = None,
     ) -> "Posterior":
         """Posterior whose precision is the matrix of the normal equations at the optimum."""
         return cls(posed, material, modes, covariance_factor(normal.matrix), residue, open)

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.evidence import PARTNERS, Evidence
+from mereo.fitting.problem.evidence import MORE_PARTNERS, PARTNERS, Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed, Rows
 from mereo.fitting.problem.joints import Joints
 from mereo.fitting.problem.noise import SHARED, constants_for, is_noise, noise_of, shared
@@ -130,7 +130,17 @@ class Problem:
         """Whether a misfit of the cloud, much greater than its noise, says that the fit is likely wrong."""
         if cloud < UNEXPLAINED:
             return False
+        if self.config.turned_anyway:
+            return not self.leaves_noise(surface)
         return cloud > TAILS * (self.noise_beside(surface) / self.config.cloud_sigma) ** 2
+
+    @property
+    def by_every_point(self) -> "Problem":
+        """The problem with as many partners as a noisy frame has; the same where they are all of them already."""
+        evidence = self.evidence
+        if len(evidence.partners) >= min(len(evidence.points), MORE_PARTNERS):
+            return self
+        return replace(self, evidence=evidence.with_more_partners)
 
     def with_network(self, found: Correspondences) -> "Problem":
         """The problem with other correspondences."""
@@ -156,6 +166,10 @@ class Problem:
     def met(self, surface: Surface) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
         """``Surface.along_sight`` of the observed partners."""
         return surface.along_sight(self.evidence.partners, self.far)
+
+    def cloud_misfit(self, surface: Surface) -> float:
+        """Misfit of the cloud, in squared standard deviations of a partner."""
+        return float(robust_square(self.met(surface)[0], self.config.cloud_sigma).mean())
 
     @cached_property
     def samples(self) -> SampledSurface:
@@ -215,7 +229,7 @@ class Problem:
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""
         sigma, surface = self.config.cloud_sigma, surface or Surface.of(self.model, posed)
-        cloud = float(robust_square(self.met(surface)[0], sigma).mean())
+        cloud = self.cloud_misfit(surface)
         amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * sigma)[1]
         outside = float(robust_square(amount, sigma, 4 * ROBUST).mean())
         return self.total(cloud, self.network.energy(posed, self.network_sigma), outside, posed.z)

@@ -24,7 +24,7 @@ from mereo.fitting.problem.correspondences import Correspondences, find_correspo
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import Surface, robust_square
+from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.problem.scene_unit import agree, estimate_unit
 from mereo.fitting.registration.registration import Method, Registration
 from mereo.fitting.uncertainty.optimum import DrawsOptimum, ModesOptimum, Optimum
@@ -35,9 +35,6 @@ from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.statistical_model import StatisticalModel
 
 KNOWN_SCALE_STD = 1e-6
-
-CLIPPED = 0.5
-"""Largest distance of one place that counts in ``ModesFit.displaced``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +105,11 @@ class ModesFit:
         return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
 
     @property
+    def asks_draws(self) -> bool:
+        """Whether draws may be the answer: beside the rest model only under noise, where modes may miss what moved."""
+        return self.rest is None or self.problem.noisy
+
+    @property
     def tolerance(self) -> float:
         """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
         return self.problem.config.tolerance
@@ -139,13 +141,13 @@ class ModesFit:
         Modes can imitate what they do not hold, with more of them than a scene has draws; the evidence counts that.
         It does not speak against draws, which have the states that there really are.
         """
-        if self.rest is not None:
+        if not self.asks_draws:
             return self.registration()
         started = time.perf_counter()
         with one_blas_thread():
             problem = DrawsProblem.of(self.problem, states, self.found)
             drawn = fit_draws(problem, self.posed)
-            taken = drawn is not None and is_drawn(problem, drawn, self.posed)
+            taken = drawn is not None and is_drawn(problem, drawn, self.posed, self.rest)
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
             return replace(self.registration(), seconds=seconds)
@@ -154,12 +156,7 @@ class ModesFit:
         return replace(found, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
 
     def _registration(
-        self,
-        method: Method,
-        z: Float[np.ndarray, " k"],
-        optimum: Optimum,
-        posed: Posed,
-        surface: Surface,
+        self, method: Method, z: Float[np.ndarray, " k"], optimum: Optimum, posed: Posed, surface: Surface
     ) -> Registration:
         distance = surface.nearest(self.problem.evidence.partners)[0]
         explained = float((distance <= self.tolerance).mean())
@@ -186,14 +183,10 @@ class ModesFit:
         """``Registration.radius_scale`` and ``radius_beside``."""
         if self.calibration is None:
             return None, 0.0
-        factors = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy)
-        scale = factors.scale if factors.misfit is None else factors.scale_at(self.misfit_of(surface))
-        displaced = None if factors.displaced is None else self.displaced(surface.material)
-        return scale, self.problem.model.half * factors.beside(displaced)
-
-    def misfit_of(self, surface: Surface) -> float:
-        """The cloud's misfit, in squared standard deviations of a partner."""
-        return float(robust_square(self.problem.met(surface)[0], self.problem.config.cloud_sigma).mean())
+        factors, model = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy), self.problem.model
+        scale = factors.scale if factors.misfit is None else factors.scale_at(self.problem.cloud_misfit(surface))
+        displaced = None if factors.displaced is None else self.found.displaced(model, surface.material)
+        return scale, model.half * factors.beside(displaced)
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
         """Whether a fit explains enough of the points; less is enough where the network sees the same segments there.
@@ -213,25 +206,16 @@ class ModesFit:
         model = self.problem.model
         return float((model.labels[model.faces[surface.facing[face], 0]] == seen.labels).mean())
 
-    def displaced(self, material: Float[np.ndarray, "m 3"]) -> float | None:
-        """How far the network has the places of the object from where they are, as a share of half its length.
 
-        Root mean square, each ``CLIPPED`` at most; None where the network was not asked.
+def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: Judged | None = None) -> bool:
+    """Whether a state of the draws is to be preferred to the modes, or to the rest model, where that is given.
 
-        Args:
-            material: places of the material points in this frame, scene units.
-        """
-        if len(self.found.points) == 0:
-            return None
-        model = self.problem.model
-        place = model.weights(self.found.rest, self.found.labels)(material)
-        apart = np.linalg.norm(place - self.found.points, axis=1) / model.half
-        return float(np.sqrt((np.minimum(apart, CLIPPED) ** 2).mean()))
-
-
-def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed) -> bool:
-    """Whether a state of the draws is to be preferred to the modes."""
-    gain = drawn.misfit - problem.base.misfit(modes).total
+    By the points that the answer was fitted to.
+    """
+    if rest is not None:
+        unbent = of_rest(problem.last, problem.found).misfit(rest.posed).total
+        return drawn.misfit + draws_narrowing(problem, drawn) < unbent
+    gain = drawn.misfit - problem.last.misfit(modes).total
     return gain < 0 or gain < modes_narrowing(problem.base, modes) - draws_narrowing(problem, drawn)
 
 

@@ -95,11 +95,13 @@ def fitted_frame(
 
     def fitted(reading: Reading) -> FittedFrame:
         seen = encoded if encoded is not None and reading is found[0] else encode_frame(reading, model, axes)
-        if fitting is None:
-            return FittedFrame(seen, seen)
+        return FittedFrame(seen, seen) if fitting is None else fitted_by(fitting, seen)
+
+    def fitted_by(one: Registrar, seen: EncodedFrame) -> FittedFrame:
+        reading = seen.reading
         doubtful = transform_points(seen.T_camera_input, reading.whole.points[~reading.keep])
         try:
-            modes = fitting.fit_modes(seen.seen, seen.code, scene_unit, stated_unit, doubtful)
+            modes = one.fit_modes(seen.seen, seen.code, scene_unit, stated_unit, doubtful)
         except ValueError as error:
             return FittedFrame(seen, seen, error=error)
         return FittedFrame(seen, seen, modes)
@@ -109,10 +111,20 @@ def fitted_frame(
         return first
     everything, surfaces = sorted((first, fitted(found[1])), key=lambda one: one.reading.dropped)
     taken = chosen(everything, surfaces, fitted)
+    if taken.modes is not None and not taken.modes.registration().accepted:  # then it is not for strays alone
+        taken = more_explained(taken, fitted_by(registrar.at_last, taken.seen))
     if taken.modes is not None:
         spent = time.perf_counter() - started - taken.seen.timings_s["encode"]
         taken = replace(taken, modes=replace(taken.modes, seconds=spent))
     return replace(taken, unaided=first.seen)
+
+
+def more_explained(one: FittedFrame, other: FittedFrame) -> FittedFrame:
+    """That of two fits to one reading which explains the greater share of all points; the first where both do."""
+    if one.modes is None or other.modes is None:
+        return one if other.modes is None else other
+    tolerance = min(one.modes.tolerance, other.modes.tolerance)
+    return one if (one.off_surface <= tolerance).mean() >= (other.off_surface <= tolerance).mean() else other
 
 
 def chosen(everything: FittedFrame, surfaces: FittedFrame, fitted: Callable[[Reading], FittedFrame]) -> FittedFrame:

@@ -79,7 +79,7 @@ class Signs:
         beyond: how far the state lies outside all that were learned, scene units; None at rest.
         unusual: mean square of the state's coefficients; None at rest.
         displaced: how far apart network and registered model have the same places of the object, as a share of half its
-            length (``ModesFit.displaced``); None where the network was not asked.
+            length (``Correspondences.displaced``); None where the network was not asked.
     """
 
     size: float | None = None
@@ -205,7 +205,7 @@ def recognize(
 
 def displaced_of(modes: ModesFit, registration: Registration) -> float | None:
     """``Signs.displaced`` of a registration made of a fit of the modes."""
-    return modes.displaced(registration.material / modes.unit)
+    return modes.found.displaced(registration.model, registration.material / modes.unit)
 
 
 def recognized(

@@ -102,6 +102,11 @@ class Registrar:
         """The same without the patience to ask about a frame again with the camera turned."""
         return replace(self, config=replace(self.config, turned=False))
 
+    @property
+    def at_last(self) -> "Registrar":
+        """The same, which asks about a frame with the camera turned however noisy it may be."""
+        return replace(self, config=replace(self.config, turned_anyway=True))
+
     def asking(self, network: Model) -> "Registrar":
         """The same, asking the same weights on another device; scene and states that are known stay so."""
         if network is self.network:
@@ -149,7 +154,7 @@ class Registrar:
 
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer from a fit of the modes: the draws too where ``choice`` asks for them."""
-        states = None if self.choice == "modes" or fitted.rest is not None else self.at_hand
+        states = None if self.choice == "modes" or not fitted.asks_draws else self.at_hand
         return fitted.registration() if states is None else fitted.with_draws(states)
 
     def takes(self, registration: Registration) -> bool:

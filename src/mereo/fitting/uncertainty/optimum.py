@@ -12,11 +12,11 @@ from jaxtyping import Float, Float32
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws.problem import terms as terms_of_draws
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.problem.own_turns import left_open
 from mereo.fitting.problem.posterior import Observed, Posterior, Terms
 from mereo.fitting.problem.priors import Prior
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import Surface, add_witnesses
-from mereo.fitting.uncertainty.own_turns import left_open
 from mereo.io.cores import one_blas_thread
 
 

@@ -19,7 +19,7 @@ from mereo.fitting.registration.state import model_digest, played_state
 from mereo.fitting.registration.state_file import MOST_NUMBERS, Block, RegistrationState, Text, parse_state, said
 from mereo.scenes.given_draws import played_back
 from mereo.scenes.parameters import Played
-from mereo.scenes.rounds import at_rest, is_at_rest
+from mereo.scenes.rest_pose import at_rest, is_at_rest
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
