@@ -11,8 +11,8 @@ clean and of simulated cameras' views that are "unsure" and refused; and the exp
 probabilities as they are and calibrated. Weights without a calibration are calibrated here, on training seeds, and not
 written. Test seeds begin at 1,000,000: tune on others.
 
-With `--output` each object's row is kept in FOLDER/OBJECT.json as soon as it is measured and FOLDER/table.md has all
-rows that are there, so that a run that was cut off goes on where it was: rows of the same settings are not measured
+With `--output` each object's row is kept in FOLDER/OBJECT.json as soon as it is measured and FOLDER/table.md has those
+of the objects named, so that a run that was cut off goes on where it was: rows of the same settings are not measured
 again, and those of others are refused.
 """
 
