@@ -161,7 +161,7 @@ def test_the_summary_tells_centroids_volumes_and_the_whole(found: Answer, folder
 def test_the_report_says_and_shows_it(found: Answer, folder: Path, cloud: PointCloud) -> None:
     page = (folder / "report.html").read_text(encoding="utf-8")
     data = json.loads(re.search(r"const DATA = (.*);\n", page)[1])  # type: ignore[index]
-    assert data["words"]["heads"][1:3] == ["centre x, y, z, ± 95 % (mm)", "volume and 95 % of it (cm³)"]
+    assert data["words"]["heads"][1:3] == ["centre x, y, z, ± 95 % (mm)", "volume, 95 % range (cm³)"]
     assert "±" in data["words"]["rows"][0][0] and " to " in data["words"]["rows"][0][1]
     assert any("(95 %, not calibrated)" in fact and " mm in the median" in fact for fact in data["words"]["facts"])
     for shown in data["segments"]:

@@ -17,7 +17,7 @@ def docs_page(description: Mapping[str, Any]) -> str:
     """HTML of an OpenAPI description: every address with its parameters and answers."""
     info = description["info"]
     parts = [
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(info['title'])}</title>",
+        f"<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width, initial-scale=1'><title>{escape(info['title'])}</title>",
         f"<style>{STYLE}</style><h1>{escape(info['title'])}</h1><p>{escape(info.get('description', ''))}</p>",
         "<p>For programs: <a href=/openapi.json>openapi.json</a>.</p>",
     ]

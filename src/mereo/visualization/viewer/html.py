@@ -97,9 +97,8 @@ def answer(
         said = "on the surface"
     toward = "" if np.isnan(direction).any() else f"towards {_vector(direction.tolist())}"
     rest = "" if found.rest is None else f"<br>at rest at {_vector(found.rest[0].tolist())} scene units"
-    where = f"at {unit.place(place)} {unit.length_name}"
-    if found.radius95 is not None:
-        where += f" ± {_length(float(found.radius95[0]), unit)} (95 %)"
+    radius = None if found.radius95 is None else float(found.radius95[0])
+    where = f"at {unit.place(place, radius)} {unit.length_name}" + ("" if radius is None else " (95 %)")
     return (
         f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">{where}</span></div>'
         f'{_likeliest(found, names, colors)}<div style="{BOX}">{escape(said)}<br><span style="{SOFT}">{toward}{rest}'
