@@ -30,7 +30,7 @@ from mereo.visualization.viewer import display, serve
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, ModeShapes
 from mereo.visualization.viewer.laboratory import Laboratory, QuickRegistrar
-from mereo.visualization.viewer.probe import Inspection
+from mereo.visualization.viewer.probe import ON_SURFACE, Inspection
 
 AWAY = np.array([0.0, 0.0, 150.0])
 needs_browser = pytest.mark.skipif(find_spec("viser") is None or BROWSER is None, reason="no viser or no browser")
@@ -214,6 +214,22 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
     assert sentence in error
 
 
+def test_a_place_on_a_surface_is_its_segments(states: StatisticalModel, model: Model) -> None:
+    """Rounding puts about half of such places outside; a click on a segment asks about it all the same."""
+    inspection = Inspection.of_registration(by_modes(states), model, np.eye(4))
+    assert inspection.registration is not None
+    segment = inspection.registration.mesh.segments[0]
+    places = segment.vertices[segment.faces[::7]].mean(axis=1)
+    outside = inspection.registration.query(places).label == 0
+    found = inspection.ask(places)
+    met = np.abs(found.distance) <= ON_SURFACE * np.abs(places).max(axis=1)
+    assert (outside & met).any() and (found.label[outside & met] == 1).all()
+    corners = segment.vertices[segment.faces[::7]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    away = places + 0.01 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    assert (inspection.ask(away).label == 0).any(), "beside it is empty space"
+
+
 @needs_browser
 def test_the_page_of_a_state_shows_its_mesh_and_answers(states: StatisticalModel, model: Model, tmp_path: Path) -> None:
     server = display.start_server(0, "mereo")
@@ -226,6 +242,7 @@ def test_the_page_of_a_state_shows_its_mesh_and_answers(states: StatisticalModel
         until(lambda: pixels_of(browser.screenshot()[:, :420], base) > 150)
         page._move_probe(page.mesh.segments[0].vertices[0])
         until(lambda: "at rest at" in browser.text() and "on the surface" in browser.text())
+        assert not page.coloring.visible, "there is one colouring"
     server.stop()
 
 

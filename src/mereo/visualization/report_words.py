@@ -3,7 +3,7 @@
 ``reconstruction_report`` is about the page's shapes and bytes; here is all of its text that depends on a result.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
