@@ -260,8 +260,8 @@ def series(outcome: Outcome[FrameAnswer]) -> dict[str, float]:
             facts["answer/explained"] = found.explained
         if found.recognition is not NOT_ASKED:
             facts["answer/known"] = 0.5 if found.recognition.known == "unsure" else float(found.recognition.known)
-        for name in ("median", "max") if found.radius95 else ():
-            facts[f"radius95/{name}"] = float(found.radius95[name])
+        if found.radius95 is not None:
+            facts |= {f"radius95/{name}": float(found.radius95[name]) for name in ("median", "max")}
     return facts | {f"milliseconds/{name}": 1e3 * seconds for name, seconds in parts.items()}
 
 
