@@ -19,7 +19,7 @@ from mereo.evaluation.cases import TestCase
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import intersection_over_union
 from mereo.evaluation.scoring import CELLS, score_cases
-from mereo.fitting.register import registrar_for
+from mereo.fitting.registration.register import registrar_for
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene

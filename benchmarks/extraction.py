@@ -14,7 +14,7 @@ import numpy as np
 
 from mereo.evaluation.scoring import trained_scene
 from mereo.models.weights import load_model
-from mereo.reconstruction.isosurfaces import Extraction, extract, extract_dense
+from mereo.reconstruction.isosurfaces import Extraction, extract
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -32,9 +32,9 @@ def main(weights: str = "rope", resolution: int = 64, views: int = 2) -> None:
         box = np.stack([low, high]) + 0.1 * (high - low).max() * np.array([[-1.0], [1.0]])
         results: list[Extraction] = []
         seconds = []
-        for run in (extract, extract_dense):
+        for every in (False, True):
             start = time.perf_counter()
-            results.append(run(field, box, resolution, model.names, model.colors))
+            results.append(extract(field, box, resolution, model.names, model.colors, dense=every))
             seconds.append(time.perf_counter() - start)
         fine, dense = results
         odd = np.argwhere(fine.grid.labels != dense.grid.labels)

@@ -20,9 +20,9 @@ from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import predict_grid
-from mereo.fitting.fit import fit
-from mereo.fitting.playback import DrawnStates
-from mereo.fitting.registration import Registration
+from mereo.fitting.draws.playback import DrawnStates
+from mereo.fitting.registration.fit import fit
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid

@@ -20,22 +20,23 @@ import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
-from mereo.fitting.register import Registrar
-from mereo.fitting.registration import Registration
-from mereo.fitting.track_config import TrackConfig
-from mereo.fitting.tracker import Followed, Tracker
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
+from mereo.fitting.tracking.config import TrackConfig
+from mereo.fitting.tracking.tracker import Followed, Tracker
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.synthesis.config import SENSORS
+from mereo.synthesis.config import SENSORS, Occluder
 from mereo.synthesis.depth_rendering import add_depth_noise
 from mereo.synthesis.sequence_config import SequenceConfig
 from mereo.synthesis.sequences import Moment, sequence
@@ -185,7 +186,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=value)
     for name, value in (("seconds", 5.0), ("noise", SequenceConfig.noise_std), ("noise-end", 0.0)):
         parser.add_argument(f"--{name}", type=float, default=value)
-    parser.add_argument("--occluder", choices=("tool", "hand", "none"), default="tool")
+    parser.add_argument("--occluder", choices=get_args(Occluder), default="tool")
     parser.add_argument("--sensor", choices=tuple(SENSORS), default="paper")
     parser.add_argument("--change", type=float, default=SequenceConfig.change)
     parser.add_argument("--motion", choices=("pose", "velocity"), default=TrackConfig.motion)

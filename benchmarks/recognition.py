@@ -22,14 +22,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mereo.evaluation.calibrate import VIEWS, calibrate
-from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, own_views, strange_frames
+from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.probability_scaling import Scaling
+from mereo.evaluation.probability_scaling import ece_of
 from mereo.evaluation.reliability import AskedCells
 from mereo.evaluation.scoring import trained_scene
-from mereo.fitting.readings import fitted_frame
-from mereo.fitting.recognition import Recognition, recognized
-from mereo.fitting.register import Registrar
+from mereo.fitting.registration.readings import fitted_frame
+from mereo.fitting.registration.recognition import Recognition, recognized
+from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.weights import load_model
@@ -106,7 +106,7 @@ def measured(name: str, arguments: argparse.Namespace) -> Found:
     for index, view in enumerate(clean):
         wrong = PointCloud(view.seen.points * FACTORS[index % len(FACTORS)])
         found.strange["wrong unit"].append(said_of(wrong, model, registrar))
-    for strange in strange_frames(scene, arguments.strangers, seed):
+    for strange in strange_frames(scene, other_objects(scene), arguments.strangers, seed):
         found.strange[strange.kind].append(said_of(strange.cloud, model, registrar, stated=None))
     for strange in frames_beyond(scene, arguments.views, seed):
         found.strange[strange.kind].append(said_of(strange.cloud, model, registrar))
@@ -127,9 +127,8 @@ def calibration_error(model: Model, views: Sequence[CalibrationView]) -> tuple[f
         truth.append(cells.truth)
     calibration = model.calibration
     assert calibration is not None and calibration.temperature is not None
-    scaling = Scaling(calibration.temperature, calibration.biases)
     every = np.concatenate(logits), np.concatenate(truth)
-    return Scaling().ece(*every), scaling.ece(*every)
+    return ece_of(*every), ece_of(*every, calibration.scaling)
 
 
 def row(name: str, found: Found) -> str:

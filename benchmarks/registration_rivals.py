@@ -44,9 +44,9 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.config import FitConfig
-from mereo.fitting.correspondences import find_correspondences
-from mereo.fitting.fit import fit
-from mereo.fitting.registration import Registration
+from mereo.fitting.problem.correspondences import find_correspondences
+from mereo.fitting.registration.fit import fit
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.procrustes import robust_rigid

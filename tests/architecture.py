@@ -1,18 +1,17 @@
-"""The rules of the package's rooms, read from its sources alone: nothing is imported or run.
+"""The rules of the package's rooms.
 
-``read_package`` reads a folder, whatever its name; every rule is a function of what it returns, or of files, and
-answers with its violations, one readable sentence each. An empty list means that the rule holds.
-
-A module is called by its file below the package's folder, without ``.py``: ``geometry/mesh``, ``io/writers/__init__``.
+Every rule is a function of what ``read_package`` returns, or of files, and answers with its violations, one readable
+sentence each. An empty list means that the rule holds.
 """
 
 import ast
 import re
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+
+from package_imports import Import, Package
 
 ROOMS = (
     "geometry",
@@ -34,6 +33,9 @@ ROOMS = (
 )
 """From the ground up: a room imports only from itself and from those before it."""
 
+SUBROOMS = {"fitting": ("config", "problem", "modes", "draws", "uncertainty", "registration", "tracking")}
+"""Rooms whose sub-rooms, and modules beside them, have an order too: all of the room lies in one of these."""
+
 DATA_FOLDERS = ("frames", "states", "weights")
 """They travel with the package and hold no code."""
 
@@ -47,150 +49,27 @@ HEAVY = ("numpy", "torch", "scipy", "trimesh", "matplotlib")
 
 MOST_LINES = 300
 
-TYPES_ONLY = ("TYPE_CHECKING", "typing.TYPE_CHECKING")
-"""Conditions that hold for type checkers and never when a program runs."""
-
-MODULE_NAME = re.compile(r"\w+\.[\w.]*")
 ROOM_ROW = re.compile(r"^\| *\[?`(\w+)/`", re.MULTILINE)
 """How a row of the README's table of rooms begins; the room's name may be a link."""
-
-
-@dataclass(frozen=True)
-class Import:
-    """One place where a module names another one, in an import statement or in a string.
-
-    Attributes:
-        source: the module that imports.
-        line: where, counted from 1.
-        target: the module of the package that is imported, or a library's name (``torch``).
-        at_start: importing ``source`` executes it: it is neither in a function, nor for type checkers only, nor a
-            string.
-    """
-
-    source: str
-    line: int
-    target: str
-    at_start: bool
-
-    @property
-    def edge(self) -> str:
-        """The two modules without the line, which every change above it would move."""
-        return f"{self.source} -> {self.target}"
-
-    @property
-    def place(self) -> str:
-        return f"{self.source}.py:{self.line}"
-
-
-@dataclass(frozen=True)
-class Package:
-    """The modules of a package.
-
-    Attributes:
-        root: its folder.
-        trees: the syntax of each module.
-        imports: all that they import, by module.
-    """
-
-    root: Path
-    trees: Mapping[str, ast.Module]
-    imports: Mapping[str, tuple[Import, ...]]
-
-    def __iter__(self) -> Iterator[Import]:
-        for imports in self.imports.values():
-            yield from imports
-
-    def needs(self, module: str) -> list[str]:
-        """What importing a module imports at once: other modules of the package, and libraries."""
-        return [i.target for i in self.imports.get(module, ()) if i.at_start and i.target != module]
-
-
-# --- reading ----------------------------------------------------------------------------------------------------------
-
-
-def read_package(root: Path) -> Package:
-    """Read every module below ``root``, the package's folder, whose name is the package's."""
-    files = sorted(root.rglob("*.py"))
-    trees = {f.relative_to(root).with_suffix("").as_posix(): ast.parse(f.read_text("utf-8"), str(f)) for f in files}
-    modules = {_dotted(root.name, module): module for module in trees}
-    imports = {m: tuple(dict.fromkeys(_imports(root.name, m, tree, modules))) for m, tree in trees.items()}
-    return Package(root, trees, imports)
-
-
-def _dotted(package: str, module: str) -> str:
-    """``mereo.io.writers`` for ``io/writers/__init__``."""
-    return ".".join([package, *module.split("/")]).removesuffix(".__init__")
-
-
-def _imports(package: str, source: str, tree: ast.Module, modules: Mapping[str, str]) -> Iterator[Import]:
-    folder = [package, *source.split("/")[:-1]]
-    for node, at_start in _nodes(tree):
-        for name in _imported(node, folder):
-            library = name.partition(".")[0]
-            target = _module_of(name, modules) if library == package else library
-            yield Import(source, node.lineno, target, at_start)
-        for target in _spelled(node, package, modules):
-            yield Import(source, node.lineno, target, at_start=False)
-
-
-def _nodes(node: ast.AST, at_start: bool = True) -> Iterator[tuple[ast.stmt | ast.expr, bool]]:
-    """All statements and expressions below a node, with whether importing the module executes them."""
-    if isinstance(node, ast.stmt | ast.expr):
-        yield node, at_start
-    inside = at_start and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-    for_types = node.body if isinstance(node, ast.If) and ast.unparse(node.test) in TYPES_ONLY else []
-    for child in ast.iter_child_nodes(node):
-        yield from _nodes(child, inside and child not in for_types)
-
-
-def _imported(node: ast.AST, folder: list[str]) -> list[str]:
-    """Dotted names of what a statement, or a call of ``import_module`` with a literal, imports."""
-    match node:
-        case ast.Import(names=names):
-            return [alias.name for alias in names]
-        case ast.ImportFrom(module=module, names=names, level=level):
-            base = [*folder[: len(folder) - level + 1], *([module] if module else [])] if level else [module or ""]
-            return [".".join([*base, alias.name]) for alias in names]
-        case ast.Call(func=ast.Name(id=called) | ast.Attribute(attr=called), args=[ast.Constant(value=str(name)), *_]):
-            return [name] if called in ("import_module", "__import__") else []
-    return []
-
-
-def _spelled(node: ast.AST, package: str, modules: Mapping[str, str]) -> list[str]:
-    """The module that a string names: for ``import_module``, in a table, or as the constant start of an f-string.
-
-    Without the package's name, as ``"geometry.mesh"``, it must be a whole module: ``"training.csv"`` is a file. An
-    f-string that goes on right after ``"mereo."`` can mean any room, so it counts as the root.
-    """
-    if not (isinstance(node, ast.Constant) and isinstance(node.value, str) and MODULE_NAME.fullmatch(node.value)):
-        return []
-    name = node.value.rstrip(".")
-    if name.partition(".")[0] != package:
-        return [modules[f"{package}.{name}"]] if f"{package}.{name}" in modules else []
-    target = _module_of(name, modules)
-    return [target] if target != "__init__" or name == package else []
-
-
-def _module_of(name: str, modules: Mapping[str, str]) -> str:
-    """The module that a dotted name lies in: itself, or the longest beginning that is one; else the root."""
-    while name not in modules and name:
-        name = name.rpartition(".")[0]
-    return modules.get(name, "__init__")
 
 
 # --- rules of imports -------------------------------------------------------------------------------------------------
 
 
 def upward_imports(package: Package) -> list[Import]:
-    """Imports from a later room or from the root: lazy ones, those for type checkers and names in strings included."""
+    """Imports from a later room or sub-room, or from the root: lazy ones, for type checkers and in strings included."""
     inside = [i for i in package if i.target in package.trees and i.source not in ROOT_MODULES]
     return [i for i in inside if _height(i.target) > _height(i.source)]
 
 
-def _height(module: str) -> int:
-    """Place of the module's room in ``ROOMS``; what lies in none of them comes after all."""
-    room = module.partition("/")[0]
-    return ROOMS.index(room) if room in ROOMS else len(ROOMS)
+def _height(module: str) -> tuple[int, int]:
+    """Place of the module's room in ``ROOMS``, then of its sub-room; what lies in none of them comes after all."""
+    room, inside, *_ = *module.split("/"), ""
+    return _place(room, ROOMS), _place(inside, SUBROOMS.get(room, ()))
+
+
+def _place(name: str, order: tuple[str, ...]) -> int:
+    return order.index(name) if name in order else len(order)
 
 
 def differences(upward: Iterable[Import], exceptions: Collection[str]) -> list[str]:
@@ -269,15 +148,22 @@ def _init_fault(tree: ast.Module | None) -> str:
 
 
 def misplaced(package: Package) -> list[str]:
-    """Folders that are neither a room nor data, code among the data, and modules at the root that belong in a room."""
+    """Folders that are neither a room nor data, code among the data, and modules that belong in a room or sub-room."""
     strange = [folder for folder in _folders(package) if folder not in (*ROOMS, *DATA_FOLDERS)]
     code = [module for module in package.trees if module.startswith(tuple(f"{d}/" for d in DATA_FOLDERS))]
     loose = [module for module in package.trees if "/" not in module and module not in ROOT_MODULES]
+    homeless = [module for module in package.trees if _in_no_subroom(module)]
     return [
         *(f"{folder}/ is neither a room nor a folder of data" for folder in strange),
         *(f"{module}.py is code in a folder of data" for module in code),
         *(f"{module}.py lies at the root and not in a room" for module in loose),
+        *(f"{module}.py lies in no sub-room" for module in homeless),
     ]
+
+
+def _in_no_subroom(module: str) -> bool:
+    room, inside, *_ = *module.split("/"), ""
+    return room in SUBROOMS and inside not in (*SUBROOMS[room], "__init__")
 
 
 def _folders(package: Package) -> list[str]:

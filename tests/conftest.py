@@ -20,7 +20,7 @@ install_import_hook("mereo", "type_checker.check")
 from mereo.scenes import assets  # noqa: E402
 
 if TYPE_CHECKING:
-    from mereo.fitting.playback import DrawnStates
+    from mereo.fitting.draws.playback import DrawnStates
     from mereo.models.model import Model
     from mereo.scenes.statistical_model import StatisticalModel
 
@@ -70,7 +70,7 @@ def toy_model() -> "StatisticalModel":
 @pytest.fixture(scope="session")
 def few_rope_states(rope: "Model") -> "DrawnStates":
     """Random states of the rope, ``FEW_STATES`` of them."""
-    from mereo.fitting.playback import DrawnStates
+    from mereo.fitting.draws.playback import DrawnStates
     from mereo.scenes.registry import load_scene
 
     assert rope.statistical_model is not None
@@ -80,7 +80,7 @@ def few_rope_states(rope: "Model") -> "DrawnStates":
 @pytest.fixture
 def few_states(few_rope_states: "DrawnStates", monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a fit of the rope's draws start among those few, which are made once."""
-    from mereo.fitting.playback import DrawnStates
+    from mereo.fitting.draws.playback import DrawnStates
 
     monkeypatch.setattr(DrawnStates, "of", lambda scene, model: few_rope_states)
 

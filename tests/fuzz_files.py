@@ -215,8 +215,8 @@ def checkpoint() -> Checkpoint:
 def state(path: Path) -> None:
     import test_registration_state as cases
 
-    from mereo.fitting.registration_state import state_of
-    from mereo.fitting.state_file import save_state
+    from mereo.fitting.registration.state import state_of
+    from mereo.fitting.registration.state_file import save_state
 
     found = state_of(cases.by_modes(statistical_model()), "toy", weights="w", frame="camera", unit_m=1.0,
                      T_camera_input=np.eye(4))  # fmt: skip
@@ -224,7 +224,7 @@ def state(path: Path) -> None:
 
 
 def read_registration(path: Path) -> object:
-    from mereo.fitting.registration_state import load_state
+    from mereo.fitting.registration.state import load_state
 
     return load_state(path, statistical_model())
 

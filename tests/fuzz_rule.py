@@ -17,8 +17,7 @@ from pathlib import Path
 from traceback import extract_tb
 from types import FrameType
 
-from mereo import __main__ as command_line
-from mereo.io.foreseen import PACKAGE, is_foreseen
+from mereo.io.foreseen import PACKAGE, is_foreseen, words_of
 from mereo.io.size_limits import LIMIT_VARIABLE
 
 MOST_SECONDS, MOST_GB = 20.0, 2.0
@@ -122,7 +121,7 @@ def _fault_of_error(error: BaseException, names: tuple[str, ...]) -> Fault | Non
     kind = f"{type(error).__name__} in {where}"
     if not isinstance(error, Exception) or not is_foreseen(error):
         return Fault(kind, f"{type(error).__name__}: {text[:600]}")
-    said = command_line.one_line(error)
+    said = words_of(error)
     wrong = {
         "of several lines": len(text.splitlines()) > 1,
         "with control characters": not said.replace("\u00a0", " ").isprintable(),

@@ -9,18 +9,18 @@ from architecture import (
     MAY_IMPORT_TORCH,
     MOST_LINES,
     ROOMS,
-    Package,
+    SUBROOMS,
     bad_init_files,
     cycles,
     differences,
     heavy_settings,
     long_files,
     misplaced,
-    read_package,
     rooms_unlike_readme,
     torch_imports,
     upward_imports,
 )
+from package_imports import Package, read_package
 
 TOP = Path(__file__).parents[1]
 
@@ -146,6 +146,15 @@ def test_each_room_is_later_than_the_one_before(tmp_path: Path) -> None:
     assert len(upward_imports(package)) == count * (count - 1) / 2
 
 
+def test_each_subroom_is_later_than_the_one_before(tmp_path: Path) -> None:
+    for room, order in SUBROOMS.items():
+        code = "".join(f"import mereo.{room}.{name}.x\n" for name in order)
+        package = package_of(tmp_path, {f"{room}/{name}/x.py": code for name in order})
+        assert len(upward_imports(package)) == len(order) * (len(order) - 1) / 2
+        first = f"{room}/{order[0]}/x.py:2 imports {room}.{order[1]}.x, a later room"
+        assert differences(upward_imports(package), ())[0] == first
+
+
 def test_exceptions_pass_until_they_are_stale(tmp_path: Path) -> None:
     upward = upward_imports(package_of(tmp_path, {"geometry/mesh.py": "import mereo.io.readers", **LATER}))
     assert differences(upward, {"geometry/mesh -> io/readers"}) == []
@@ -159,7 +168,7 @@ def test_exceptions_pass_until_they_are_stale(tmp_path: Path) -> None:
 )
 def test_torch_elsewhere_is_found(code: str, tmp_path: Path) -> None:
     allowed = ("models/ops/svd.py", "training/loop.py", "experiments/speed/report.py", "cli/doctor.py")
-    free = ("fitting/fit.py", "experiments/paper/store.py", "cli/demo.py", "__main__.py")
+    free = ("fitting/registration/fit.py", "experiments/paper/store.py", "cli/demo.py", "__main__.py")
     package = package_of(tmp_path, dict.fromkeys((*allowed, *free), code))
     rule = f"imports torch, which only {', '.join(MAY_IMPORT_TORCH)} may"
     line = code.count("\n") + 1
@@ -205,6 +214,7 @@ def test_other_init_files_are_found(text: str, fault: str, tmp_path: Path) -> No
 
 def test_what_lies_in_no_room_is_found(tmp_path: Path) -> None:
     files = {"bench/report.py": "", "weights/rope.json": "{}", "states/load.py": "", "frames.py": "", "__main__.py": ""}
+    files |= {"fitting/config.py": "", "fitting/modes/fit.py": "", "fitting/loose.py": "", "fitting/other/x.py": ""}
     root = package_of(tmp_path, {"io/readers.py": "", **files}).root
     (root / "weights/__init__.py").unlink()
     (root / "states/__init__.py").unlink()
@@ -214,6 +224,9 @@ def test_what_lies_in_no_room_is_found(tmp_path: Path) -> None:
         "bench/ is neither a room nor a folder of data",
         "states/load.py is code in a folder of data",
         "frames.py lies at the root and not in a room",
+        "fitting/loose.py lies in no sub-room",
+        "fitting/other/__init__.py lies in no sub-room",
+        "fitting/other/x.py lies in no sub-room",
     ]
 
 

@@ -13,7 +13,7 @@ from safetensors import safe_open
 from mereo import __main__ as command_line
 from mereo.evaluation.calibrate import calibrate
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.probability_scaling import GOOD_ENOUGH, Scaling, fit_scaling
+from mereo.evaluation.probability_scaling import GOOD_ENOUGH, ece_of, fit_scaling
 from mereo.evaluation.reliability import BINS, AskedCells, Reliability
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model
@@ -52,7 +52,7 @@ def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
 
 
 def test_answers_that_are_as_likely_as_they_say_have_none(logits: np.ndarray) -> None:
-    assert Scaling().ece(logits, drawn(logits)) < 0.01
+    assert ece_of(logits, drawn(logits)) < 0.01
 
 
 def test_scaling_finds_what_made_the_probabilities_wrong(logits: np.ndarray) -> None:
@@ -63,8 +63,8 @@ def test_scaling_finds_what_made_the_probabilities_wrong(logits: np.ndarray) -> 
     favoured = fit_scaling(2.5 * (logits + FAVOUR), truth)
     assert favoured.biases is not None and favoured.temperature == pytest.approx(2.5, rel=0.03)
     np.testing.assert_allclose(favoured.biases, [0.0, -2.0, 1.0], atol=0.08)
-    before = Scaling().ece(2.5 * (logits + FAVOUR), truth)
-    assert favoured.ece(2.5 * (logits + FAVOUR), truth) < GOOD_ENOUGH / 2 < before / 5
+    before = ece_of(2.5 * (logits + FAVOUR), truth)
+    assert ece_of(2.5 * (logits + FAVOUR), truth, favoured) < GOOD_ENOUGH / 2 < before / 5
 
 
 def test_cells_are_drawn_among_those_that_count_and_are_the_same_every_time() -> None:
@@ -90,7 +90,7 @@ def test_labels_stay_and_probabilities_are_scaled() -> None:
     np.testing.assert_allclose(after.probability, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
     assert scaled.calibrates and not plain.calibrates
     own = torch.tensor([[1.0, 2.0, 3.0]])
-    assert Calibration(seed=0, views=8).scaled(own) is own
+    assert Calibration(seed=0, views=8).scaling.scaled(own) is own
 
 
 def test_observed_points_have_the_calibrated_probability_of_their_own_segment() -> None:

@@ -14,7 +14,7 @@ from mereo.evaluation.metrics import Scores
 from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scoring import evaluate
 from mereo.evaluation.tables import markdown_table, metrics
-from mereo.fitting.register import Registrar
+from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.atomic_files import write_json

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
 
 from mereo.deformation.maps import Deformation
-from mereo.fitting.carry import Placed, carry, local_rotations, place
-from mereo.fitting.register import Registrar
-from mereo.fitting.registration import Registration, nearest_labels
+from mereo.fitting.registration.carry import Placed, carry, local_rotations, place
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import rigid, transform_points

@@ -10,8 +10,8 @@ import pytest
 
 from mereo.cli import demo
 from mereo.evaluation.sample_views import load_view
-from mereo.fitting.registration_state import load_state
-from mereo.fitting.state_file import STATE
+from mereo.fitting.registration.state import load_state
+from mereo.fitting.registration.state_file import STATE
 from mereo.geometry.solids import Solids
 from mereo.io.output_folders import MARKER, new_directory
 from mereo.models.model import EncodedCloud, Model

@@ -10,9 +10,9 @@ from toy_scene import Shear, rest_mesh, toy_scene
 
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation
-from mereo.fitting.discrete_draws import chosen_otherwise
-from mereo.fitting.fit import ModesFit
-from mereo.fitting.playback import Drawn, DrawnStates
+from mereo.fitting.draws.discrete import chosen_otherwise
+from mereo.fitting.draws.playback import Drawn, DrawnStates
+from mereo.fitting.registration.fit import ModesFit
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import scene_model, state_points

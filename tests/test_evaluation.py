@@ -216,6 +216,10 @@ def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert stored["iou"] == pytest.approx(result.scores.iou) and stored["seed"] == 1_000_000
     assert stored["confusion"] == result.confusion.tolist()
     assert stored["scene"] == "rope" and stored["examples"] == 2 and len(stored["per_example"]) == 2
+    first, second = stored["per_example"].values()
+    assert first["answered_by"] == "network" and first["known"] is None
+    low, high = sorted((first["miou"], second["miou"]))
+    assert stored["network"]["miou_tenth"] == pytest.approx(low + 0.1 * (high - low))
     assert (tmp_path / "out/table.md").read_text() == markdown_table(result)
     assert "whole set" in capsys.readouterr().out
     with pytest.raises(FileExistsError):

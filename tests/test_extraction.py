@@ -8,7 +8,7 @@ from mereo.evaluation.scoring import trained_scene
 from mereo.geometry.mesh import PALETTE, Segment
 from mereo.models.weights import load_model, shipped_names
 from mereo.reconstruction.coarse_to_fine import Field, sample_coarse_to_fine, sample_dense
-from mereo.reconstruction.isosurfaces import Extraction, _grid, extract, extract_dense, extract_whole, locate
+from mereo.reconstruction.isosurfaces import Extraction, _grid, extract, extract_whole, locate
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
@@ -21,7 +21,7 @@ def run(
     field: Field, segments: int = 1, resolution: int = 40, box: np.ndarray = BOX, dense: bool = False
 ) -> Extraction:
     names = tuple(f"part {i}" for i in range(segments))
-    return (extract_dense if dense else extract)(field, box, resolution, names, PALETTE[:segments])
+    return extract(field, box, resolution, names, PALETTE[:segments], dense=dense)
 
 
 def euler_number(segment: Segment) -> int:
@@ -216,7 +216,7 @@ def test_trained_networks_give_the_dense_labels(name: str) -> None:
     code = model.encode(view.depth.to_points())
     field: Field = lambda points: model.logits(code, points)  # noqa: E731
     names, colors = model.names, model.colors
-    fine, dense = (do(field, view.mesh.bounds, 40, names, colors) for do in (extract, extract_dense))
+    fine, dense = (extract(field, view.mesh.bounds, 40, names, colors, dense=every) for every in (False, True))
     odd = np.argwhere(fine.grid.labels != dense.grid.labels)
     if len(odd):
         logits = np.sort(field(fine.grid.positions(odd)), axis=1)

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from toy_scene import toy_scene
 
-from mereo.fitting.correspondences import Correspondences
-from mereo.fitting.evidence import Evidence
-from mereo.fitting.fit import fit_correspondences
-from mereo.fitting.gauss_newton import POSE, Posed, along
-from mereo.fitting.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.recognition import recognize
-from mereo.fitting.registration import Registration
-from mereo.fitting.scene_unit import estimate_unit
+from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.gauss_newton import POSE, Posed, along
+from mereo.fitting.problem.scene_unit import estimate_unit
+from mereo.fitting.registration.fit import fit_correspondences
+from mereo.fitting.registration.recognition import recognize
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import State

@@ -7,13 +7,13 @@ import pytest
 from test_fitting_theorems import said, shown
 from toy_scene import toy_scene
 
-from mereo.fitting.draws_approach import Shape, approach, derivatives, near, secant
-from mereo.fitting.draws_fit import fit_draws
-from mereo.fitting.draws_problem import DrawsProblem
-from mereo.fitting.draws_problem import narrowing as draws_narrowing
-from mereo.fitting.fit import ModesFit, is_drawn
-from mereo.fitting.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.rest_fit import narrowing as modes_narrowing
+from mereo.fitting.draws.approach import Shape, approach, derivatives, near, secant
+from mereo.fitting.draws.fit import fit_draws
+from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
+from mereo.fitting.draws.problem import DrawsProblem
+from mereo.fitting.draws.problem import narrowing as draws_narrowing
+from mereo.fitting.modes.rest import narrowing as modes_narrowing
+from mereo.fitting.registration.fit import ModesFit, is_drawn
 from mereo.scenes.statistical_model import StatisticalModel
 
 SCENE = toy_scene()
@@ -88,7 +88,7 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
     problem = DrawsProblem.of(fitted.problem, states, fitted.found)
     drawn = fit_draws(problem, fitted.posed)
     assert drawn is not None
-    modes = problem.base.misfit(fitted.posed).total
+    modes = problem.last.misfit(fitted.posed).total
     bought = modes_narrowing(problem.base, fitted.posed) - draws_narrowing(problem, drawn)
     assert bought > 1.0
     for gain, taken in ((-5.0, True), (0.9 * bought, True), (1.1 * bought, False)):
@@ -120,5 +120,5 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     poor = replace(poor, jumps=0, asked_again=False)
     once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
-    monkeypatch.setattr("mereo.fitting.draws_fit.second_pass", None)  # not called where the first explains the cloud
+    monkeypatch.setattr("mereo.fitting.draws.fit.second_pass", None)  # not called where the first explains the cloud
     assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None

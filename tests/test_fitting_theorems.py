@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
 
-from mereo.fitting.correspondences import Correspondences
-from mereo.fitting.fit import fit_correspondences
-from mereo.fitting.residuals import Surface
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.residuals import Surface
+from mereo.fitting.registration.fit import fit_correspondences
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points

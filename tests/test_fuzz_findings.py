@@ -17,8 +17,8 @@ from PIL import Image
 from safetensors import numpy as arrays
 from safetensors.torch import load_file, save_file
 
-from mereo import __main__ as command_line
 from mereo.io.errors import quiet, reason, without_output
+from mereo.io.foreseen import words_of
 
 
 def npz(**members: bytes) -> bytes:
@@ -172,7 +172,7 @@ def test_a_checkpoint_of_another_run_is_refused_before_training_begins(tmp_path:
 
 def test_a_terminal_obeys_no_file(capsys: pytest.CaptureFixture[str]) -> None:
     error = ValueError("the segment \x1b[31mred\x07 is unknown;\n\u2028correct it")
-    assert command_line.one_line(error) == r"the segment \x1b[31mred\x07 is unknown; correct it"
+    assert words_of(error) == r"the segment \x1b[31mred\x07 is unknown; correct it"
 
 
 def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.CaptureFixture[str]) -> None:

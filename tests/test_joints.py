@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from shapes import box
 
-from mereo.fitting.gauss_newton import Posed
-from mereo.fitting.joints import Joints, different
+from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.joints import Joints, different
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.scenes.principal_components import build_model
 from mereo.scenes.statistical_model import StatisticalModel

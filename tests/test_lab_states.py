@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from toy_scene import toy_scene
 
-from mereo.fitting.playback import Drawn, material_moved
-from mereo.fitting.registration import Registration
-from mereo.fitting.registration_state import state_of
+from mereo.fitting.draws.playback import Drawn, material_moved
+from mereo.fitting.registration.registration import Registration
+from mereo.fitting.registration.state import state_of
 from mereo.scenes.parameters import Played, parameters, random_state
 from mereo.scenes.random_states import scene_model
-from mereo.scenes.rounds import blend, smooth_round
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.walks import blend, smooth_round
 from mereo.visualization.viewer.freedom import DrawnShapes, ModeShapes
 from mereo.visualization.viewer.wishes import STEPS, Wishes
 

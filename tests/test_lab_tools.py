@@ -15,7 +15,7 @@ from PIL import Image
 from shapes import ball, box
 from toy_scene import toy_scene
 
-from mereo.fitting.state_file import STATE
+from mereo.fitting.registration.state_file import STATE
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids

@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from scene_files import write_bar
 
 from mereo.evaluation import calibrate as calibration
-from mereo.fitting.playback import DrawnStates
+from mereo.fitting.draws.playback import DrawnStates
 from mereo.io.sensor_frame import read_frame
 from mereo.learning import learn as learning
 from mereo.learning import outcome, probe, schedule

@@ -16,7 +16,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.overlap import overlaps
 from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
 from mereo.geometry.transforms import rigid, transform_points
-from mereo.reconstruction.isosurfaces import extract, extract_dense
+from mereo.reconstruction.isosurfaces import extract
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
@@ -225,8 +225,8 @@ def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: tupl
     field = logits_of(core, lambda points: np.maximum(whole(points), -core(points)))
     box_around = np.array([[-1.2] * 3, [1.2] * 3])
     found, dense = (
-        run(field, box_around, 48, ("core", "organ"), ((1, 2, 3), (4, 5, 6)), nested)
-        for run in (extract, extract_dense)
+        extract(field, box_around, 48, ("core", "organ"), ((1, 2, 3), (4, 5, 6)), nested, dense=every)
+        for every in (False, True)
     )
     assert np.array_equal(found.grid.labels, dense.grid.labels)
     found.surfaces.check()

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo import __main__ as command_line
 from mereo.io.atomic_files import atomic_file, write_json
+from mereo.io.foreseen import words_of
 from mereo.io.output_folders import claim_directory, new_directory
 
 INTERRUPTIONS = [ValueError("no"), KeyboardInterrupt(), SystemExit(1)]
@@ -58,7 +58,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path: Path) -> None:
             (partial / "f" if partial.is_dir() else partial).write_bytes(b"half")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         assert caught.value.errno == errno.ENOSPC
-        assert command_line.one_line(caught.value) == (
+        assert words_of(caught.value) == (
             f"the disk is full while writing {tmp_path / name}: free space or choose another place"
         )
     assert contents(tmp_path) == {}

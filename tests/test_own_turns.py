@@ -13,13 +13,14 @@ from test_fitting_theorems import IN_FRONT, said, seen
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.fitting.config import MANY_DRAWS
-from mereo.fitting.draws_fit import descend, jump, likely_to_jump
-from mereo.fitting.draws_problem import DrawsProblem, played
-from mereo.fitting.fit import ModesFit
-from mereo.fitting.gauss_newton import Posed
-from mereo.fitting.own_turns import ANGLES, left_open, own_turns
-from mereo.fitting.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.posterior import Posterior, covariance_factor
+from mereo.fitting.draws.descent import descend
+from mereo.fitting.draws.fit import jump, likely_to_jump
+from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
+from mereo.fitting.draws.problem import DrawsProblem, played
+from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.own_turns import ANGLES, left_open, own_turns
+from mereo.fitting.problem.posterior import Posterior, covariance_factor
+from mereo.fitting.registration.fit import ModesFit
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.random_states import scene_model

@@ -20,7 +20,7 @@ from toy_scene import toy_scene
 import mereo
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.evaluation.results import Evaluation
-from mereo.fitting.registration import Located
+from mereo.fitting.registration.registration import Located
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.output_folders import MARKER
 from mereo.reconstruction.config import IsolationConfig

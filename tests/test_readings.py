@@ -7,13 +7,13 @@ import pytest
 
 from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import SCANS, scan_in_camera
-from mereo.fitting.answer import answer
 from mereo.fitting.config import FitConfig
-from mereo.fitting.evidence import Evidence
-from mereo.fitting.noise import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, noise_of, shared
-from mereo.fitting.readings import FittedFrame, fitted_frame
-from mereo.fitting.register import Registrar
-from mereo.fitting.residuals import Surface
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.noise import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, noise_of, shared
+from mereo.fitting.problem.residuals import Surface
+from mereo.fitting.registration.answer import answer
+from mereo.fitting.registration.readings import FittedFrame, fitted_frame
+from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.weights import load_model
@@ -79,7 +79,7 @@ def test_a_part_that_looks_like_strays_is_given_back(
         keep = cloud.points[:, 0] < np.quantile(cloud.points[:, 0], 0.9)
         return Reading(cloud, keep), Reading.of_all(cloud)
 
-    monkeypatch.setattr("mereo.fitting.readings.readings", wrong)
+    monkeypatch.setattr("mereo.fitting.registration.readings.readings", wrong)
     found = frame(model, registrar, points)
     assert found.reading.dropped == 0 and found.unaided.reading.dropped > 0
 
@@ -95,7 +95,7 @@ def test_points_that_a_fit_explains_are_given_back_beside_strays(
         keep[lost] = False
         return Reading(cloud, keep), Reading.of_all(cloud)
 
-    monkeypatch.setattr("mereo.fitting.readings.readings", hasty)
+    monkeypatch.setattr("mereo.fitting.registration.readings.readings", hasty)
     keep = frame(model, registrar, contaminated).reading.keep
     assert keep[lost].all() and not keep[len(points) :].any()
 

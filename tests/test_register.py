@@ -13,12 +13,12 @@ from mereo import __main__ as command_line
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.evaluation.sample_views import SampleView, load_view
 from mereo.evaluation.scoring import evaluate
-from mereo.fitting import register
-from mereo.fitting.answer import Answer, answer
-from mereo.fitting.fit import ModesFit
-from mereo.fitting.playback import DrawnStates
-from mereo.fitting.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
-from mereo.fitting.registration import Registration
+from mereo.fitting.draws.playback import DrawnStates
+from mereo.fitting.registration import register
+from mereo.fitting.registration.answer import Answer, answer
+from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.registration.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA

@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from toy_scene import toy_scene
 
-from mereo.fitting.playback import Drawn, material_moved
-from mereo.fitting.registration import Registration
-from mereo.fitting.registration_state import load_state, model_digest, played_state, restored, state_of
-from mereo.fitting.state_file import STATE, RegistrationState, is_state, read_state, save_state
+from mereo.fitting.draws.playback import Drawn, material_moved
+from mereo.fitting.registration.registration import Registration
+from mereo.fitting.registration.state import load_state, model_digest, played_state, restored, state_of
+from mereo.fitting.registration.state_file import STATE, RegistrationState, is_state, read_state, save_state
 from mereo.geometry.transforms import rigid
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model

@@ -1,16 +1,18 @@
 """The object at rest: found exactly where it is at rest, never believed where it is bent."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_fitting_theorems import IN_FRONT, SCENE, said, seen, shown
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.evidence import Evidence
-from mereo.fitting.fit import KNOWN_SCALE_STD, ModesFit, fit_correspondences
-from mereo.fitting.gauss_newton import NormalEquations, Posed
-from mereo.fitting.playback import DrawnStates
-from mereo.fitting.problem import Problem
-from mereo.fitting.rest_fit import narrowing
+from mereo.fitting.draws.playback import DrawnStates
+from mereo.fitting.modes.rest import narrowing
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.gauss_newton import NormalEquations, Posed
+from mereo.fitting.problem.problem import Problem
+from mereo.fitting.registration.fit import KNOWN_SCALE_STD, ModesFit, fit_correspondences
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -46,6 +48,15 @@ def test_an_object_at_rest_needs_no_draws(model: StatisticalModel) -> None:
     assert fitted.rest is not None
     found = fitted.with_draws(DrawnStates.of(SCENE, model, 30))
     assert found.method == "rest" and found.seconds == fitted.seconds
+
+
+def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(model: StatisticalModel) -> None:
+    points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
+    clean = ModesFit.of(points, said(model, material), model, 1.0)
+    noisy = replace(clean, problem=replace(clean.problem, noisy=True))
+    assert noisy.asks_draws and not clean.asks_draws
+    found = noisy.with_draws(DrawnStates.of(SCENE, model, 30))
+    assert found.method == "rest" and found.seconds > clean.seconds
 
 
 def test_what_the_frame_does_not_show_narrows_nothing(model: StatisticalModel, monkeypatch: pytest.MonkeyPatch) -> None:

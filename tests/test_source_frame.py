@@ -9,8 +9,8 @@ import pytest
 from analytic import untrained
 from scene_files import write_bar
 
-from mereo.fitting.carry import place
-from mereo.fitting.register import Registrar
+from mereo.fitting.registration.carry import place
+from mereo.fitting.registration.register import Registrar
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
 from mereo.io.attachments import Attachment, Positions

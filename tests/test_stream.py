@@ -1,8 +1,10 @@
 """Streams: the latest frame wins, memory stays bounded, one bad frame stops nothing."""
 
+import json
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,6 +111,20 @@ def test_whatever_a_frame_raises_is_its_own_error(problem: Exception, sentence: 
     frames = [StreamFrame("bad", 0.0, load), frame(1)]
     bad, good = stream(frames, number_of, every_frame=True)
     assert bad.result is None and bad.error.startswith(sentence) and good.result == 1
+
+
+def test_a_librarys_own_error_names_the_frame() -> None:
+    bad, lost = stream(
+        [
+            StreamFrame("bad.json", 0.0, lambda: json.loads("{")),
+            StreamFrame("lost", 0.0, lambda: Path("no/such.ply").read_bytes()),
+        ],
+        bool,
+        every_frame=True,
+    )
+    assert bad.error.startswith("bad.json cannot be answered (JSONDecodeError: Expecting property name")
+    assert bad.error.endswith("): record or write it again")
+    assert lost.error == "no/such.ply: no such file or directory: correct that and try again"
 
 
 def test_the_memory_of_a_summary_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import pytest
 from mereo.cli.stream import stream_reconstructions
 from mereo.cli.stream_answers import FrameAnswer
 from mereo.cli.stream_rerun import CURVES, RerunTarget, messages, series
-from mereo.fitting.recognition import Recognition
+from mereo.fitting.registration.recognition import Recognition
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.config import InputConfig

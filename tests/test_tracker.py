@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed
-from mereo.fitting.register import Registrar
-from mereo.fitting.registration import Registration
-from mereo.fitting.residuals import NetworkTerm
-from mereo.fitting.track_config import TrackConfig
-from mereo.fitting.tracker import Followed, Tracker
-from mereo.fitting.tracking import Expectation, Track, between
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.problem.residuals import NetworkTerm
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
+from mereo.fitting.tracking.config import TrackConfig
+from mereo.fitting.tracking.next_fit import Expectation, Track, between
+from mereo.fitting.tracking.tracker import Followed, Tracker
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA

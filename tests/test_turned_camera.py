@@ -5,9 +5,9 @@ import pytest
 from test_fitting_theorems import IN_FRONT, SCENE, said, shown
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.correspondences import Correspondences
-from mereo.fitting.fit import ModesFit
-from mereo.fitting.turned_camera import turns
+from mereo.fitting.modes.turned_camera import turns
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.registration.fit import ModesFit
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -90,3 +90,15 @@ def test_where_frames_do_not_wait_none_is_asked_about_again(model: StatisticalMo
     found = confused(said(model, material))
     ModesFit.of(points, found, model, 1.0, FitConfig(turned=False), ask=network)
     assert network.asked == 0
+
+
+def test_noise_that_hides_how_wrong_a_fit_is_hides_it_from_a_last_try_no_more(model: StatisticalModel) -> None:
+    points, material = shown(model, 0.8)
+    points = points * (1 + np.random.default_rng(0).normal(scale=0.4, size=(len(points), 1)) / IN_FRONT[2, 3])
+    right = said(model, material)
+    network = Network(points, right, list(turns(points.mean(axis=0)))[2])
+    first = ModesFit.of(points, confused(right), model, 1.0, FitConfig(turned=False), ask=network)
+    last = ModesFit.of(points, confused(right), model, 1.0, FitConfig(turned_anyway=True), ask=network)
+    off, mended = (np.linalg.norm(one.registration().material - material, axis=1) for one in (first, last))
+    assert not first.registration().accepted and np.median(off) > 3.0
+    assert last.registration().accepted and np.median(mended) < 0.5

@@ -9,11 +9,11 @@ from scipy.stats import chi2
 from toy_scene import Lift, Shear, toy_scene
 
 from mereo.evaluation.coverage import RadiusRatios, seen_points
-from mereo.fitting.correspondences import Correspondences
-from mereo.fitting.fit import fit_correspondences
-from mereo.fitting.gauss_newton import POSE, NormalEquations, Posed
-from mereo.fitting.posterior import Posterior, covariance_factor, radius95
-from mereo.fitting.registration import Registration
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.problem.posterior import Posterior, covariance_factor, radius95
+from mereo.fitting.registration.fit import fit_correspondences
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.moments import owned_centroids, owned_gradients

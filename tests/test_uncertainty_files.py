@@ -19,9 +19,9 @@ from mereo.cli.reconstruct import FrameJob
 from mereo.cli.stream import line
 from mereo.cli.stream_answers import FrameAnswer
 from mereo.evaluation.sample_views import load_view
-from mereo.fitting.answer import Answer, answer
-from mereo.fitting.register import Registrar
-from mereo.fitting.tracker import Tracker
+from mereo.fitting.registration.answer import Answer, answer
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.camera import PointCloud
 from mereo.io.config import FilesConfig
 from mereo.models.calibration import Calibration

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from mereo.deformation.moving_least_squares import spread
 from mereo.evaluation.registration.visible_surface import exposed
-from mereo.fitting.residuals import Surface
+from mereo.fitting.problem.residuals import Surface
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel

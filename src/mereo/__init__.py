@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mereo.evaluation.sample_views import load_frame as load_frame
-    from mereo.fitting.register import Registrar as Registrar
-    from mereo.fitting.tracker import Tracker as Tracker
+    from mereo.fitting.registration.register import Registrar as Registrar
+    from mereo.fitting.tracking.tracker import Tracker as Tracker
     from mereo.geometry.camera import Camera as Camera
     from mereo.geometry.camera import DepthImage as DepthImage
     from mereo.geometry.camera import PointCloud as PointCloud
@@ -56,11 +56,11 @@ _HOME = {
     "IsolationConfig": "reconstruction.config",
     "Model": "models.model",
     "PointCloud": "geometry.camera",
-    "Registrar": "fitting.register",
+    "Registrar": "fitting.registration.register",
     "Result": "visualization.result",
     "Segment": "geometry.mesh",
     "SegmentedMesh": "geometry.mesh",
-    "Tracker": "fitting.tracker",
+    "Tracker": "fitting.tracking.tracker",
     "TrainConfig": "training.config",
     "answer": "visualization.answering",
     "evaluate": "learning.steps",

@@ -28,7 +28,7 @@ from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.cli.usage import noted_events, usage_sentence
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import FreeCores, use_free_cores, use_threads
-from mereo.io.foreseen import is_foreseen
+from mereo.io.foreseen import is_foreseen, printable_line, words_of
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
@@ -98,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
         if os.environ.get(TRACEBACK_VARIABLE) == "1":
             raise
         if is_foreseen(error):
-            return _stop(f"mereo: error: {one_line(error)}", USER_ERROR)
+            return _stop(f"mereo: error: {words_of(error)}", USER_ERROR)
         return _stop(f"mereo: error: {sentence(error, arguments, TRACEBACK_VARIABLE)}", FAULT)
     return 0
 
@@ -111,23 +111,8 @@ def version() -> str:
         return "(not installed)"
 
 
-def one_line(error: Exception) -> str:
-    """Sentence of an error; for one of the operating system its file and reason."""
-    if isinstance(error, OSError) and error.strerror:
-        reason = error.strerror[0].lower() + error.strerror[1:]
-        place = f"{error.filename}: " if error.filename else ""
-        return f"{place}{reason}: correct that and run the same command again"
-    return _printed(str(error)) or type(error).__name__
-
-
-def _printed(text: str) -> str:
-    """Text in one line, with what a terminal would obey (files may have it in names) as Python spells it."""
-    line = " ".join(text.split())
-    return line if line.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
-
-
 def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:
-    return f"mereo: warning: {_printed(str(message))}\n"
+    return f"mereo: warning: {printable_line(str(message))}\n"
 
 
 def _stop(message: str, code: int) -> int:

@@ -21,10 +21,10 @@ from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import bunny_posed
 from mereo.evaluation.scoring import predict_grid
-from mereo.fitting.answer import Answer, answer_fitted
-from mereo.fitting.readings import fitted_frame
-from mereo.fitting.register import Registrar, registrar_for
-from mereo.fitting.registration_state import write_state
+from mereo.fitting.registration.answer import Answer, answer_fitted
+from mereo.fitting.registration.readings import fitted_frame
+from mereo.fitting.registration.register import Registrar, registrar_for
+from mereo.fitting.registration.state import write_state
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.solids import label_grid

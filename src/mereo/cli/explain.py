@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.radii import level_told
 from mereo.io.writers.ply import write_explained_ply
 from mereo.visualization.sure_colors import UNEXPLAINED, mark_colors, point_marks, shares_told

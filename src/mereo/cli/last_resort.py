@@ -2,11 +2,10 @@
 
 from pathlib import Path
 
+from mereo.io.foreseen import words_of
+
 NO_MEMORY = ("out of memory", "can't allocate memory", "bad_alloc")
 """What torch and compiled libraries say where Python has a ``MemoryError``."""
-
-MOST_CHARACTERS = 300
-"""Length of a quoted text, of which libraries may make pages."""
 
 
 def sentence(error: Exception, arguments: list[str], variable: str) -> str:
@@ -17,12 +16,9 @@ def sentence(error: Exception, arguments: list[str], variable: str) -> str:
         arguments: of the command line.
         variable: of the environment, by which the traceback is shown.
     """
-    text = " ".join(str(error).split())
-    text = text if text.isprintable() else ascii(text)[1:-1]
-    text = text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
-    what = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    what = words_of(error)
     where = f"{_command(arguments)}: {what}"
-    if isinstance(error, MemoryError) or any(words in text.lower() for words in NO_MEMORY):
+    if isinstance(error, MemoryError) or any(words in what.lower() for words in NO_MEMORY):
         return f"{where}; the memory does not suffice: ask for less (resolution, points, batch, workers) or free some"
     if isinstance(error, RecursionError):
         return f"{where}; something is nested too deeply, or in itself: look into the files that are named"

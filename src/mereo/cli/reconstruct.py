@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.cli.explain import explain, print_sure, wish_of
-from mereo.fitting.answer import Answer
-from mereo.fitting.carry import Carried, Placed, place
-from mereo.fitting.carry import carry as carry_one
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import Registrar, registrar_for
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.carry import Carried, Placed, place
+from mereo.fitting.registration.carry import carry as carry_one
+from mereo.fitting.registration.register import Registrar, registrar_for
 from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig

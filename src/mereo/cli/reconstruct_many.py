@@ -21,7 +21,7 @@ from mereo.io.progress import duration
 from mereo.io.ros_recordings import is_recording
 from mereo.io.scratch_folders import check_place
 from mereo.reconstruction.observation import SizeWarning
-from mereo.reconstruction.stream import sentence
+from mereo.reconstruction.stream import frame_error
 from mereo.reconstruction.stream_sources import frames_in
 from mereo.workers.config import Cluster
 
@@ -158,7 +158,7 @@ def _say(file: Path, problem: Exception) -> None:
     """Say on standard error what is wrong with a frame."""
     if os.environ.get("MEREO_TRACEBACK") == "1":
         raise problem
-    print(f"mereo: error: {sentence(problem, file.name)}", file=sys.stderr, flush=True)
+    print(f"mereo: error: {frame_error(problem, file.name)}", file=sys.stderr, flush=True)
 
 
 def _show(outcomes: Sequence[Outcome], output: Path) -> None:

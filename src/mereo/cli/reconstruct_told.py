@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from mereo.cli.reconstruct import seconds_of
-from mereo.fitting.answer import Answer
-from mereo.fitting.recognition import Known
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.recognition import Known
 
 KNOWN: Mapping[Known, str] = {True: "yes", False: "no", "unsure": "unsure"}
 """Words of a table for whether a frame shows the object."""

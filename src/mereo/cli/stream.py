@@ -11,8 +11,8 @@ from typing import Any
 
 from mereo.cli.stream_answers import Answering, FrameAnswer, Seen
 from mereo.cli.stream_rerun import RerunLog, RerunTarget
-from mereo.fitting.register import registrar_for
-from mereo.fitting.track_config import StreamFit
+from mereo.fitting.registration.register import registrar_for
+from mereo.fitting.tracking.config import StreamFit
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.atomic_files import atomic_file, to_json
 from mereo.io.config import InputConfig
@@ -22,7 +22,7 @@ from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, Summary, sentence, stream
+from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, Summary, frame_error, stream
 from mereo.reconstruction.stream_sources import STANDARD_INPUT, frames_of, watched_frames
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 
@@ -46,7 +46,7 @@ def stream_reconstructions(
 ) -> Summary:
     """Print a line of JSON for each answered or bad frame, and the summary at the end or after Ctrl-C.
 
-    Where the object's model is registered, it is followed from frame to frame (``fitting.tracker``). ``surfaces`` is a
+    Where the object's model is registered, it is followed from frame to frame (``fitting.tracking``). ``surfaces`` is a
     folder without content, or with ``force`` one in which files of the same name are replaced. ``rerun`` is a new
     recording's file or a viewer's address (``RerunTarget``). ``uncertainty`` says how sure each answer is that is the
     registered model.
@@ -151,7 +151,7 @@ class SurfaceFolder:
                 write_segments_glb(partial, outcome.result.surfaces, viewer_rotation(axes))
             self._frames[name] = outcome.name
         except Exception as problem:
-            return replace(outcome, result=None, error=sentence(problem, outcome.name))
+            return replace(outcome, result=None, error=frame_error(problem, outcome.name))
         return outcome
 
 

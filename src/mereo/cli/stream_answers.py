@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.recognition import NOT_ASKED, Recognition
-from mereo.fitting.register import Registrar
-from mereo.fitting.tracker import Followed, Tracker
+from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.tracking.tracker import Followed, Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.moments import owned_centroids
 from mereo.models.model import Model

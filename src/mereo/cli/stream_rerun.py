@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from mereo.cli.stream_answers import FrameAnswer
-from mereo.fitting.recognition import NOT_ASKED
+from mereo.fitting.registration.recognition import NOT_ASKED
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, vertex_normals

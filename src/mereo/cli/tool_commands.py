@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
-from mereo.fitting.track_config import StreamFit
+from mereo.fitting.tracking.config import StreamFit
 from mereo.io.bounds import Cells, Count, CountOrNone, Port, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
 from mereo.io.cores import workers_for
@@ -77,8 +77,8 @@ class ViewCommand:
 
     Attributes:
         input: a point cloud or depth image, as for `mereo reconstruct`, or a result of it with a registered model (the
-            folder, or its state.json); a folder of `mereo scene record`, which is played; without it (and --scene) a
-            shipped frame.
+            folder, or its state.json; the YAML scene file that it was made with is found again); a folder of `mereo
+            scene record`, which is played; without it (and --scene) a shipped frame.
         weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
         scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
         state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.

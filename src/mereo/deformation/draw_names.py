@@ -35,10 +35,12 @@ class NamedGenerator(np.random.Generator):
     Attributes:
         parts: those whose numbers are being drawn, the outermost first.
         next_name: name and unit of the next draw.
+        checked: whether states that the scene would refuse are to be refused, see ``unchecked``.
     """
 
     parts: tuple[str, ...] = ()
     next_name: tuple[str | tuple[str, ...], str] = ("", "")
+    checked: bool = True
 
     def take_name(self) -> DrawName:
         """Name of the draw that is being made; the one after it has none until it is told."""
@@ -57,6 +59,15 @@ def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "")
     if isinstance(rng, NamedGenerator):
         rng.next_name = (name, unit)
     return rng
+
+
+def unchecked(rng: np.random.Generator) -> bool:
+    """Whether a scene may leave out its test of a state, as the state itself is not wanted.
+
+    A fit plays states a small step beside a tested one for what each draw moves. A test such as for parts that meet may
+    take longer than the rest of a state, and refused neighbours would tell nothing.
+    """
+    return isinstance(rng, NamedGenerator) and not rng.checked
 
 
 @contextmanager

@@ -9,6 +9,7 @@ derivatives of f. Lengths share one unit, angles are in radians.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -64,8 +65,13 @@ class Rigid:
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Points after the turn and the shift."""
-        matrix = Rotation.from_rotvec(self.rotation_vector).as_matrix()
-        return (points - self.center) @ matrix.T + (self.center + self.translation)
+        return (points - self.center) @ self._matrix.T + (self.center + self.translation)
+
+    @cached_property
+    def _matrix(self) -> Float[np.ndarray, "3 3"]:
+        """Turn as a matrix, made once: a chain of joints asks each for all links behind it."""
+        matrix: np.ndarray = Rotation.from_rotvec(self.rotation_vector).as_matrix()
+        return matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +147,18 @@ def turn(
     """
     local = points - center
     across = local - np.outer(local @ axis, axis)
-    quarter = across @ np.cross(axis, np.eye(3))
+    quarter = across @ crossing(axis)
     return points + (np.cos(angle_rad) - 1.0)[:, None] * across + np.sin(angle_rad)[:, None] * quarter
+
+
+def crossing(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Matrices whose rows are v x e_k, so that ``points @ matrix`` is v x p; many times faster than numpy's cross."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    result = np.zeros((*vectors.shape, 3))
+    result[..., 0, 1], result[..., 0, 2] = z, -y
+    result[..., 1, 0], result[..., 1, 2] = -z, x
+    result[..., 2, 0], result[..., 2, 1] = y, -x
+    return result
 
 
 def jacobian(

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
 
 from mereo.deformation.draw_names import named
-from mereo.deformation.maps import smooth_step, turn, unit
+from mereo.deformation.maps import crossing, smooth_step, turn, unit
 
 LATTICE_LIMIT = 1 / 2.48
 """Choi & Lee, "Injectivity conditions of 2D and 3D uniform cubic B-spline functions", Graphical Models 62, 2000."""
@@ -276,7 +276,7 @@ def transport_frames(tangents: Float[np.ndarray, "m 3"], normal: Float[np.ndarra
     """
     a, b = tangents[:-1], tangents[1:]
     cross, cosine = np.cross(a, b), np.einsum("ni,ni->n", a, b)
-    skew = np.cross(cross[:, None], np.eye(3))  # rows v x e_k, so that row vectors are multiplied from the left
+    skew = crossing(cross)
     turns = np.eye(3) + skew + skew @ skew / (1.0 + cosine)[:, None, None]
     normal = unit(normal - (normal @ tangents[0]) * tangents[0])
     frames = np.empty((len(tangents), 3, 3))

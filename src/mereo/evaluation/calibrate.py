@@ -14,9 +14,9 @@ from mereo.evaluation.probability_gauge import ProbabilityGauge
 from mereo.evaluation.radius_gauge import RadiusGauge
 from mereo.evaluation.recognition_gauge import RecognitionGauge
 from mereo.evaluation.scoring import check_names, trained_scene
-from mereo.fitting.readings import FittedFrame, fitted_frame
-from mereo.fitting.register import Registrar, registrar_for
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration.readings import FittedFrame, fitted_frame
+from mereo.fitting.registration.register import Registrar, registrar_for
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.io.progress import progress
 from mereo.models.calibration import Calibration
@@ -80,14 +80,14 @@ def calibrate(
     if registrar is not None:
         gauges = (*gauges, RecognitionGauge(), RadiusGauge(replace(registrar, choice="auto")))
     each = max(1, round(views / 24)) if strangers and registrar is not None else 0
-    others = len(other_objects(scene)) if each else 0
-    with progress("calibrate", views + each * (others + 8), "views", quiet=quiet) as shown:
+    others = other_objects(scene) if each else []
+    with progress("calibrate", views + each * (len(others) + 8), "views", quiet=quiet) as shown:
         for view in own_views(scene, views, seed):
             frame, registration = _fitted(bare, registrar, view.seen, view.scene_unit)
             for gauge in gauges:
                 gauge.add(view, frame, registration)
             shown.advance()
-        for strange in strange_frames(scene, each, seed) if each else ():
+        for strange in strange_frames(scene, others, each, seed):
             frame, registration = _fitted(bare, registrar, strange.cloud, None)
             for gauge in gauges:
                 gauge.add_strange(frame, registration)

@@ -4,7 +4,7 @@ scene -own_views-> CalibrationView (the object in states that were learned, clea
       -strange_frames-> StrangeFrame (other objects, planes and heaps; frames_beyond: states beyond the scene's)
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -87,12 +87,11 @@ def own_views(scene: Scene, count: int, seed: int) -> Iterator[CalibrationView]:
         yield CalibrationView(view.mesh, view.depth.to_points(), camera, scene_unit, partial(true_material, view))
 
 
-def strange_frames(scene: Scene, each: int, seed: int) -> Iterator[StrangeFrame]:
-    """Frames of every other built-in object that can be had, and ``4 * each`` of planes and of heaps."""
-    for name in other_objects(scene):
-        other = load_scene(name)
+def strange_frames(scene: Scene, others: Sequence[Scene], each: int, seed: int) -> Iterator[StrangeFrame]:
+    """Frames of every other object (``other_objects``), and ``4 * each`` of planes and of heaps."""
+    for other in others:
         for index in range(each):
-            yield StrangeFrame("other object", _seen(other, seed + OF_OTHERS, index), name)
+            yield StrangeFrame("other object", _seen(other, seed + OF_OTHERS, index), other.name)
     settings = GenerateConfig()
     for index in range(4 * each):
         plane, heap = (example_rng(seed + offset, index) for offset in (OF_PLANES, OF_HEAPS))
@@ -110,15 +109,14 @@ def frames_beyond(scene: Scene, count: int, seed: int, factor: float = FARTHER) 
             yield StrangeFrame("state beyond", _seen(with_farther_states(scene, factor), seed + OF_FARTHER, index))
 
 
-def other_objects(scene: Scene) -> list[str]:
+def other_objects(scene: Scene) -> list[Scene]:
     """Built-in scenes of other objects than this one, whose meshes are here."""
     same = LIVERS if scene.name in LIVERS else (scene.name,)
     found = []
     for name in SCENES:
         with suppress(AssetUnavailable):
             if name not in (*same, *LIVERS[1:]):
-                load_scene(name)
-                found.append(name)
+                found.append(load_scene(name))
     return found
 
 

@@ -7,10 +7,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from mereo.fitting.readings import fitted_frame
-from mereo.fitting.recognition import Known, recognized
-from mereo.fitting.register import Registrar
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration.readings import fitted_frame
+from mereo.fitting.registration.recognition import Known, recognized
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.solids import label_grid

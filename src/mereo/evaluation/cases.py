@@ -25,8 +25,8 @@ from mereo.evaluation.coverage import RadiusRatios, seen_points
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.reliability import Reliability
 from mereo.evaluation.results import EvaluatedView, Evaluation, Tally, grid_confusion
-from mereo.fitting.recognition import Known
-from mereo.fitting.register import Registrar
+from mereo.fitting.registration.recognition import Known
+from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color
 from mereo.models.elsewhere import arrived

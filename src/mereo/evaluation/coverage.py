@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from mereo.fitting.posterior import LEVEL
-from mereo.fitting.registration import Registration
+from mereo.fitting.problem.posterior import LEVEL
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 
 SEEN_WITHIN = 1.5

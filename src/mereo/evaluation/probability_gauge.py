@@ -7,10 +7,10 @@ from jaxtyping import Float, UInt8
 
 from mereo.evaluation.calibration_views import CalibrationView
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.probability_scaling import Scaling, fit_scaling
+from mereo.evaluation.probability_scaling import ece_of, fit_scaling
 from mereo.evaluation.reliability import AskedCells
-from mereo.fitting.readings import FittedFrame
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration.readings import FittedFrame
+from mereo.fitting.registration.registration import Registration
 from mereo.models.model import Model
 
 CELLS = 60
@@ -50,5 +50,5 @@ class ProbabilityGauge:
         return {
             "temperature": scaling.temperature,
             "biases": scaling.biases,
-            "ece": (Scaling().ece(logits, truth), scaling.ece(logits, truth)),
+            "ece": (ece_of(logits, truth), ece_of(logits, truth, scaling)),
         }

@@ -7,44 +7,34 @@ it. Both are found by the likelihood of the true labels, whose maximum is unique
 Notation: n points, c classes.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.optimize import minimize
 from scipy.special import log_softmax, softmax
 
 from mereo.evaluation.reliability import Reliability
+from mereo.models.calibration import Scaling
 
 GOOD_ENOUGH = 0.02
 """Expected calibration error up to which the temperature does alone: two thirds of what is wanted of unseen views."""
 
 
-@dataclass(frozen=True)
-class Scaling:
-    """Scaling of logits.
-
-    Attributes:
-        temperature: divides them.
-        biases: are added then, one for each class, that of empty space 0; None where the temperature does alone.
-    """
-
-    temperature: float = 1.0
-    biases: tuple[float, ...] | None = None
-
-    def ece(self, logits: Float[np.ndarray, "n c"], truth: UInt8[np.ndarray, " n"]) -> float:
-        """Expected calibration error of the probability of the most likely class by the logits as they are."""
-        labels, rows = logits.argmax(axis=1), np.arange(len(logits))
-        scaled = logits.astype(np.float64) / self.temperature + (0.0 if self.biases is None else np.array(self.biases))
-        counted = Reliability()
-        counted.add(softmax(scaled, axis=1)[rows, labels], labels == truth)
-        return counted.ece
+def ece_of(
+    logits: Float[np.ndarray, "n c"],
+    truth: UInt8[np.ndarray, " n"],
+    scaling: Scaling = Scaling(),  # noqa: B008 (frozen)
+) -> float:
+    """Expected calibration error of the scaled probability of the most likely class by the logits as they are."""
+    labels, rows = logits.argmax(axis=1), np.arange(len(logits))
+    counted = Reliability()
+    counted.add(softmax(scaling.scaled_array(logits).astype(np.float64), axis=1)[rows, labels], labels == truth)
+    return counted.ece
 
 
 def fit_scaling(logits: Float[np.ndarray, "n c"], truth: UInt8[np.ndarray, " n"]) -> Scaling:
     """The simplest scaling that is good enough: a temperature, or also a bias for each class."""
     alone = _most_likely(logits, truth, biased=False)
-    return alone if alone.ece(logits, truth) <= GOOD_ENOUGH else _most_likely(logits, truth, biased=True)
+    return alone if ece_of(logits, truth, alone) <= GOOD_ENOUGH else _most_likely(logits, truth, biased=True)
 
 
 def _most_likely(logits: Float[np.ndarray, "n c"], truth: UInt8[np.ndarray, " n"], biased: bool) -> Scaling:

@@ -6,13 +6,11 @@ import numpy as np
 
 from mereo.evaluation.calibration_views import CalibrationView
 from mereo.evaluation.coverage import RadiusRatios, seen_points
-from mereo.fitting.readings import FittedFrame
-from mereo.fitting.recognition import is_noisy
-from mereo.fitting.register import Registrar
-from mereo.fitting.registration import Registration
-
-FIELDS = ("radius_scale", "noisy_radius_scale", "draws_radius_scale", "noisy_draws_radius_scale")
-"""Fields of ``Calibration``: of modes, clean and noisy, and of draws."""
+from mereo.fitting.registration.readings import FittedFrame
+from mereo.fitting.registration.recognition import is_noisy
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
+from mereo.models.calibration import RADIUS_FIELDS
 
 LEAST = 4
 """Views without which nothing is said."""
@@ -32,19 +30,20 @@ class RadiusGauge:
 
     def __init__(self, full: Registrar | None = None) -> None:
         self.full = None if full is None or full.at_hand is None else full
-        self.ratios: dict[str, list[RadiusRatios]] = {name: [] for name in FIELDS}
+        self.ratios: dict[str, list[RadiusRatios]] = {name: [] for name in RADIUS_FIELDS.values()}
 
     def add(self, view: CalibrationView, frame: FittedFrame, registration: Registration | None) -> None:
         """Take in a view of the object where its registration is believed: of others users get no radii."""
-        each = [registration]
+        each = [("modes", registration)]
         if self.full is not None and frame.modes is not None:
-            each.append(self.full.finish(frame.modes))
-        for number, one in enumerate(each):
-            if one is None or not one.accepted or (number == 1 and one.method != "draws"):
+            drawn = self.full.finish(frame.modes)
+            each += [("draws", drawn)] if drawn.method == "draws" else []
+        for method, one in each:
+            if one is None or not one.accepted:
                 continue
             truth = view.material(one.model)
             ratios = RadiusRatios.of(one, truth, seen_points(truth, view.seen, 1.0))
-            self.ratios[FIELDS[2 * number + is_noisy(one)]].append(ratios)
+            self.ratios[RADIUS_FIELDS[method, is_noisy(one)]].append(ratios)
 
     def add_strange(self, frame: FittedFrame, registration: Registration | None) -> None:
         """Leave out what is not the object: there are no true places."""

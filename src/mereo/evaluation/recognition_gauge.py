@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from mereo.evaluation.calibration_views import CalibrationView
-from mereo.fitting.readings import FittedFrame
-from mereo.fitting.recognition import CLIPPED, CONSERVATIVE, LEAST, Signs, is_noisy, strangeness
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration.readings import FittedFrame
+from mereo.fitting.registration.recognition import CLIPPED, CONSERVATIVE, LEAST, Signs, is_noisy, strangeness
+from mereo.fitting.registration.registration import Registration
 from mereo.models.calibration import Recognizing, SignName, Usual
 
 MEASURED: tuple[SignName, ...] = tuple(name for name in LEAST if name != "size")

@@ -11,7 +11,7 @@ from mereo.evaluation.coverage import RadiusRatios
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.evaluation.reliability import Reliability
-from mereo.fitting.recognition import Known
+from mereo.fitting.registration.recognition import Known
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color

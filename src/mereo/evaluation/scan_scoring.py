@@ -13,7 +13,7 @@ from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scans import SCANS, PosedScan, bunny_posed
 from mereo.evaluation.scoring import CELLS, check_names, score_cases
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import registrar_for
+from mereo.fitting.registration.register import registrar_for
 from mereo.models.model import Model
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel

@@ -19,7 +19,7 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import Evaluation, grid_confusion
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import CURE, Registrar, other_mesh, registrar_for
+from mereo.fitting.registration.register import CURE, Registrar, other_mesh, registrar_for
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points

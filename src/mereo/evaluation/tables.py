@@ -31,7 +31,7 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "miou": scores.miou,
         "per_segment": dict(zip(evaluation.names, scores.per_segment.tolist(), strict=True)),
         "example_mean": {"iou": iou, "miou": miou},
-        "per_example": {name: {"iou": each.iou, "miou": each.miou} for name, each in evaluation.examples.items()},
+        "per_example": per_example(evaluation),
         "confusion": evaluation.confusion,
         "ece": evaluation.reliability.ece,
         "calibrated": evaluation.calibrated,
@@ -40,13 +40,26 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def per_example(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
+    """Each example's scores, who answered it, and whether it was said to show the object; None where nothing was."""
+    count = len(evaluation.examples)
+    sources = evaluation.sources if len(evaluation.sources) == count else (None,) * count
+    known = evaluation.known if len(evaluation.known) == count else (None,) * count
+    each = zip(evaluation.examples.items(), sources, known, strict=True)
+    return {
+        name: {"iou": scores.iou, "miou": scores.miou, "answered_by": source, "known": said}
+        for (name, scores), source, said in each
+    }
+
+
 def answers(evaluation: Evaluation) -> dict[str, Any]:
     """Part of ``metrics.json`` that compares who could have answered: network, modes, full.
 
-    ``chosen`` has the share of examples by where the scored answer came from, ``better`` the share in which another
-    answer would have been better than it by more than ``CLEARLY``. ``registration_error`` and
-    ``coverage95``, the share of true places within the registration's radii, are None where none was taken, and so is
-    ``known``, the share of examples by whether they are said to show the object, where no registration was asked for.
+    Each has ``miou_tenth``, the mIoU that a tenth of its examples do not reach. ``chosen`` has the share of examples
+    by where the scored answer came from, ``better`` the share in which another answer would have been better than it by
+    more than ``CLEARLY``. ``registration_error`` and ``coverage95``, the share of true places within the registration's
+    radii, are None where none was taken, and so is ``known``, the share of examples by whether they are said to show
+    the object, where no registration was asked for.
     """
     count = max(1, len(evaluation.sources))
     sources = {name: evaluation.sources.count(name) / count for name in ("network", "rest", "modes", "draws")}
@@ -110,7 +123,8 @@ def _value(scores: Scores) -> float:
 
 def _answer(found: AnswerScores, segmented: bool) -> dict[str, float]:
     scores = intersection_over_union(found.confusion, segmented)
-    return {"iou": scores.iou, "miou": scores.miou, "seconds": float(np.median(found.seconds))}
+    tenth = float(np.quantile([one.miou for one in found.examples], 0.1))
+    return {"iou": scores.iou, "miou": scores.miou, "seconds": float(np.median(found.seconds)), "miou_tenth": tenth}
 
 
 def markdown_table(evaluation: Evaluation) -> str:

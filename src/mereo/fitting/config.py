@@ -39,6 +39,7 @@ class FitConfig:
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface,
             in scene units.
         turned: whether the network is asked again, with the camera turned, where much is unexplained: seconds a frame.
+        turned_anyway: whether it is, however much noise that may be: for frames that nothing else explains.
         agreed, accepted_agreed: where the network and the fit give as large a share of the correspondences on the
             object's surface the same segment, this smaller share is enough.
     """
@@ -78,6 +79,7 @@ class FitConfig:
     accepted: float = 0.95
     tolerance: float = 0.45
     turned: bool = True
+    turned_anyway: bool = False
     agreed: float = 0.8
     accepted_agreed: float = 0.85
 
@@ -106,9 +108,15 @@ class DrawsConfig:
         hopeless: the same, above which the next starts are tried, in at most ``batches`` of them.
         passes: while it is above ``hopeless``, how often the modes are refined from where the draws ended, and the
             draws fitted to that shape again.
-        jumps: how often one draw may jump to one of ``places`` places, of which the ``places_kept`` best are compared.
+        jumps: how often one draw may jump to another place of its range.
+        places, places_kept: into how many even steps its range is divided, so that there is one place fewer to jump to;
+            and how many of these, the best, are compared: all where None.
         sliding: most share of a draw's motion that may leave the surface; 1 lets all draws jump.
+        turned_worse: misfit by which a state may be worse with segments stiffly turned that look alike turned
+            (``turned_segments``), for that shape to be tried.
+        turned_sieve: ``sieve`` for it; one start is then fitted to the frame.
         asked_again: whether the network's answer is a start too, where the cloud is not explained.
+        every_point: whether the answer is fitted to every observed point in the end.
         few: scenes with more draws than this get ``MANY_DRAWS`` instead: every set of differences plays each draw once.
         near: how many states count as near where draws are guessed from the modes.
         start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
@@ -137,9 +145,12 @@ class DrawsConfig:
     passes: int = 0
     jumps: int = 2
     places: int = 6
-    places_kept: int = 5
+    places_kept: int | None = None
     sliding: float = 1.0
+    turned_worse: float = 25.0
+    turned_sieve: tuple[tuple[int, int], ...] = ((1, 4), (1, 1))
     asked_again: bool = True
+    every_point: bool = True
     few: int = 30
     near: int = 100
     start_sigma: float = 0.03
@@ -159,5 +170,6 @@ MANY_DRAWS = DrawsConfig(
     places_kept=1,
     sliding=0.2,
     asked_again=False,
+    every_point=False,
 )
 """Constants for scenes with many draws."""

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.evaluation.metrics import format_score
+from mereo.io.foreseen import words_of
 from mereo.io.label_volumes import is_volume
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.output_folders import claim_directory
@@ -213,7 +214,7 @@ class _Learning:
         except Exception as error:
             if os.environ.get("MEREO_TRACEBACK") == "1":
                 raise
-            return Trial(name, None, _sentence(error), time.monotonic() - started)
+            return Trial(name, None, words_of(error), time.monotonic() - started)
         return Trial(name, metrics, seconds=time.monotonic() - started)
 
     def _check_shared(self, files: Sequence[Path]) -> None:
@@ -229,11 +230,6 @@ class _Learning:
 def _lost(item: Learnable, error: ChildProcessError) -> Trial:
     """Trial of an object whose task was killed again and again."""
     return Trial(item[0], None, str(error))
-
-
-def _sentence(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, ValueError | OSError | ImportError) and text else f"{type(error).__name__}: {text}"
 
 
 def _show(trials: Sequence[Trial], output: Path, seconds: float) -> None:

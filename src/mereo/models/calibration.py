@@ -1,5 +1,6 @@
 """Calibration of weights: what was measured, on training seeds, of how far their answers can be trusted."""
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Literal
 
@@ -14,7 +15,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 SignName = Literal["size", "unexplained", "ruled_out", "beyond", "unusual", "displaced"]
-"""Signs that a frame does not show the object in a state that was learned; ``mereo.fitting.recognition`` tells them."""
+"""Signs that a frame does not show the object in a state that was learned; ``fitting.registration`` tells them."""
 
 
 class Usual(BaseModel, frozen=True):
@@ -25,7 +26,7 @@ class Usual(BaseModel, frozen=True):
 
 
 class Recognizing(BaseModel, frozen=True):
-    """What tells the object in learned states from other things and states (``mereo.fitting.recognition``).
+    """What tells the object in learned states from other things and states (``fitting.registration.recognition``).
 
     Attributes:
         clean: usual signs of views without noise beyond the paper's.
@@ -44,6 +45,43 @@ class Recognizing(BaseModel, frozen=True):
         if self.unsure >= self.refused:
             raise ValueError(f"the limits are {self.unsure:g} and {self.refused:g}; the first must be the smaller")
         return self
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Scaling of logits before they become probabilities.
+
+    Only probabilities are made of scaled logits. Labels are decided by the logits as they are, whose class offsets
+    (logit adjustment, ``training.logit_adjustment``) serve the mIoU.
+
+    Attributes:
+        temperature: divides them.
+        biases: are added then, one for each class, that of empty space 0; None where the temperature does alone.
+    """
+
+    temperature: float = 1.0
+    biases: tuple[float, ...] | None = None
+
+    def scaled(self, logits: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
+        """Logits in single precision, divided and with their biases; as they are where neither changes anything."""
+        if self == Scaling():
+            return logits
+        divided = logits.float() / self.temperature
+        return divided if self.biases is None else divided + _on_device(self.biases, logits.device)
+
+    def scaled_array(self, logits: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
+        """``scaled`` of logits that have left their device."""
+        return self.scaled(torch.from_numpy(logits)).numpy()
+
+
+RADIUS_FIELDS = {
+    ("modes", False): "radius_scale",
+    ("modes", True): "noisy_radius_scale",
+    ("draws", False): "draws_radius_scale",
+    ("draws", True): "noisy_draws_radius_scale",
+}
+"""Field of a ``Calibration`` that scales the radii of fits of the modes or of a scene's draws, by whether the frame is
+noisy."""
 
 
 class Calibration(BaseModel, frozen=True):
@@ -77,24 +115,13 @@ class Calibration(BaseModel, frozen=True):
 
     def radius_scales(self, noisy: bool) -> tuple[float | None, float | None]:
         """Factors of the radii of a fit of the modes and of one of draws, to a clean or a camera's noisy frame."""
-        if noisy:
-            return self.noisy_radius_scale, self.noisy_draws_radius_scale
-        return self.radius_scale, self.draws_radius_scale
+        modes, draws = (getattr(self, RADIUS_FIELDS[method, noisy]) for method in ("modes", "draws"))
+        return modes, draws
 
-    def scaled(self, logits: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
-        """Logits divided by the temperature, plus the biases; as they are where there is no temperature.
-
-        Only probabilities are made of them. Labels are decided by the logits as they are, whose class offsets (logit
-        adjustment, ``training.logit_adjustment``) serve the mIoU.
-        """
-        if self.temperature is None:
-            return logits
-        divided = logits.float() / self.temperature
-        return divided if self.biases is None else divided + _on_device(self.biases, logits.device)
-
-    def scaled_array(self, logits: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-        """``scaled`` of logits that have left their device."""
-        return self.scaled(torch.from_numpy(logits)).numpy()
+    @property
+    def scaling(self) -> Scaling:
+        """Scaling of logits; one that changes nothing where there is no temperature."""
+        return Scaling() if self.temperature is None else Scaling(self.temperature, self.biases)
 
 
 @lru_cache(maxsize=16)

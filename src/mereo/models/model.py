@@ -182,7 +182,7 @@ class Model:
 
         def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             logits, distance, direction = self.respond(prediction, queries)
-            scaled = logits if self.calibration is None else self.calibration.scaled(logits)
+            scaled = logits if self.calibration is None else self.calibration.scaling.scaled(logits)
             return logits.argmax(dim=-1).to(torch.uint8), scaled.softmax(dim=-1), distance, direction
 
         label, probability, distance, direction = self._chunked(code, points, answer)

@@ -7,7 +7,7 @@ the model (``SegmentedMesh``). The field is evaluated coarse to fine (``mereo.re
 cell that a surface crosses is known at all its corners, so the surfaces are those of the dense grid.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,6 +53,8 @@ def extract(
     names: Sequence[str],
     colors: Sequence[Color],
     nested: Nested = (),
+    *,
+    dense: bool = False,
 ) -> Extraction:
     """Surfaces and labels of a field, evaluated only where labels may change.
 
@@ -63,35 +65,12 @@ def extract(
         names: of the segments.
         colors: of the segments.
         nested: which of them lie inside another; the outer one's surface is then that of both together.
+        dense: evaluate the field at every node, many times slower: the reference.
 
     Raises ``ValueError`` for a resolution below 4, an empty box, or a grid over ``MAX_NODES`` nodes.
     """
-    return _extract(sample_coarse_to_fine, field, box, resolution, names, colors, nested)
-
-
-def extract_dense(
-    field: Field,
-    box: Float[np.ndarray, "2 3"],
-    resolution: int,
-    names: Sequence[str],
-    colors: Sequence[Color],
-    nested: Nested = (),
-) -> Extraction:
-    """Surfaces and labels of a field, evaluated at every node: the reference of ``extract``, many times slower."""
-    return _extract(sample_dense, field, box, resolution, names, colors, nested)
-
-
-def _extract(
-    sample: Callable[..., Sampled],
-    field: Field,
-    box: Float[np.ndarray, "2 3"],
-    resolution: int,
-    names: Sequence[str],
-    colors: Sequence[Color],
-    nested: Nested,
-) -> Extraction:
     origin, spacing, shape = _grid(box, resolution)
-    sampled = sample(field, origin, spacing, shape)
+    sampled = (sample_dense if dense else sample_coarse_to_fine)(field, origin, spacing, shape)
     grid = LabelGrid(sampled.labels, origin, spacing, tuple(names))
     nothing = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     empty = SegmentedMesh(tuple(Segment(*named, *nothing) for named in zip(names, colors, strict=True)), nested)

@@ -65,7 +65,7 @@ def segment_points(
         labels: of the points, 1 or more, where another than the network says them.
     """
     labels = (logits[:, 1:].argmax(axis=1) + 1).astype(np.uint8) if labels is None else labels
-    scaled = logits if calibration is None else calibration.scaled_array(logits)
+    scaled = logits if calibration is None else calibration.scaling.scaled_array(logits)
     parts = scaled[:, 1:].astype(np.float64)
     return SegmentedCloud(
         points=points,

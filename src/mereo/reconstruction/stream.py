@@ -14,6 +14,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from mereo.io.foreseen import is_foreseen, words_of
 from mereo.reconstruction.latest_slot import LatestSlot
 
 Content = TypeVar("Content")
@@ -88,7 +89,7 @@ def stream(
             try:
                 result = answer(frame.load())
             except Exception as problem:  # a damaged frame makes the libraries that parse it raise anything
-                error = sentence(problem, frame.name)
+                error = frame_error(problem, frame.name)
             now = time.perf_counter()
             yield Outcome(frame.name, frame.time_s, result, error, now - taken.arrived_s, now - start, taken.replaced)
         if reading.failure is not None:
@@ -97,13 +98,10 @@ def stream(
         reading.slot.stop()
 
 
-def sentence(problem: Exception, name: str) -> str:
+def frame_error(problem: Exception, name: str) -> str:
     """Sentence that says what is wrong with a frame; ``name`` is the frame's."""
-    text = " ".join(str(problem).split())
-    if isinstance(problem, ValueError | OSError | ImportError):
-        return text or type(problem).__name__
-    reason = f"{type(problem).__name__}: {text}" if text else type(problem).__name__
-    return f"{name} cannot be answered ({reason}): record or write it again"
+    words = words_of(problem)
+    return words if is_foreseen(problem) else f"{name} cannot be answered ({words}): record or write it again"
 
 
 class _Reading(Generic[Content]):

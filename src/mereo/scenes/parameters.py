@@ -98,6 +98,19 @@ def play(scene: Scene, recorder: Recorder) -> tuple[Deformation, ...]:
     return scene.sample_deformations(recorder)
 
 
+def replayed(scene: Scene, seed: int, given: Mapping[Key, Shares]) -> Played | None:
+    """State by the shares of its draws, in their order; None where the scene refuses them, or draws others."""
+    recorder = Recorder(seed, given, len(given))
+    try:
+        deformations = play(scene, recorder)
+    except (OutOfDraws, ValueError):  # a scene that gives up raises ValueError
+        return None
+    calls = tuple(recorder.calls)
+    if [call.key for call in calls] != list(given):
+        return None
+    return Played(seed, calls, deformations, {call.key: call.shares for call in calls}, {})
+
+
 def _played(
     scene: Scene,
     seed: int,
@@ -149,14 +162,8 @@ def _without_refused(
 
 
 def _plays_alike(scene: Scene, seed: int, calls: tuple[Call, ...], wanted: Float[np.ndarray, "w 3"]) -> bool:
-    renumbered = _renumbered(calls)
-    recorder = Recorder(seed, {call.key: call.shares for call in renumbered}, len(calls))
-    try:
-        deformations = play(scene, recorder)
-    except (OutOfDraws, ValueError):
-        return False
-    same_draws = [call.key for call in recorder.calls] == [call.key for call in renumbered]
-    return same_draws and np.array_equal(_witness(scene, deformations), wanted)
+    played = replayed(scene, seed, {call.key: call.shares for call in _renumbered(calls)})
+    return played is not None and np.array_equal(_witness(scene, played.deformations), wanted)
 
 
 def _witness(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "w 3"]:

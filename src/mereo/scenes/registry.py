@@ -1,5 +1,6 @@
 """Scenes by name: the built-in ones, and those of files."""
 
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -48,9 +49,9 @@ def load_scene(name: str | Path) -> Scene:
     ``FileNotFoundError`` where it, or a mesh that it names, does not exist.
     """
     if is_yaml(name):
-        scene: Scene = import_module("mereo.scenes.files.build").load(Path(name))
+        scene: Scene = replace(import_module("mereo.scenes.files.build").load(Path(name)), file=Path(name))
     elif Path(name).suffix == ".py":
-        scene = import_module("mereo.scenes.files.python").load(Path(name))
+        scene = replace(import_module("mereo.scenes.files.python").load(Path(name)), file=Path(name))
     elif name in SCENES:
         scene = import_module(f"mereo.scenes.builtin.{str(name).replace('-', '_')}").scene()
     else:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -97,6 +98,7 @@ class Scene:
             the identity where it is defined in scene units.
         definition: what a scene from a file states, in a text that changes exactly when its meaning does. Empty for
             built-in scenes: the version of mereo stands for it.
+        file: scene file that it was read from, as it was named; None for others.
     """
 
     name: str
@@ -109,6 +111,7 @@ class Scene:
     T_scene_source: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     definition: str = ""
     cone: Workspace | None = None
+    file: Path | None = None
 
     def __post_init__(self) -> None:
         if self.held_out is not None and self.held_out.rest.names != self.rest.names:

@@ -1,6 +1,7 @@
 """Walks through the states of a scene: its own random numbers, changing smoothly with time.
 
     scene, seed -walk-> Played, Played, ...
+    scene, Played -smooth_round-> Played, Played, ... and back
 
 Every number that a scene draws is a standard normal one as ``Phi^-1(share)`` (``scenes.draw_recorder``). A walk lets
 each follow a smooth Gaussian process of mean 0 and variance 1, so that at any time the state is distributed as the
@@ -10,16 +11,17 @@ start: whole numbers, choices, permutations, and draws on which it depends what 
 Notation: n times, d numbers, k nodes of the process.
 """
 
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
-from mereo.scenes.draw_recorder import SMOOTH, Call, Key, OutOfDraws, Recorder
-from mereo.scenes.parameters import Played, play, random_state
+from mereo.scenes.draw_recorder import SMOOTH, Key, OutOfDraws, Recorder
+from mereo.scenes.parameters import Played, play, random_state, replayed, turned
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
@@ -57,12 +59,11 @@ def walk(scene: Scene, seed: int, times_s: Float[np.ndarray, " n"], change_s: fl
     tries = 0
     while len(states) < len(times_s):
         i = len(states)
-        deformations = _deformations(scene, start, path.shares(i))
-        place = None if deformations is None else _vertices(scene, deformations)
+        state = replayed(scene, seed, path.shares(i))
+        place = None if state is None else _vertices(scene, state.deformations)
         if place is not None and (i == 0 or np.linalg.norm(place - places[-1], axis=1).max() <= max(step[i], 1e-9)):
-            assert deformations is not None
-            calls = path.calls(i)
-            states.append(Played(seed, calls, deformations, {call.key: call.shares for call in calls}, {}))
+            assert state is not None
+            states.append(state)
             places.append(place)
             continue
         tries += 1
@@ -74,6 +75,27 @@ def walk(scene: Scene, seed: int, times_s: Float[np.ndarray, " n"], change_s: fl
         kept = path.redraw(i, shrink=tries % SHRINK_EVERY == 0)
         del states[kept:], places[kept:]
     return states
+
+
+def smooth_round(scene: Scene, start: Played, seed: int, count: int) -> Iterator[Played]:
+    """States of one round, ``count`` of them at most, the last one the start again.
+
+    All smooth draws go round a circle at once (``parameters.turned``), so every state is as random as the scene's own.
+    Those that the scene refuses are left out.
+    """
+    for step in range(1, count + 1):
+        shares = {
+            call.key: turned(call.shares, step / count, (seed, number)) if call.kind in SMOOTH else call.shares
+            for number, call in enumerate(start.calls)
+        }
+        state = replayed(scene, start.seed, shares)
+        if state is not None:
+            yield state
+
+
+def blend(count: int) -> Float[np.ndarray, " n"]:
+    """Shares of another state on a way there and back in ``count`` steps, slow at both ends."""
+    return (1 - np.cos(2 * np.pi * np.arange(1, count + 1) / count)) / 2
 
 
 def process_weights(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
@@ -154,11 +176,6 @@ class _Path:
             at += count if moves else 0
         return result
 
-    def calls(self, i: int) -> tuple[Call, ...]:
-        """The draws at time i."""
-        shares = self.shares(i)
-        return tuple(replace(call, shares=shares[call.key]) for call in self.start.calls)
-
     def redraw(self, i: int, shrink: bool) -> int:
         """Draw the nodes anew that count most at time i and after; returns how many first states stay as they were."""
         if shrink:
@@ -172,18 +189,6 @@ class _Path:
             self.nodes[first:] += np.outer(own / (own @ own), self.first - self.weights[0] @ self.nodes)
         changed = np.flatnonzero((self.nodes != before).any(axis=1))
         return int(np.flatnonzero((self.weights[:, changed] > 0).any(axis=1))[0]) if len(changed) else 0
-
-
-def _deformations(
-    scene: Scene, start: Played, shares: dict[Key, Float[np.ndarray, " m"]]
-) -> tuple[Deformation, ...] | None:
-    """Deformations by these draws; None where the scene refuses them and wants others."""
-    recorder = Recorder(start.seed, shares, len(start.calls))
-    try:
-        deformations = play(scene, recorder)
-    except (OutOfDraws, ValueError):  # a scene that gives up raises ValueError
-        return None
-    return deformations if tuple(call.key for call in recorder.calls) == start.keys else None
 
 
 def _vertices(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "v 3"]:

@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from mereo.fitting.register import Registrar, registrar_for
+from mereo.fitting.registration.register import Registrar, registrar_for
 from mereo.io.atomic_files import to_json
-from mereo.io.foreseen import is_foreseen
+from mereo.io.foreseen import is_foreseen, words_of
 from mereo.io.sensor_frame import read_frame
 from mereo.io.size_limits import SizeError
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
@@ -236,7 +236,7 @@ def refusal(error: Exception, frame: FrameRequest) -> Reply:
         LOG.error("a frame of %s cannot be answered", frame.weights, exc_info=error)
         return failed(500, FAULT)
     status = 413 if isinstance(error, SizeError | TooManyPoints) else 415 if isinstance(error, ImportError) else 422
-    return failed(status, shown(str(error), frame))
+    return failed(status, shown(words_of(error), frame))
 
 
 def shown(text: str, frame: FrameRequest) -> str:

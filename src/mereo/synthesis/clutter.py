@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 
 from mereo.geometry.raycasting import Hits, toward
 from mereo.geometry.solids import Solids
-from mereo.synthesis.config import SensorConfig
+from mereo.synthesis.config import Occluder, SensorConfig
 
 NOTHING, OBJECT, OCCLUDER, BACKGROUND = range(4)
 """What a pixel's ray meets first."""
@@ -124,23 +124,42 @@ def sample_surroundings(
         streams: a random generator for each of ``tool``, ``hand``, ``background``.
     """
     unit = 1 / sensor.metres_per_unit
-    occluders: list[Capsule] = []
-    if streams["tool"].random() < sensor.tool:
-        occluders += sample_tool(seen, reach, unit, streams["tool"])
-    if streams["hand"].random() < sensor.hand:
-        occluders += sample_hand(seen, reach, unit, streams["hand"])
+    probable: tuple[tuple[Occluder, float], ...] = (("tool", sensor.tool), ("hand", sensor.hand))
+    there = [kind for kind, probability in probable if streams[kind].random() < probability]
+    occluders = [part for kind in there for part in sample_occluder(kind, seen, reach, unit, streams[kind])]
     plane = None
     if streams["background"].random() < sensor.background:
         plane = sample_plane(solids, unit, streams["background"])
     return Surroundings(tuple(occluders), plane)
 
 
+def sample_occluder(
+    kind: Occluder, seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator
+) -> tuple[Capsule, ...]:
+    """Random occluder of a kind in front of an object.
+
+    Args:
+        kind: what it is; "none" is nothing.
+        seen: visible points of the object, camera frame; it points at one of them.
+        reach: slope x/z from the image's centre to its corners, beyond which it begins.
+        unit: scene units in a metre.
+        rng: decides on its place and shape.
+    """
+    if kind == "none":
+        return ()
+    return tuple(sample_tool(seen, reach, unit, rng) if kind == "tool" else sample_hand(seen, reach, unit, rng))
+
+
 def sample_plane(solids: Solids, unit: float, rng: np.random.Generator) -> Backdrop:
     """Random table or wall behind the object: up to 45 degrees off the image plane, touching to 5 cm behind."""
     normal = _polar(np.tan(rng.uniform(0, np.pi / 4)), rng.uniform(0, 2 * np.pi))
     normal = normal / np.linalg.norm(normal)
-    farthest = max(float((segment.vertices @ normal).max()) for segment in solids.mesh.segments)
-    return Backdrop(normal, farthest + rng.uniform(0, 0.05) * unit)
+    return Backdrop(normal, farthest(solids, normal) + rng.uniform(0, 0.05) * unit)
+
+
+def farthest(solids: Solids, normal: Vector) -> float:
+    """How far an object reaches along a direction."""
+    return max(float((segment.vertices @ normal).max()) for segment in solids.mesh.segments)
 
 
 def _polar(radius: float, angle_rad: float) -> Vector:

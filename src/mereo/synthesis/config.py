@@ -109,6 +109,9 @@ SENSORS: dict[Sensor, SensorConfig] = {
     ),
 }
 
+Occluder = Literal["none", "tool", "hand"]
+"""What may stand in front of the object (``synthesis.clutter``)."""
+
 ObservationName = Literal["paper", "structured-light", "time-of-flight", "tool", "hand", "mask"]
 
 OBSERVATIONS: dict[ObservationName, SensorConfig] = {

@@ -1,11 +1,9 @@
 """Settings of sequences; light, so that the command line may import them."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from mereo.io.bounds import ImageSize, NotNegative, Positive, check_bounds
-
-Occluder = Literal["tool", "hand", "none"]
+from mereo.synthesis.config import Occluder
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from mereo.scenes.parameters import Played
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.walks import process_weights, walk
-from mereo.synthesis.clutter import Backdrop, Capsule, Surroundings, sample_hand, sample_plane, sample_tool
+from mereo.synthesis.clutter import Backdrop, Capsule, Surroundings, farthest, sample_occluder, sample_plane
 from mereo.synthesis.config import SensorConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.sequence_config import SequenceConfig
@@ -153,23 +153,20 @@ class _Around:
             )
         seen, unit = directions[hit] * distance[hit, None], 1 / sensor.metres_per_unit
         reach = float(np.linalg.norm(directions[:, :2], axis=1).max())
-        occluder: list[Capsule] = []
-        if settings.occluder != "none":
-            sample = sample_tool if settings.occluder == "tool" else sample_hand
-            occluder = sample(seen, reach, unit, rng)
+        occluder = sample_occluder(settings.occluder, seen, reach, unit, rng)
         away = _way_out(occluder, reach)
         if rng.random() >= sensor.background:
-            return cls(tuple(occluder), away, settings.hidden_s)
+            return cls(occluder, away, settings.hidden_s)
         plane = sample_plane(solids, unit, rng)
-        gap = plane.offset - _farthest(solids, plane.normal)
-        return cls(tuple(occluder), away, settings.hidden_s, T_world_camera[:3, :3] @ plane.normal, gap)
+        gap = plane.offset - farthest(solids, plane.normal)
+        return cls(occluder, away, settings.hidden_s, T_world_camera[:3, :3] @ plane.normal, gap)
 
     def at(self, time_s: float, solids: Solids, T_world_camera: Float[np.ndarray, "4 4"]) -> Surroundings | None:
         """Surroundings at a time; None where there are none."""
         background = None
         if self.normal is not None:
             normal = self.normal @ T_world_camera[:3, :3]
-            background = Backdrop(normal, _farthest(solids, normal) + self.gap)
+            background = Backdrop(normal, farthest(solids, normal) + self.gap)
         start, end = self.span_s
         if not (self.occluder and start <= time_s < end):
             return None if background is None else Surroundings((), background)
@@ -180,11 +177,7 @@ class _Around:
         return Surroundings(moved, background)
 
 
-def _farthest(solids: Solids, normal: Float[np.ndarray, "3"]) -> float:
-    return max(float((segment.vertices @ normal).max()) for segment in solids.mesh.segments)
-
-
-def _way_out(occluder: list[Capsule], reach: float) -> Float[np.ndarray, "3"]:
+def _way_out(occluder: tuple[Capsule, ...], reach: float) -> Float[np.ndarray, "3"]:
     """Shift along the image that takes an occluder out of view, the way its far end lies."""
     if not occluder:
         return np.zeros(3)

@@ -41,7 +41,7 @@ from mereo.io.progress import progress
 from mereo.io.scratch_folders import check_place
 from mereo.scenes.random_states import scene_model, states_for
 from mereo.scenes.registry import is_yaml, load_scene
-from mereo.scenes.rest_pose import rest_distances
+from mereo.scenes.rest_pose import rest_digest, rest_distances
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.scenes.statistical_model_file import statistical_model_bytes
@@ -172,10 +172,7 @@ def _check_request(examples: int, seed: int, workers: int, shard: tuple[int, int
 
 def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: int) -> dict[str, Any]:
     """Manifest of a dataset as JSON values: all that decides it, and what training needs to know of the scene."""
-    workspace, digest = scene.workspace_named(settings.workspace), hashlib.sha256()
-    for segment in scene.rest.segments:
-        for array, dtype in ((segment.vertices, "<f8"), (segment.faces, "<i8")):
-            digest.update(np.ascontiguousarray(array, dtype=dtype).tobytes())
+    workspace = scene.workspace_named(settings.workspace)
     manifest = {
         "scene": scene.name,
         "source": scene.source,
@@ -187,7 +184,7 @@ def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: i
         "seed": seed,
         "examples": examples,
         "shard_size": SHARD_SIZE,
-        "rest_sha256": digest.hexdigest(),
+        "rest_sha256": rest_digest(scene.rest),
         "scene_file_sha256": hashlib.sha256(scene.definition.encode()).hexdigest() if scene.definition else None,
         "unit_m": scene.unit_m,
         "version": version("mereo"),

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.evaluation.sample_views import load_frame
-from mereo.fitting import answer as fitting
 from mereo.fitting.config import FitChoice
-from mereo.fitting.register import Registrar, registrar_for
+from mereo.fitting.registration import answer as fitting
+from mereo.fitting.registration.register import Registrar, registrar_for
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.sensor_frame import SensorFrame

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mereo.fitting.carry import Carried
+from mereo.fitting.registration.carry import Carried
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.attachments import Surfaces
 from mereo.visualization.reconstruction_report import cluster

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mereo.fitting.recognition import told_of
+from mereo.fitting.registration.recognition import told_of
 from mereo.geometry.radii import level_told
 from mereo.visualization.units import Unit, rounded
 
@@ -41,7 +41,9 @@ SAID_ELSEWHERE = frozenset(
 )
 """Keys of a summary that the page shows in another place, or that its units say."""
 
-FOR_PROGRAMS = frozenset({"precision", "evaluated_points", "depth_m", "visible_size_m", "isolation", "carried"})
+FOR_PROGRAMS = frozenset(
+    {"precision", "evaluated_points", "depth_m", "visible_size_m", "isolation", "carried", "scene_file"}
+)
 """Keys that only summary.json has."""
 
 DEVICES = {"cpu": "the processor", "cuda": "the GPU"}

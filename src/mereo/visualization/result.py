@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mereo.fitting.answer import Answer
-from mereo.fitting.carry import Carried
-from mereo.fitting.register import Registrar, describe
-from mereo.fitting.registration_state import write_state
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.carry import Carried
+from mereo.fitting.registration.register import Registrar, describe
+from mereo.fitting.registration.state import write_state
 from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import atomic_file
@@ -26,6 +26,7 @@ from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.visualization.result_files import write_files, write_one
 from mereo.visualization.result_html import result_html
+from mereo.visualization.result_scene import scene_facts
 from mereo.visualization.units import UNKNOWN, Unit
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ class Result(Answer):
     def write(self, directory: Path, files: FilesConfig = DEFAULT_FILES, carried: Sequence[Carried] = ()) -> None:
         """Write what `mereo reconstruct` does into a directory that is there."""
         frame = self.seen.frame
-        facts = self.facts(carried)
+        facts = self.facts(carried) | scene_facts(None if self.registrar is None else self.registrar.given)
         write_files(
             directory,
             self.reconstruction,

@@ -10,10 +10,10 @@ from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.evaluation.scoring import CELLS, evaluate, trained_scene
 from mereo.evaluation.tables import markdown_table, metrics
-from mereo.fitting.carry import Carried
 from mereo.fitting.config import FitChoice
-from mereo.fitting.registration import Registration
-from mereo.fitting.uncertainty import Uncertainty
+from mereo.fitting.registration.carry import Carried
+from mereo.fitting.registration.registration import Registration
+from mereo.fitting.uncertainty.uncertainty import Uncertainty
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh

@@ -16,7 +16,7 @@ from mereo.geometry.normalizer import Normalizer
 from mereo.models.cuda_graphs import StaticFrames
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import changing_cells, over_corners, sample_coarse_to_fine, sample_dense
-from mereo.reconstruction.isosurfaces import extract_dense, extract_whole, locate
+from mereo.reconstruction.isosurfaces import extract, extract_whole, locate
 from mereo.reconstruction.pipeline import SEARCH_BOX
 
 
@@ -147,7 +147,9 @@ class Bench:
         box = locate(field, search)
 
         def straightforward() -> UInt8[np.ndarray, "x y z"]:
-            return extract_dense(self._rival().logits, box, 128, model.names, model.colors, model.nested).grid.labels
+            return extract(
+                self._rival().logits, box, 128, model.names, model.colors, model.nested, dense=True
+            ).grid.labels
 
         return self._grid_stage("surfaces of all segments, 128", self._grid_work(ours()), ours, straightforward)
 

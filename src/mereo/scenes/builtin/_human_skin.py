@@ -6,7 +6,7 @@ by an angle about a joint has the Jacobian ``1 + angle * grad w . (axis x (point
 """
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,6 +15,7 @@ from scipy.sparse import csr_matrix, diags, identity
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from mereo.deformation.maps import crossing
 from mereo.geometry.read_only import read_only
 from mereo.geometry.solids import label_grid
 from mereo.scenes.builtin._human_joints import JOINTS, PARENTS, part_axes
@@ -154,14 +155,14 @@ class PosedBody:
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Images of points, shaped and posed."""
-        shares = share_field()(points)
+        shares, turned = _shares(np.ascontiguousarray(points, dtype=np.float64).tobytes())
         moved = self._shaped(points, shares)
         heads, angles = self.heads(), np.linalg.norm(self.rotations, axis=1)
-        # rows a x e_k: Rodrigues' formula for a fixed axis is two products with these and their squares
-        quarter = np.cross((self.rotations / np.maximum(angles, 1e-12)[:, None])[:, None], np.eye(3))
+        # Rodrigues' formula for a fixed axis is two products with these and their squares
+        quarter = crossing(self.rotations / np.maximum(angles, 1e-12)[:, None])
         half = quarter @ quarter
         for index in reversed(range(len(JOINTS))):
-            rows = np.flatnonzero(shares[:, index] > 1e-9)
+            rows = turned[index]
             local, angle = moved[rows] - heads[index], (angles[index] * shares[rows, index])[:, None]
             moved[rows] += np.sin(angle) * (local @ quarter[index]) + (1.0 - np.cos(angle)) * (local @ half[index])
         return moved
@@ -180,6 +181,13 @@ class PosedBody:
         shift = (_own_shares() * self.girth) @ np.einsum("jab,jb->ja", across, heads)
         growth = np.einsum("nab,nb->na", (shares @ grown).reshape(-1, 3, 3), points) - shares @ shift
         return (points + growth) * self._scale()
+
+
+@lru_cache(maxsize=16)
+def _shares(points: bytes) -> tuple[Float[np.ndarray, "n j"], tuple[Int[np.ndarray, " _"], ...]]:
+    """Joints' shares in points, and which of them each joint turns; kept, as every state is asked for the same."""
+    shares = read_only(share_field()(np.frombuffer(points).reshape(-1, 3)))
+    return shares, tuple(np.flatnonzero(column > 1e-9) for column in shares.T)
 
 
 @cache

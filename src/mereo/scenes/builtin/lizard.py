@@ -23,7 +23,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from mereo.deformation.draw_names import named, part
+from mereo.deformation.draw_names import named, part, unchecked
 from mereo.deformation.maps import Compose, Deformation
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.read_only import read_only
@@ -154,7 +154,7 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
         spine = spine_motions(vectors)
         swings = {name: _leg_vectors(rng, name) for name in LEGS}
         legs = {name: _leg_motions(name, spine, swing) for name, swing in swings.items()}
-        if is_clear(spine, legs):
+        if unchecked(rng) or is_clear(spine, legs):
             break
     maps: list[Deformation] = [
         Compose((Hinged(SPINE[first : last - 1], vectors[first : last - 1]), rigid_map(spine[first])))

@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mereo.deformation.draw_names import named
+from mereo.deformation.draw_names import named, unchecked
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.read_only import read_only
@@ -164,9 +164,10 @@ def _moved(bulk: Bulk, turns: tuple[Rigid, ...]) -> Float[np.ndarray, "n 3"]:
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """Motions of all segments at random angles of all joints and a random opening; the base stays."""
-    turns = chain(sample_angles(rng))
-    while not is_clear(turns):
+    while True:  # one line draws, so that a recorder knows refused angles for what they are
         turns = chain(sample_angles(rng))
+        if unchecked(rng) or is_clear(turns):
+            break
     links = [Compose(turns[:count][::-1]) for count in range(1, len(turns) + 1)]
     opening = named(rng, "fingers apart").uniform(*OPENING)
     slide = np.array([0.0, opening - parts.JAW_OPENING, 0.0])

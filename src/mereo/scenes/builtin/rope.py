@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from mereo.deformation.draw_names import named, part
+from mereo.deformation.draw_names import named, part, unchecked
 from mereo.deformation.maps import Deformation, Identity
 from mereo.deformation.warps import CurveSweep
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -192,9 +192,10 @@ def is_clear(center: Float[np.ndarray, "m 3"]) -> bool:
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """Random sweep that moves the whole rope; the base stays."""
-    center = sample_centerline(rng)
-    while not is_clear(center):
+    while True:  # one line draws, so that a recorder knows refused curves for what they are
         center = sample_centerline(rng)
+        if unchecked(rng) or is_clear(center):
+            break
     sweep = CurveSweep.through(NODES, center, np.array([0.0, 1.0, 0.0]), RADIUS)
     return (Identity(), *([sweep] * SEGMENTS))
 

@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.deformation.draw_names import DrawName
-from mereo.fitting.registration import SegmentMotion
+from mereo.fitting.registration.registration import SegmentMotion
 from mereo.scenes.parameters import Parameter, Played, parameters, random_state, set_value
-from mereo.scenes.rounds import at_rest, blend, smooth_round
+from mereo.scenes.rest_pose import at_rest
 from mereo.scenes.scene import Scene, State
 from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.walks import blend, smooth_round
 from mereo.visualization.viewer import state_text
 
 Shape = TypeVar("Shape")

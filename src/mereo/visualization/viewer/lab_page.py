@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.foreseen import words_of
 from mereo.visualization.viewer import html
 from mereo.visualization.viewer.display import SegmentControls
 from mereo.visualization.viewer.film import Film, picture
@@ -180,7 +181,7 @@ class LabPage:
         film.add(picture(film.view, meshes, seen, depth_picture(self.moment.view.depth)))
 
     def _failed(self, error: Exception) -> None:
-        self._say(" ".join(str(error).split()) or type(error).__name__, bad=True)
+        self._say(words_of(error), bad=True)
         self._draw()
 
     # --- results ------------------------------------------------------------------------------------------------------

@@ -42,6 +42,32 @@ class Moment:
     trial: Trial | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """What of a moment a mode shows, and where.
+
+    Attributes:
+        found, true: reconstruction and truth in the camera frame; None where it is not shown.
+        aside: shift of the truth on the stage; the reconstruction and the points are as far the other way.
+    """
+
+    found: SegmentedMesh | None
+    true: SegmentedMesh | None
+    aside: Float[np.ndarray, "3"]
+
+    @classmethod
+    def of(cls, moment: Moment, mode: str) -> "Placed":
+        """What one of ``SHOWN`` shows."""
+        found = None if moment.trial is None or mode == "truth" else moment.trial.reconstruction.surfaces
+        aside = (ASIDE if mode == "side by side" else 0.0) * moment.view.T_world_camera[:3, 0]
+        return cls(found, None if mode == "reconstruction" else moment.view.mesh, aside)
+
+    @property
+    def meshes(self) -> tuple[tuple[SegmentedMesh | None, Float[np.ndarray, "3"]], ...]:
+        """Both, each with its shift."""
+        return (self.found, -self.aside), (self.true, self.aside)
+
+
 class LabStage:
     """Stage that shows a ``Moment`` in the scene's frame."""
 
@@ -62,37 +88,30 @@ class LabStage:
             shown: choice of the segments.
             points: whether those that the camera sees are shown.
         """
-        T_world_camera, truth = moment.view.T_world_camera, moment.view.mesh
-        both = mode == "side by side"
-        aside = (ASIDE if both else 0.0) * T_world_camera[:3, 0]
-        self._draw_camera(moment.view, -aside, points)
+        T_world_camera, placed = moment.view.T_world_camera, Placed.of(moment, mode)
+        self._draw_camera(moment.view, -placed.aside, points)
         self._clear_names()
-        if mode == "reconstruction":
+        if placed.true is None:
             self.true.clear_from()
         else:
-            self.true.show(truth.transformed(T_world_camera), shown, shift=aside)
-        if moment.trial is None or mode == "truth":
+            self.true.show(placed.true.transformed(T_world_camera), shown, shift=placed.aside)
+        if placed.found is None or moment.trial is None:
             self.found.clear_from()
             return None
-        surfaces = moment.trial.reconstruction.surfaces
-        if both:
-            self._name("reconstruction", surfaces, moment.view, -aside)
-            self._name("truth", truth, moment.view, aside)
+        if placed.true is not None:
+            self._name("reconstruction", placed.found, moment.view, -placed.aside)
+            self._name("truth", placed.true, moment.view, placed.aside)
         painted = self._colors(coloring, moment.view, moment.trial)
         colors, scale = (None, None) if painted is None else painted
-        self.found.show(surfaces.transformed(T_world_camera), shown, colors, -aside)
+        self.found.show(placed.found.transformed(T_world_camera), shown, colors, -placed.aside)
         return scale
 
     def shown(self, moment: Moment, mode: str, shown: Shown) -> tuple[list[SegmentedMesh], Float[np.ndarray, "n 3"]]:
         """Meshes and observed points as ``draw`` puts them on the stage, in the segments' own colours."""
-        T_world_camera = moment.view.T_world_camera
-        aside = (ASIDE if mode == "side by side" else 0.0) * T_world_camera[:3, 0]
-        found = None if moment.trial is None or mode == "truth" else moment.trial.reconstruction.surfaces
-        meshes = [(found, -aside)] if found is not None else []
-        meshes += [(moment.view.mesh, aside)] if found is None or mode != "reconstruction" else []
-        return [self._staged(mesh, T_world_camera, shift, shown) for mesh, shift in meshes], self._seen(
-            moment.view
-        ) - aside
+        placed = Placed.of(moment, mode)
+        meshes = [(mesh, shift) for mesh, shift in placed.meshes if mesh is not None]
+        staged = [self._staged(mesh, moment.view.T_world_camera, shift, shown) for mesh, shift in meshes]
+        return staged, self._seen(moment.view) - placed.aside
 
     def _seen(self, view: View) -> Float[np.ndarray, "n 3"]:
         """The observed points, on the stage."""

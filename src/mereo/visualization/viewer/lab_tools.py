@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mereo.io.foreseen import words_of
 from mereo.visualization.renderer import Viewpoint
 from mereo.visualization.viewer.film import MOST_FRAMES, Film, viewpoint
 from mereo.visualization.viewer.lab_stage import Moment
@@ -57,7 +58,7 @@ class LabTools:
         try:
             act()
         except Exception as error:
-            self.ties.say(" ".join(str(error).split()) or type(error).__name__, True)
+            self.ties.say(words_of(error), True)
 
     # --- states -------------------------------------------------------------------------------------------------------
 

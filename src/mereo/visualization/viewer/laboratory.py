@@ -17,9 +17,9 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scoring import check_names, predict_grid
-from mereo.fitting.fit import ModesFit
-from mereo.fitting.register import Registrar, registrar_for
-from mereo.fitting.registration import Registration
+from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.registration.register import Registrar, registrar_for
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.solids import Solids, label_grid

@@ -6,10 +6,10 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mereo.fitting.answer import Answer as FrameAnswer
-from mereo.fitting.recognition import Recognition, recognize
-from mereo.fitting.register import Registrar
-from mereo.fitting.registration import Registration, nearest_labels
+from mereo.fitting.registration.answer import Answer as FrameAnswer
+from mereo.fitting.registration.recognition import Recognition, recognize
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.solids import Solids

@@ -1,7 +1,7 @@
 """Page of an answer that is there already: what ``Result.show`` opens."""
 
-from mereo.fitting.answer import Answer
-from mereo.fitting.register import Registrar
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.register import Registrar
 from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.visualization.units import Unit

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.register import registrar_for
-from mereo.fitting.tracker import Tracker
+from mereo.fitting.registration.register import registrar_for
+from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for, shipped_names

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from mereo.evaluation.sample_views import load_frame, shipped_views
-from mereo.fitting.register import statistical_model_of
-from mereo.fitting.registration_state import played_state, restored
-from mereo.fitting.state_file import RegistrationState, is_state, read_state
+from mereo.fitting.registration.register import statistical_model_of
+from mereo.fitting.registration.state import played_state, restored
+from mereo.fitting.registration.state_file import RegistrationState, is_state, read_state
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.models.config import InferenceConfig
@@ -18,10 +18,11 @@ from mereo.models.weights import find_weights, load_for, shipped_names
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.scene import SCENES, Scene
 from mereo.synthesis.recording import is_recording_folder, read_recording
 from mereo.visualization.answering import answer
 from mereo.visualization.result import Result
+from mereo.visualization.result_scene import scene_of_result
 from mereo.visualization.units import UNKNOWN, Unit
 from mereo.visualization.viewer.display import import_viser, start_server
 from mereo.visualization.viewer.frame_page import FramePage
@@ -56,8 +57,8 @@ def view(
 
     Args:
         input: a point cloud or depth image; a folder of `mereo scene record`, which is played; a result of
-            `mereo reconstruct` with a registered model (the folder, or its state.json); a ``Result``; without it (and
-            ``scene``) a shipped frame.
+            `mereo reconstruct` with a registered model (the folder, or its state.json), by the scene file that its
+            summary names; a ``Result``; without it (and ``scene``) a shipped frame.
         weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
         scene: open the laboratory of this scene: its name, or a scene file.
         state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
@@ -147,7 +148,8 @@ def view_state(
         )
     weights = weights_of(state, weights)
     model = load_for(weights, inference or InferenceConfig())
-    registration = restored(state, statistical_model_of(model))
+    plays = state.draws is not None and state.scene not in SCENES
+    registration = restored(state, statistical_model_of(model), scene_of_result(path) if plays else None)
     cloud = None if seen is None else seen.cloud
     inspection = Inspection.of_registration(registration, model, np.array(state.T_camera_input), cloud)
     entry = Entry.of(host)

@@ -4,7 +4,6 @@ mesh, Camera, Sensing -see-> SimulatedView: the depth image that is answered, an
 """
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 
@@ -12,15 +11,10 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.raycasting import Hits
 from mereo.geometry.solids import Solids
-from mereo.synthesis.clutter import OBJECT, Capsule, Surroundings, sample_hand, sample_tool
-from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
+from mereo.synthesis.clutter import OBJECT, Capsule, Surroundings, sample_occluder
+from mereo.synthesis.config import SENSORS, GenerateConfig, Occluder, Sensor
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import View
-
-Front = Literal["nothing", "tool", "hand"]
-
-FRONTS: tuple[Front, ...] = get_args(Front)
-"""What may stand in front of the object."""
 
 PLACES = 24
 """Places of a tool or hand among which that is taken which hides nearest to what is asked for."""
@@ -43,7 +37,7 @@ class Sensing:
     sensor: Sensor = "paper"
     image_size: int = PAPER.image_size
     noise_std: float = PAPER.noise_std
-    front: Front = "nothing"
+    front: Occluder = "none"
     hidden: float = 0.1
 
 
@@ -78,15 +72,15 @@ def in_front(solids: Solids, camera: Camera, sensing: Sensing) -> tuple[tuple[Ca
     hits = solids.first_hit(directions)
     visible = np.isfinite(hits.distance)
     count = int(visible.sum())
-    if sensing.front == "nothing" or count < MIN_POINTS:
+    if sensing.front == "none" or count < MIN_POINTS:
         return (), 0.0
     rays, alone = directions[visible], Hits(hits.distance[visible], hits.normal[visible])
     seen, reach = rays * alone.distance[:, None], float(np.linalg.norm(directions[:, :2], axis=1).max())
-    draw, unit = (sample_tool if sensing.front == "tool" else sample_hand), 1 / SENSORS[sensing.sensor].metres_per_unit
+    unit = 1 / SENSORS[sensing.sensor].metres_per_unit
     best: tuple[Capsule, ...] = ()
     hidden = 0.0
     for place in range(PLACES):
-        capsules = tuple(draw(seen, reach, unit, np.random.default_rng(place)))
+        capsules = sample_occluder(sensing.front, seen, reach, unit, np.random.default_rng(place))
         left = int((Surroundings(capsules).join(alone, rays)[1] == OBJECT).sum())
         share = 1 - left / count
         if left >= MIN_POINTS and (not best or abs(share - sensing.hidden) < abs(hidden - sensing.hidden)):

@@ -1,16 +1,16 @@
 """Sliders for degrees of freedom, kept in step with the state, for the camera's place, and for its sensor."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from mereo.scenes.draw_recorder import Key
 from mereo.scenes.parameters import Parameter
-from mereo.synthesis.config import SENSORS
+from mereo.synthesis.config import SENSORS, Occluder
 from mereo.visualization.viewer import html
 from mereo.visualization.viewer.laboratory import CameraPlace, Laboratory
-from mereo.visualization.viewer.sight import FRONTS, Sensing
+from mereo.visualization.viewer.sight import Sensing
 
 Moved = Callable[[Parameter, float], None]
 
@@ -131,7 +131,7 @@ class SensorControls:
         self._sensor = gui.add_dropdown("sensor", tuple(SENSORS), initial_value=plain.sensor)
         self._size = gui.add_slider("pixels", *SIZES, 16, plain.image_size)
         self._noise = gui.add_slider("noise (units)", 0.0, MOST_NOISE, 0.02, plain.noise_std)
-        self._front = gui.add_dropdown("in front", FRONTS, initial_value=plain.front)
+        self._front = gui.add_dropdown("in front", get_args(Occluder), initial_value=plain.front)
         self._hidden = gui.add_slider("hides (%)", 1, MOST_HIDDEN, 1, round(100 * plain.hidden), visible=False)
         self._told = gui.add_html("", visible=False)
         for handle in (self._sensor, self._size, self._noise, self._front, self._hidden):
@@ -139,7 +139,7 @@ class SensorControls:
         self._front.on_update(lambda _: self._fold())
 
     def _fold(self) -> None:
-        self._hidden.visible = self._told.visible = self._front.value != "nothing"
+        self._hidden.visible = self._told.visible = self._front.value != "none"
 
     def sensing(self) -> Sensing:
         """Camera that the controls say."""

@@ -1,0 +1,243 @@
+"""A scene's own draws that explain a frame: Gauss and Newton's method on states that the scene really has.
+
+Around a state the scene is linear in its draws (``draws.problem``); it is played with the draws that fit best there,
+and so on, from several starts.
+"""
+
+from dataclasses import replace
+
+import igl
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import ndtr, ndtri
+
+from mereo.deformation.moving_least_squares import spread
+from mereo.fitting.draws.approach import Near, Shape, approach, near
+from mereo.fitting.draws.descent import descend, first_sigma
+from mereo.fitting.draws.discrete import chosen_otherwise
+from mereo.fitting.draws.playback import Drawn
+from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, beside, misfit, played
+from mereo.fitting.draws.turned_segments import turned, twins
+from mereo.fitting.modes.fit import refine
+from mereo.fitting.modes.hypotheses import robust_poses
+from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.residuals import robust_square
+
+MOST_DRAWS = 120
+"""Scenes with more free numbers are left to the modes."""
+
+RANKED_BY = 150
+"""Points by which random states are compared with a shape."""
+
+SMALLEST = 1e-4
+"""Least share of a draw that jumps."""
+
+SLIDES = 0.03
+"""Least motion, for one standard deviation of a draw that may jump, of the point that moves farthest: of ``half``."""
+
+
+def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
+    """The best of several starts; None where the scene has too many draws or plays none of them back."""
+    if problem.states.z.shape[1] > MOST_DRAWS:
+        return None
+    found = like_modes(problem, modes, [])
+    for _ in range(problem.config.passes):
+        if explained(problem, found, problem.config.hopeless):
+            break
+        found += second_pass(problem, min(found, key=by_misfit, default=None))
+    if problem.config.asked_again and not explained(problem, found, problem.config.explained):
+        camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
+        found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
+    best = min(found, key=by_misfit, default=None)
+    return None if best is None else by_sight(problem, jump(problem, with_twins_turned(problem, best)))
+
+
+def by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
+    """The state brought to what the lines of sight meet, by every observed point.
+
+    Nearest places lead there from afar, and noise takes them a little beside it; over more points it averages out. The
+    answer has the partners of all other states, but its misfit by every point: those it was fitted to.
+    """
+    sighted = replace(problem, by_sight=True)
+    dense = replace(sighted, base=problem.last)
+    start = played(dense, fit.drawn, fit.z, fit.posed)
+    if start is None:
+        return fit
+    found = descend(dense, start, problem.config.last_rounds)
+    if dense.base is sighted.base:
+        return found
+    end = played(sighted, found.drawn, found.z, found.posed)
+    assert end is not None  # it was played before
+    return replace(end, motion=found.motion, misfit=found.misfit)
+
+
+def like_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:
+    """States that explain the frame, from starts like a fit of the modes, and from ``others``."""
+    guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
+    return fitted(problem, modes, shape_of(problem, problem.model.material(modes.z)), [guess, *others])
+
+
+def second_pass(problem: DrawsProblem, best: DrawsFit | None) -> list[DrawsFit]:
+    """States like the modes' own fit from where the draws ended, which may be in another basin than their first."""
+    if best is None:
+        return []
+    pose, z = problem.model.project(best.placed())
+    scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
+    modes = refine(problem.base, Posed(pose[:3, :3] / scale, pose[:3, 3], z, float(np.log(scale))))
+    return like_modes(problem, modes, [replace(best.drawn, z=best.z)])
+
+
+def explained(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool:
+    """Whether one of the states explains the cloud: ``Problem.explained``."""
+    sigma = problem.base.config.cloud_sigma
+    misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in found]
+    if not misfits:
+        return False
+    best = found[int(np.argmin(misfits))]
+    return problem.base.explained(min(misfits), best.surface, most)
+
+
+def shape_of(problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> Shape:
+    """Shape of material points, unposed: dense and smooth."""
+    config, few = problem.config, problem.states.played.index
+    return Shape.of(material[few], config.shape_std * problem.model.half, config.shape_worth, np.ones(len(few)))
+
+
+def shape_of_network(problem: DrawsProblem, log_scale: float) -> Shape:
+    """Shape that the correspondences have, in the camera frame."""
+    found, sigma = problem.found, problem.base.network_sigma
+    points = found.points * np.exp(-log_scale)
+    return Shape.of(points, sigma, problem.config.shape_worth, found.confidence, problem.followed)
+
+
+def fitted(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
+    """States that explain the frame, from starts like a shape; ``frame`` poses the shape in the camera frame.
+
+    While what is found is far from explaining the cloud, the next starts are tried.
+    """
+    config, states = problem.config, problem.states
+    drawn = [states.drawn(seed) for seed in alike(problem, shape)] + guesses
+    found = [near(states, shape, one, one.z) for one in drawn]
+    here = sorted((one for one in found if one is not None), key=lambda one: one.misfit)
+    batch, fits = config.sieve[0][1], list[DrawsFit]()
+    for number in range(config.batches):
+        fits += followed(problem, frame, shape, here[number * batch : (number + 1) * batch])
+        if explained(problem, fits, config.hopeless):
+            break
+    return fits
+
+
+def followed(problem: DrawsProblem, frame: Posed, shape: Shape, here: list[Near]) -> list[DrawsFit]:
+    """The best of some starts, followed to the end."""
+    config, states = problem.config, problem.states
+    for fresh, keep in config.sieve:
+        here = [approach(states, shape, one, fresh) for one in sorted(here, key=by_misfit)[:keep]]
+        here += chosen_better(problem, shape, min(here, key=by_misfit, default=None))
+    starts = [(played(problem, one.drawn, one.z, posed_on(frame, one)), one.motion) for one in here]
+    likely = sorted(((fit, motion) for fit, motion in starts if fit is not None), key=lambda start: start[0].misfit)
+    return [descend(problem, fit, config.last_rounds, motion) for fit, motion in likely[: config.kept]]
+
+
+def chosen_better(problem: DrawsProblem, shape: Shape, best: Near | None) -> list[Near]:
+    """States near a shape that ``best`` does not meet, made from that one by other discrete draws."""
+    config, states = problem.config, problem.states
+    if best is None or best.misfit < config.met:
+        return []
+    others = chosen_otherwise(states.scene, replace(best.drawn, z=best.z), config.choices)
+    here = [near(states, shape, other, other.z) for other in others]
+    likely = sorted((one for one in here if one is not None and differs(one, best, shape.std)), key=by_misfit)
+    return [approach(states, shape, one, 1) for one in likely[: config.chosen]]
+
+
+def differs(one: Near, other: Near, least: float) -> bool:
+    """Whether any played point of two states is farther apart than ``least``; a choice may come out the same again."""
+    return bool(np.abs(one.points - other.points).max() > least)
+
+
+def by_misfit(one: Near | DrawsFit) -> float:
+    """Misfit, as a key to sort by."""
+    return one.misfit
+
+
+def alike(problem: DrawsProblem, shape: Shape) -> list[int]:
+    """Seeds of the random states most like a shape."""
+    states = problem.states
+    some = spread(shape.points, RANKED_BY)
+    library, goal = states.material[:, states.played.index], shape.points[some].astype(np.float32)
+    if shape.follow is None:
+        compared = library[:, some]
+    else:
+        compared = np.stack([shape.follow[some] @ one for one in library])
+    cost = robust_poses(compared, goal, shape.weight[some].astype(np.float32), problem.base.network_sigma)[0]
+    return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
+
+
+def with_twins_turned(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
+    """The state, or one with segments turned that look alike turned, where that explains the frame better.
+
+    A forearm by half a turn, for which several draws change at once. Only where the shape, stiffly turned, explains
+    the frame nearly as well: what is seen of a right one mostly tells.
+    """
+    config = problem.config
+    few = replace(problem, config=replace(config, sieve=config.turned_sieve, kept=1, batches=1))
+    for together in twins(problem.model):
+        material = turned(problem.model, fit.material, together)
+        stiff = beside(problem, fit.drawn, fit.z, fit.posed, material)
+        if stiff is not None and stiff.misfit < fit.misfit + config.turned_worse:
+            fit = min([fit, *fitted(few, fit.posed, shape_of(problem, material), [])], key=by_misfit)
+    return fit
+
+
+def posed_on(frame: Posed, here: Near) -> Posed:
+    """Pose in the camera frame of a state that lies on a shape whose own pose there is ``frame``."""
+    translation = frame.place(here.translation[None])[0]
+    return Posed(frame.rotation @ here.rotation, translation, np.empty(0), frame.log_scale)
+
+
+def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
+    """One draw anywhere in its range, where that explains the frame better: a wheel by half a turn.
+
+    Only while the cloud is not explained.
+    """
+    config = problem.config
+    sigma = first_sigma(problem)
+    for _ in range(config.jumps):
+        if explained(problem, [fit], config.explained):
+            break
+        each = [likely_places(problem, fit, int(number), sigma) for number in likely_to_jump(problem, fit)]
+        likely = sorted((place for places in each for place in places), key=lambda place: place[0])
+        found = [descend(problem, other, config.first_rounds) for _, other in likely[: config.kept + 1]]
+        best = min(found, key=by_misfit, default=fit)
+        if best.misfit >= fit.misfit:
+            break
+        fit = descend(problem, best, config.first_rounds)
+    return fit
+
+
+def likely_places(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
+    """A state with one draw at other places of its range: all, or the best where there are many draws, with misfits."""
+    config, there = problem.config, list[tuple[float, DrawsFit]]()
+    for turn in range(1, config.places):
+        z = fit.z.copy()
+        z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.places) % 1.0, SMALLEST, 1 - SMALLEST))
+        other = played(problem, fit.drawn, z, fit.posed)
+        if other is not None:
+            there.append((misfit(problem, other, sigma), other))
+    return sorted(there, key=lambda place: place[0])[: config.places_kept]
+
+
+def likely_to_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
+    """Draws that may jump: of many, those that move what they move along its own surface, as a ring on its post.
+
+    Only then a state far away may look nearly the same, so that no small step leads there.
+    """
+    smooth = np.flatnonzero(fit.drawn.smooth)
+    if problem.config.sliding >= 1.0 or fit.motion is None:
+        return smooth
+    model, index = problem.model, problem.states.played.index
+    surface = index < sum(model.vertex_counts)
+    motion = fit.motion[surface][:, :, smooth].astype(np.float64)
+    normal = igl.per_vertex_normals(fit.material[: sum(model.vertex_counts)], model.faces)[index[surface]]
+    moved, off = (motion**2).sum(axis=(0, 1)), (np.einsum("ac,acd->ad", normal, motion) ** 2).sum(axis=0)
+    farthest = np.sqrt((motion**2).sum(axis=1).max(axis=0, initial=0.0))
+    return smooth[(off < problem.config.sliding * moved) & (farthest > SLIDES * model.half)]

@@ -1,0 +1,239 @@
+"""A scene's own random numbers as coordinates of its states.
+
+Every number that a scene draws is a share of its distribution, uniform in 0..1; as ``z = Phi^-1(share)`` it is standard
+normal. Played back in the order of the calls, the same shares give the same state, and others its neighbours.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.sparse import csr_array
+from scipy.special import ndtr, ndtri
+
+from mereo.deformation.maps import Deformation
+from mereo.deformation.moving_least_squares import Anchors, PointWeights, spread
+from mereo.geometry.procrustes import best_rotations
+from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder, Shares
+from mereo.scenes.parameters import random_state
+from mereo.scenes.random_states import state_points
+from mereo.scenes.scene import Scene
+from mereo.scenes.statistical_model import StatisticalModel, following
+
+STATES_SEED = 400_000
+"""A training seed."""
+
+MOST = 2.0
+"""Standard deviations of a draw that is guessed."""
+
+RIDGE = 1e-3
+"""Ridge of the regression of draws on modes, relative to the states' own spread."""
+
+PROJECTED = 400
+"""Material points by which many states are expressed in modes."""
+
+PLAYED = 400
+"""Material points of all segments together whose motion is played for derivatives; the others follow them."""
+
+LEAST_PLAYED = 24
+"""The same of each segment at least."""
+
+LARGEST = 4.0
+"""Standard deviations; farther out a share is 0 or 1."""
+
+
+class Playback(Recorder):
+    """A generator whose draws are given in the order of the calls; more or other ones raise ``OutOfDraws``."""
+
+    def __init__(self, seed: int, shares: Sequence[np.ndarray], checked: bool) -> None:
+        super().__init__(seed, {})
+        self._shares, self._next, self.checked = shares, 0, checked
+
+    def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any) -> Shares:
+        if self._next >= len(self._shares) or len(self._shares[self._next]) != int(np.prod(shape)):
+            raise OutOfDraws
+        self._next += 1
+        return self._shares[self._next - 1]
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A state of a scene by its draws.
+
+    Attributes:
+        seed: of what is not recorded.
+        z: all draws in the order of the calls, standard normal.
+        sizes: how many numbers each call drew.
+        smooth: which of them move the state continuously.
+    """
+
+    seed: int
+    z: Float[np.ndarray, " d"]
+    sizes: tuple[int, ...]
+    smooth: Bool[np.ndarray, " d"]
+
+    @classmethod
+    def of(cls, scene: Scene, seed: int) -> "Drawn":
+        """The random state of a seed, without attempts that the scene itself threw away."""
+        return cls.recorded(random_state(scene, seed).calls, seed)
+
+    @classmethod
+    def recorded(cls, calls: Sequence[Call], seed: int) -> "Drawn":
+        """The state of recorded calls; ``seed`` is that of what is not recorded."""
+        sizes = tuple(len(call.shares) for call in calls)
+        smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in calls])
+        return cls(seed, ndtri(np.concatenate([call.shares for call in calls])), sizes, smooth)
+
+    def deformations(
+        self, scene: Scene, z: Float[np.ndarray, " d"], checked: bool = True
+    ) -> tuple[Deformation, ...] | None:
+        """Deformations of the state with other draws; None where the scene refuses it, ``unchecked`` ones hardly."""
+        try:
+            return scene.sample_deformations(Playback(self.seed, shares_of(z, self.sizes), checked))
+        except (OutOfDraws, ValueError):
+            return None
+
+
+def shares_of(z: Float[np.ndarray, " d"], sizes: tuple[int, ...]) -> list[Shares]:
+    """Shares of each call, of standard normal draws, as they are played."""
+    return np.split(ndtr(np.clip(z, -LARGEST, LARGEST)), np.cumsum(sizes)[:-1])
+
+
+def as_sparse(weights: PointWeights, count: int) -> csr_array:
+    """Weights of ``count`` points as a matrix."""
+    rows = np.repeat(np.arange(len(weights.index)), weights.index.shape[1])
+    entries = (weights.weight.ravel().astype(np.float32), (rows, weights.index.ravel()))
+    return csr_array(entries, shape=(len(weights.index), count))
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """Few material points of each segment, and how all others follow them.
+
+    Attributes:
+        points: their positions at rest, one segment after the other.
+        index: which material points they are.
+        counts: how many each segment has.
+        spread: weights by which all material points follow them.
+    """
+
+    points: Float[np.ndarray, "a 3"]
+    index: Int[np.ndarray, " a"]
+    counts: tuple[int, ...]
+    spread: csr_array
+
+    @classmethod
+    def of(cls, model: StatisticalModel) -> "Played":
+        """Evenly spread points of a model's anchors."""
+        each = max(LEAST_PLAYED, PLAYED // len(model.anchors))
+        chosen = [anchors[spread(model.rest_points[anchors], each)] for anchors in model.anchors]
+        counts = tuple(len(part) for part in chosen)
+        places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        few = tuple(Anchors(at, model.rest_points[part]) for at, part in zip(places, chosen, strict=True))
+        follow = as_sparse(following(few, model.rest_points, model.labels), sum(counts))
+        index = np.concatenate(chosen)
+        return cls(model.rest_points[index], index, counts, follow)
+
+    def moved(self, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "a 3"]:
+        """Positions to which a state moves the points; a map that several segments share is called once."""
+        return moved_together(deformations, self.points, self.counts)
+
+
+def moved_together(
+    deformations: tuple[Deformation, ...], points: Float[np.ndarray, "n 3"], counts: tuple[int, ...]
+) -> Float[np.ndarray, "n 3"]:
+    """Positions to which points go, ``counts`` of each segment one after the other."""
+    owner = np.repeat([id(deformation) for deformation in deformations], counts)
+    result = np.empty_like(points)
+    for deformation in {id(deformation): deformation for deformation in deformations}.values():
+        rows = np.flatnonzero(owner == id(deformation))
+        if len(rows):
+            result[rows] = deformation(points[rows])
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnStates:
+    """Random states of a scene by seed: where a fit of draws may start.
+
+    Attributes:
+        scene: what is played.
+        seeds: of the states.
+        material: their material points, scene frame.
+        z: their draws, standard normal; NaN of states with other calls than the first that was not drawn again.
+        modes: their coefficients in the statistical model.
+        played: points whose motion is played for derivatives.
+        recorded: what ``drawn`` has recorded so far.
+    """
+
+    scene: Scene
+    seeds: tuple[int, ...]
+    material: Float32[np.ndarray, "n m 3"]
+    z: Float[np.ndarray, "n d"]
+    modes: Float[np.ndarray, "n k"]
+    played: Played
+    recorded: dict[int, Drawn] = field(default_factory=dict)
+
+    def drawn(self, seed: int) -> Drawn:
+        """``Drawn.of`` one of the seeds, recorded once: frames share their starts."""
+        if seed not in self.recorded:
+            self.recorded[seed] = Drawn.of(self.scene, seed)
+        return self.recorded[seed]
+
+    @classmethod
+    def of(
+        cls, scene: Scene, model: StatisticalModel, count: int = 600, first_seed: int = STATES_SEED
+    ) -> "DrawnStates":
+        """States of ``count`` seeds from ``first_seed`` on."""
+        seeds = tuple(range(first_seed, first_seed + count))
+        material, draws = [], []
+        for seed in seeds:
+            recorder = Recorder(seed, {})
+            state = scene.deform(scene.sample_deformations(recorder))
+            material.append(state_points(state, model.nodes, model.node_labels).astype(np.float32))
+            draws.append(ndtri(np.concatenate([call.shares for call in recorder.calls])))
+        fewest = min(len(z) for z in draws)
+        z = np.stack([z if len(z) == fewest else np.full(fewest, np.nan) for z in draws])
+        return cls(scene, seeds, np.stack(material), z, coefficients(model, np.stack(material)), Played.of(model))
+
+    def guess(self, modes: Float[np.ndarray, " k"], motion: Float[np.ndarray, " k"], count: int) -> Drawn:
+        """Draws of a state of these coefficients: ridge regression on states, those near it counting more.
+
+        ``motion`` is how far a standard deviation of each mode moves, ``count`` how many states count as near.
+        """
+        usable = np.flatnonzero(np.isfinite(self.z).all(axis=1))
+        apart = (((self.modes[usable] - modes) * motion) ** 2).sum(axis=1)
+        weight = 1.0 / (1.0 + apart / np.sort(apart)[min(count, len(apart)) - 1])
+        basis = np.concatenate([np.ones((len(usable), 1)), (self.modes[usable] - modes) * motion], axis=1)
+        weighted = basis * weight[:, None]
+        ridge = RIDGE * weight.sum() * float((motion**2).mean()) * np.eye(basis.shape[1])
+        ridge[0, 0] = 0.0
+        answer = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ self.z[usable])[0]
+        like = self.drawn(self.seeds[usable[0]])
+        return replace(like, z=np.where(like.smooth, np.clip(answer, -MOST, MOST), like.z))
+
+
+def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]) -> Float[np.ndarray, "n k"]:
+    """Coefficients of many states at once, by a few rounds of alignment and least squares on a few material points."""
+    few = spread(model.rest_points, PROJECTED)
+    flat = model.modes[few].reshape(-1, model.count).astype(np.float64)
+    normal = flat.T @ flat + 1e-6 * np.trace(flat.T @ flat) / model.count * np.eye(model.count)
+    states = material[:, few].astype(np.float64)
+    states -= states.mean(axis=1, keepdims=True)
+    z = np.zeros((len(states), model.count))
+    for _ in range(4):
+        goal = model.mean[few] + (z @ flat.T).reshape(len(z), -1, 3)
+        center = goal.mean(axis=1, keepdims=True)
+        rotation = best_rotations(np.matmul(states.transpose(0, 2, 1), goal - center))
+        aligned = np.matmul(states, rotation.transpose(0, 2, 1)) + center
+        z = np.linalg.solve(normal, flat.T @ (aligned - model.mean[few]).reshape(len(z), -1).T).T
+    return z
+
+
+def material_moved(
+    scene: Scene, model: StatisticalModel, deformations: tuple[Deformation, ...]
+) -> Float[np.ndarray, "m 3"]:
+    """Positions to which all material points go."""
+    return state_points(scene.deform(deformations), model.nodes, model.node_labels)

@@ -1,0 +1,247 @@
+"""One frame to be explained by one object: all terms of the fit, and how badly a state explains them."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mereo.fitting.config import FitConfig
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.evidence import MORE_PARTNERS, PARTNERS, Evidence
+from mereo.fitting.problem.gauss_newton import NormalEquations, Posed, Rows
+from mereo.fitting.problem.joints import Joints
+from mereo.fitting.problem.noise import SHARED, constants_for, is_noise, noise_of, shared
+from mereo.fitting.problem.priors import PairTerm, Prior
+from mereo.fitting.problem.residuals import (
+    ROBUST,
+    WITNESS_WEIGHT,
+    NetworkTerm,
+    Surface,
+    add_cloud,
+    add_witnesses,
+    cloud_rows,
+    robust_square,
+)
+from mereo.fitting.problem.sampled_surface import SampledSurface
+from mereo.scenes.statistical_model import WITNESSES, StatisticalModel
+
+COARSE = 3
+"""How many times fewer partners and correspondences a choice among many states needs."""
+
+BESIDE = 1.0
+"""Share of the samples' spacing: a partner so far beside one is still on its plane."""
+
+FAR = 1.0
+"""Scene units beyond the tolerance by which a vertex is ruled out for good."""
+
+UNEXPLAINED = 0.3
+"""The cloud's misfit, in squared standard deviations of a partner, above which a fit is likely wrong."""
+
+TAILS = 1.5
+"""The same, in those of normal noise as great as what the fit leaves over."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Misfit: how badly a state explains a frame, as squared standard deviations.
+
+    Attributes:
+        cloud: of one partner on average.
+        network: of all correspondences, as much as they are worth.
+        witnesses: of all vertices that the frame rules out.
+        prior: of the coefficients, under the Gaussian of all states.
+        pairs: of the kept distances, as much as they are worth.
+        total: all of it, the cloud as much as it is worth.
+    """
+
+    cloud: float
+    network: float
+    witnesses: float
+    prior: float
+    pairs: float
+    total: float
+
+    @property
+    def without_network(self) -> float:
+        """The total without the correspondences, for states that were found from different ones."""
+        return self.total - self.network
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything a fit of one frame works on; scene units, camera frame.
+
+    Attributes:
+        model: the statistical model.
+        network: correspondences.
+        evidence: the frame.
+        scale_std: how far the scale is unsure.
+        config: constants.
+        noisy: whether they are those of a noisy frame.
+    """
+
+    model: StatisticalModel
+    network: NetworkTerm
+    evidence: Evidence
+    scale_std: float
+    config: FitConfig
+    noisy: bool = False
+
+    @classmethod
+    def of(
+        cls, model: StatisticalModel, found: Correspondences, evidence: Evidence, scale_std: float, config: FitConfig
+    ) -> "Problem":
+        """Problem of one frame: what the network found, and what the frame shows."""
+        return cls(model, NetworkTerm.of(model, found), evidence, scale_std, config)
+
+    @cached_property
+    def pairs(self) -> PairTerm:
+        """Term of the distances that the states keep."""
+        return PairTerm.of(self.model)
+
+    @property
+    def witnesses(self) -> Int[np.ndarray, " w"]:
+        """Surface vertices that are compared with silhouette and free space."""
+        return self.model.witnesses
+
+    @property
+    def network_sigma(self) -> float:
+        """Standard deviation of a correspondence, scene units."""
+        return self.config.start_sigma * self.model.half
+
+    def known(self, posed: Posed, prior: Prior, slack: float) -> NormalEquations:
+        """Normal equations of what is known without the frame: prior, scale, kept distances up to ``slack``."""
+        normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
+        return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
+
+    def noise_beside(self, surface: Surface) -> float:
+        """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
+        return noise_of(surface.offsets(self.evidence.points), self.evidence.around)
+
+    def as_noisy_as(self, surface: Surface) -> "Problem | None":
+        """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that."""
+        config = constants_for(self.noise_beside(surface), self.config)
+        if config is self.config:
+            return None
+        return replace(self, config=config, evidence=self.evidence.with_more_partners, noisy=True)
+
+    def wants_turns(self, cloud: float, surface: Surface) -> bool:
+        """Whether a misfit of the cloud, much greater than its noise, says that the fit is likely wrong."""
+        if cloud < UNEXPLAINED:
+            return False
+        if self.config.turned_anyway:
+            return not self.leaves_noise(surface)
+        return cloud > TAILS * (self.noise_beside(surface) / self.config.cloud_sigma) ** 2
+
+    @property
+    def by_every_point(self) -> "Problem":
+        """The problem with as many partners as a noisy frame has; the same where they are all of them already."""
+        evidence = self.evidence
+        if len(evidence.partners) >= min(len(evidence.points), MORE_PARTNERS):
+            return self
+        return replace(self, evidence=evidence.with_more_partners)
+
+    def with_network(self, found: Correspondences) -> "Problem":
+        """The problem with other correspondences."""
+        return replace(self, network=NetworkTerm.of(self.model, found))
+
+    def leaves_noise(self, surface: Surface) -> bool:
+        """Whether what a fit leaves over is noise, and not its own error."""
+        offset = surface.offsets(self.evidence.points)
+        return is_noise(offset, noise_of(offset, self.evidence.around))
+
+    def explained(self, cloud: float, surface: Surface, most: float) -> bool:
+        """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise."""
+        if cloud < most or not self.noisy:
+            return cloud < most
+        offset = surface.offsets(self.evidence.points, self.far)
+        return shared(offset, self.evidence.around, self.config.cloud_sigma) < SHARED
+
+    @property
+    def far(self) -> float:
+        """Distance, in scene units, beyond which a place along a line of sight is of another surface than was seen."""
+        return ROBUST * self.config.cloud_sigma
+
+    def met(self, surface: Surface) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """``Surface.along_sight`` of the observed partners."""
+        return surface.along_sight(self.evidence.partners, self.far)
+
+    @cached_property
+    def samples(self) -> SampledSurface:
+        """Samples of the model's surface."""
+        return SampledSurface.of(self.model, self.config.samples)
+
+    @cached_property
+    def joints(self) -> Joints:
+        """Joints of the model."""
+        return Joints.of(self.model)
+
+    @cached_property
+    def coarse(self) -> "Problem":
+        """Problem with fewer points, for the choice among many states."""
+        config = replace(self.config, samples=self.config.coarse_samples, witnesses=self.config.witnesses // COARSE)
+        if self.noisy:  # its sigma would ask the faces in all steps
+            config = replace(config, exact_steps=0)
+        some = slice(None, None, COARSE)
+        network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
+        evidence = replace(self.evidence, partners=self.evidence.partners[: PARTNERS // COARSE])
+        coarse = Problem(self.model, network, evidence, self.scale_std, config, self.noisy)
+        vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))
+        return coarse
+
+    def screen(self, posed: Posed, sigma: float) -> Misfit:
+        """Misfit by the samples alone: good enough to choose among states, and ten times as fast."""
+        samples = self.samples.posed(posed)
+        place, normal, _ = samples.planes(self.evidence.partners)
+        offset = self.evidence.partners - place
+        across = np.einsum("pi,pi->p", offset, normal)
+        beside = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
+        distance = np.hypot(across, np.maximum(beside - BESIDE * self.samples.spacing, 0.0))
+        amount = self.evidence.violations(samples.few(self.config.witnesses).place, ROBUST * sigma)[1]
+        return self.total(
+            float(robust_square(distance, sigma).mean()),
+            self.network.energy(posed, self.network_sigma),
+            float(robust_square(amount, sigma, 4 * ROBUST).mean()),
+            posed.z,
+        )
+
+    def seen(
+        self, normal: NormalEquations, posed: Posed, sigma: float, network_worth: float, exact: bool
+    ) -> NormalEquations:
+        """Sum with cloud, witnesses and correspondences; ``exact`` asks the faces and not the samples."""
+        samples, partners = self.samples.posed(posed), self.evidence.partners
+        planes = Surface.of(self.model, posed).planes(partners, self.far) if exact else samples.planes(partners)
+        normal = self.network.add_to(normal, posed, self.network_sigma, network_worth, robust=True)
+        normal = add_cloud(normal, posed, partners, planes, sigma, self.config.cloud_worth)
+        return add_witnesses(normal, posed, samples.few(self.config.witnesses), self.evidence, sigma)
+
+    def cloud_rows(self, posed: Posed) -> Rows:
+        """Residuals of the observed partners from the faces, as the last steps of a fit have them."""
+        partners, config = self.evidence.partners, self.config
+        planes = Surface.of(self.model, posed).planes(partners, self.far)
+        return cloud_rows(posed, partners, planes, config.cloud_sigma, config.cloud_worth)
+
+    def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
+        """Misfit of a state, whose ``surface`` may be there already."""
+        sigma, surface = self.config.cloud_sigma, surface or Surface.of(self.model, posed)
+        cloud = float(robust_square(self.met(surface)[0], sigma).mean())
+        amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * sigma)[1]
+        outside = float(robust_square(amount, sigma, 4 * ROBUST).mean())
+        return self.total(cloud, self.network.energy(posed, self.network_sigma), outside, posed.z)
+
+    def ruled_out(self, surface: Surface) -> float:
+        """Share of a surface's vertices that the frame rules out by more than ``FAR``."""
+        amount = self.evidence.violations(surface.material[self.witnesses], self.config.tolerance)[1]
+        return float((amount > FAR).mean())
+
+    def total(self, cloud: float, network: float, witnesses: float, z: Float[np.ndarray, " k"]) -> Misfit:
+        """Misfit from the mean squares of one partner, one correspondence and one witness."""
+        network, witnesses = network * self.config.network_worth[1], witnesses * WITNESS_WEIGHT * WITNESSES
+        prior, pairs = float(z @ z), self.config.pair_worth * self.pairs.energy(z)
+        total = self.config.cloud_worth * cloud + network + witnesses + prior + pairs
+        return Misfit(cloud, network, witnesses, prior, pairs, total)
+
+    def unposed(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 3"]:
+        """The correspondences' places in the model's frame."""
+        return self.network.mean + self.network.modes @ z.astype(np.float32)

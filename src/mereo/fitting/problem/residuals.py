@@ -1,0 +1,212 @@
+"""Terms of the fit: what the network said, the observed points, and what the frame rules out.
+
+Every term gives normal equations near a state; lengths in scene units, camera frame. Notation: n correspondences, p
+partners, k modes.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import igl
+import numpy as np
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Float, Float32, Int
+
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.gauss_newton import NormalEquations, Posed, Rows, along, cross, geman_mcclure, in_space
+from mereo.fitting.problem.sampled_surface import Planes, PosedSamples
+from mereo.geometry.mesh import barycentric
+from mereo.geometry.raycasting import first_faces, ray_scene
+from mereo.scenes.statistical_model import StatisticalModel
+
+ROBUST = 2.5
+"""Residuals beyond this many sigma count for little."""
+
+MOST_VIOLATIONS = 400
+WITNESS_WEIGHT = 0.2
+
+
+def robust_square(residual: Float[np.ndarray, " r"], sigma: float, robust: float = ROBUST) -> Float[np.ndarray, " r"]:
+    """Geman and McClure's loss, in squared sigmas; ``geman_mcclure`` are its weights."""
+    squared = (residual / sigma) ** 2
+    return squared / (1.0 + squared / robust**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A posed model, and its faces turned towards the camera.
+
+    Attributes:
+        material: posed positions of all material points.
+        facing: indices of the faces that are seen from their outside.
+        normals: unit normals of these.
+    """
+
+    model: StatisticalModel
+    material: Float[np.ndarray, "m 3"]
+    facing: Int[np.ndarray, " g"]
+    normals: Float[np.ndarray, "g 3"]
+
+    @classmethod
+    def of(cls, model: StatisticalModel, posed: Posed) -> "Surface":
+        """Surface of a state."""
+        return cls.through(model, posed.place(model.material(posed.z)))
+
+    @classmethod
+    def through(cls, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> "Surface":
+        """Surface through posed material points."""
+        a, b, c = (material[model.faces[:, i]] for i in range(3))
+        normal = cross(b - a, c - a)
+        facing = np.flatnonzero(np.einsum("fi,fi->f", normal, a) < 0)
+        normal = normal[facing]
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        return cls(model, material, facing, normal)
+
+    @cached_property
+    def _tree(self) -> tuple[igl.AABB, Float[np.ndarray, "m 3"], Int[np.ndarray, "g 3"]]:
+        vertices, faces = np.ascontiguousarray(self.material), np.ascontiguousarray(self.model.faces[self.facing])
+        tree = igl.AABB()
+        tree.init(vertices, faces)
+        return tree, vertices, faces
+
+    def nearest(
+        self, points: Float[np.ndarray, "p 3"]
+    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """Distance, face among the facing ones, and place of the nearest point of the facing surface."""
+        tree, vertices, faces = self._tree
+        squared, face, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
+        return np.sqrt(squared), face.astype(np.int64), place
+
+    def along_sight(
+        self, points: Float[np.ndarray, "p 3"], far: float
+    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """Like ``nearest``, but of the place that each point's line of sight meets, and of the distance from its plane.
+
+        A depth camera is off along the line of sight. The nearest place is another one: of a surface that bulges, it
+        has a noisy cloud a little in front, and noise across an edge pulls that edge along. Where nothing is met, or
+        only a plane farther than ``far`` from the point, it is the nearest place all the same.
+        """
+        rows, met = first_faces(self._rays, self._center, points)
+        toward, normal = points[rows], self.normals[met]
+        corner = self.material[self.model.faces[self.facing[met], 0]]
+        shares = np.einsum("pi,pi->p", normal, corner) / np.einsum("pi,pi->p", normal, toward)
+        there = toward * shares[:, None]
+        off = np.abs(np.einsum("pi,pi->p", normal, toward - there))
+        near = off <= far
+        other = np.ones(len(points), dtype=bool)
+        other[rows[near]] = False
+        distance, face, place = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
+        distance[~other], face[~other], place[~other] = off[near], met[near], there[near]  # rows are in order
+        if other.any():
+            distance[other], face[other], place[other] = self.nearest(points[other])
+        return distance, face, place
+
+    @cached_property
+    def _center(self) -> Float[np.ndarray, "3"]:
+        center: Float[np.ndarray, "3"] = self.material.mean(axis=0)
+        return center
+
+    @cached_property
+    def _rays(self) -> EmbreeScene:
+        return ray_scene(self.material - self._center, self.model.faces[self.facing])
+
+    def offsets(self, points: Float[np.ndarray, "p 3"], far: float | None = None) -> Float[np.ndarray, " p"]:
+        """Signed distance of each point from the facing surface, negative behind it; with ``far``, ``along_sight``."""
+        distance, face, place = self.nearest(points) if far is None else self.along_sight(points, far)
+        return np.copysign(distance, np.einsum("pi,pi->p", points - place, self.normals[face]))
+
+    def planes(self, points: Float[np.ndarray, "p 3"], far: float) -> Planes:
+        """Place of the facing surface along each point's line of sight, its normal and its modes."""
+        _, face, place = self.along_sight(points, far)
+        corners = self.model.faces[self.facing[face]]
+        weight = barycentric(self.material[corners], place).astype(np.float32)
+        modes = np.matmul(weight[:, None], self.model.modes[corners].reshape(len(points), 3, -1))
+        return place, self.normals[face], modes.reshape(len(points), 3, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkTerm:
+    """Correspondences, with the modes at their rest positions.
+
+    Attributes:
+        target: positions in the camera frame.
+        mean, modes: of the same points in the model.
+        confidence: weight of each.
+    """
+
+    target: Float[np.ndarray, "n 3"]
+    mean: Float[np.ndarray, "n 3"]
+    modes: Float32[np.ndarray, "n 3 k"]
+    confidence: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, model: StatisticalModel, found: Correspondences) -> "NetworkTerm":
+        """Term of correspondences, whose rest places follow the model."""
+        weights = model.weights(found.rest, found.labels)
+        return cls(found.points, weights(model.mean), weights(model.modes), found.confidence)
+
+    @classmethod
+    def none(cls, model: StatisticalModel) -> "NetworkTerm":
+        """Term without correspondences, which adds nothing."""
+        empty = np.empty((0, 3))
+        return cls(empty, empty, np.empty((0, 3, model.count), dtype=np.float32), np.empty(0))
+
+    def place(self, posed: Posed) -> Float[np.ndarray, "n 3"]:
+        """Positions that the state gives the points."""
+        return posed.place(self.mean + self.modes @ posed.z.astype(np.float32))
+
+    def energy(self, posed: Posed, sigma: float) -> float:
+        """Mean robust squared distance, in squared sigmas; 0 without correspondences."""
+        if len(self.target) == 0:
+            return 0.0
+        distance = np.linalg.norm(self.place(posed) - self.target, axis=1)
+        return float(self.confidence / self.confidence.sum() @ robust_square(distance, sigma))
+
+    def add_to(
+        self, normal: NormalEquations, posed: Posed, sigma: float, worth: float, robust: bool
+    ) -> NormalEquations:
+        """Sum with the squared distances, together worth as many independent points as ``worth``."""
+        if len(self.target) == 0:
+            return normal
+        points = self.place(posed)
+        offset = points - self.target
+        weight = self.confidence / self.confidence.sum() * (worth / sigma**2)
+        if robust:
+            weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
+        return normal.add(in_space(posed, points, self.modes), offset.ravel(), np.repeat(weight, 3))
+
+
+def add_cloud(
+    normal: NormalEquations,
+    posed: Posed,
+    points: Float[np.ndarray, "p 3"],
+    planes: Planes,
+    sigma: float,
+    worth: float,
+) -> NormalEquations:
+    """Sum with each point's distance to its plane of the facing surface."""
+    return normal.add(*cloud_rows(posed, points, planes, sigma, worth))
+
+
+def cloud_rows(posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, sigma: float, worth: float) -> Rows:
+    """Each point's distance to its plane of the facing surface, its derivatives, and its weight."""
+    place, across, modes = planes
+    residual = np.einsum("pi,pi->p", across, place - points)
+    weight = geman_mcclure(residual, ROBUST * sigma) * (worth / len(points) / sigma**2)
+    return along(posed, place, modes, across), residual, weight
+
+
+def add_witnesses(
+    normal: NormalEquations, posed: Posed, samples: PosedSamples, evidence: Evidence, sigma: float
+) -> NormalEquations:
+    """Sum with the samples of the surface that are outside the silhouette or in free space."""
+    place = samples.place.astype(np.float64)
+    direction, amount = evidence.violations(place, ROBUST * sigma)
+    rows = np.flatnonzero(amount > 0)
+    if len(rows) == 0:
+        return normal
+    rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
+    jacobian = along(posed, place[rows], samples.surface.modes[rows, 0], direction[rows])
+    weight = WITNESS_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
+    return normal.add(jacobian, -amount[rows], weight)

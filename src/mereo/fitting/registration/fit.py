@@ -1,0 +1,299 @@
+"""Registration: the object's own deformation model, fitted to one frame.
+
+code -correspondences-> pose and state of the model -deform-> SegmentedMesh, and a map rest <-> camera
+"""
+
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.fitting.config import FitConfig
+from mereo.fitting.draws.fit import fit_draws
+from mereo.fitting.draws.playback import DrawnStates
+from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
+from mereo.fitting.draws.problem import narrowing as draws_narrowing
+from mereo.fitting.modes.fit import Judged, fit_modes
+from mereo.fitting.modes.rest import fit_rest, is_at_rest, of_rest
+from mereo.fitting.modes.rest import narrowing as modes_narrowing
+from mereo.fitting.modes.turned_camera import with_turns
+from mereo.fitting.modes.understood import Ask, as_noisy
+from mereo.fitting.problem.correspondences import Correspondences, find_correspondences
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.residuals import Surface
+from mereo.fitting.problem.scene_unit import agree, estimate_unit
+from mereo.fitting.registration.registration import Method, Registration
+from mereo.fitting.uncertainty.optimum import DrawsOptimum, ModesOptimum, Optimum
+from mereo.geometry.camera import PointCloud
+from mereo.io.cores import one_blas_thread
+from mereo.models.model import EncodedCloud, Model
+from mereo.scenes.statistical_model import StatisticalModel
+
+KNOWN_SCALE_STD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ModesFit:
+    """Frame to which the modes are fitted, and to which the scene's own draws can be fitted as well.
+
+    Attributes:
+        problem: everything the fit works on, scene units.
+        found: correspondences, scene units.
+        unit: length of a scene unit in the cloud's unit, before the fit's own scale.
+        posed: coefficients and pose.
+        seconds: that it took.
+        rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
+        radius_scale, draws_radius_scale: factors of the radii of the modes' uncertainty, and of that of draws, by the
+            network's calibration.
+    """
+
+    problem: Problem
+    found: Correspondences
+    unit: float
+    posed: Posed
+    seconds: float
+    rest: Judged | None = None
+    radius_scale: float | None = None
+    draws_radius_scale: float | None = None
+
+    @classmethod
+    def of(
+        cls,
+        points: Float[np.ndarray, "n 3"],
+        found: Correspondences,
+        model: StatisticalModel,
+        scene_unit: float | None = None,
+        config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+        doubtful: Float[np.ndarray, "d 3"] | None = None,
+        ask: Ask | None = None,
+    ) -> "ModesFit":
+        """Fit of the modes to a cloud, seen from the origin, with correspondences in its unit.
+
+        Where it leaves much unexplained, the network is asked again with the camera turned (``turned_camera``), and
+        where what is left is noise, the frame is fitted once more as a noisy one.
+
+        Args:
+            points: the cloud.
+            found: correspondences.
+            model: the statistical model.
+            scene_unit: length of a scene unit in the cloud's unit, where it is known.
+            config: constants.
+            doubtful: points that are none of the cloud: along their lines of sight nothing is known (``Evidence.of``).
+            ask: what the network states about points of the camera frame, in the cloud's unit; None cannot be asked
+                again.
+        """
+        started = time.perf_counter()
+        unit = estimate_unit(found) if scene_unit is None else scene_unit
+        scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD
+        found = found.scaled(1 / unit)
+
+        def asked(seen: Float[np.ndarray, "s 3"]) -> Correspondences:
+            assert ask is not None
+            return ask(seen * unit).scaled(1 / unit)
+
+        with one_blas_thread():
+            evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit)
+            problem = Problem.of(model, found, evidence, scale_std, config)
+            understood = problem, found, fit_modes(problem)
+            again = None if ask is None else asked
+            problem, found, modes = as_noisy(with_turns(understood, again), points / unit, again)
+            rest = fit_rest(problem, found, modes.posed)
+            at_rest = is_at_rest(problem, modes, rest)
+        return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
+
+    @property
+    def asks_draws(self) -> bool:
+        """Whether draws may be the answer: beside the rest model only under noise, where modes may miss what moved."""
+        return self.rest is None or self.problem.noisy
+
+    @property
+    def tolerance(self) -> float:
+        """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
+        return self.problem.config.tolerance
+
+    def off_surface(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Distances, in scene units, of points of the camera frame in the cloud's unit from the facing surface."""
+        return self.surface.nearest(points / self.unit)[0]
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The posed model in scene units: by its modes, or at rest where the frame speaks for that."""
+        model = self.problem.model
+        if self.rest is None:
+            return Surface.of(model, self.posed)
+        return Surface.through(model, self.rest.posed.place(model.rest_points))
+
+    def registration(self) -> Registration:
+        """The answer of the modes, or the rest model where the frame speaks for that."""
+        if self.rest is not None:
+            end = ModesOptimum(of_rest(self.problem, self.found), self.rest.posed, self.unit)
+            return self._registration("rest", self.problem.model.rest_z, end, self.rest.posed, self.surface)
+        end = ModesOptimum(self.problem, self.posed, self.unit)
+        return self._registration("modes", self.posed.z, end, self.posed, self.surface)
+
+    def with_draws(self, states: DrawnStates) -> Registration:
+        """The answer of the scene's own draws where their misfit is lower or their evidence greater, else the modes'.
+
+        Modes can imitate what they do not hold, with more of them than a scene has draws; the evidence counts that.
+        It does not speak against draws, which have the states that there really are.
+        """
+        if not self.asks_draws:
+            return self.registration()
+        started = time.perf_counter()
+        with one_blas_thread():
+            problem = DrawsProblem.of(self.problem, states, self.found)
+            drawn = fit_draws(problem, self.posed)
+            taken = drawn is not None and is_drawn(problem, drawn, self.posed, self.rest)
+        seconds = self.seconds + time.perf_counter() - started
+        if drawn is None or not taken:
+            return replace(self.registration(), seconds=seconds)
+        end = DrawsOptimum(problem, drawn, self.unit)
+        found = self._registration("draws", drawn.z, end, drawn.posed, drawn.surface)
+        return replace(found, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
+
+    def _registration(
+        self, method: Method, z: Float[np.ndarray, " k"], optimum: Optimum, posed: Posed, surface: Surface
+    ) -> Registration:
+        distance = surface.nearest(self.problem.evidence.partners)[0]
+        explained = float((distance <= self.tolerance).mean())
+        return Registration(
+            model=self.problem.model,
+            material=surface.material * self.unit,
+            method=method,
+            z=z,
+            scene_unit=self.unit * float(np.exp(posed.log_scale)),
+            unit_known=self.problem.scale_std == KNOWN_SCALE_STD,
+            explained=explained,
+            accepted=self._is_believed(explained, surface),
+            seconds=self.seconds,
+            residual=float(np.sqrt((distance**2).mean())) * self.unit,
+            ruled_out=self.problem.ruled_out(surface),
+            needed=self.problem.config.accepted,
+            optimum=optimum,
+            radius_scale=self.draws_radius_scale if method == "draws" else self.radius_scale,
+        )
+
+    def _is_believed(self, explained: float, surface: Surface) -> bool:
+        """Whether a fit explains enough of the points; less is enough where the network sees the same segments there.
+
+        On clean training views the fit was better than the network in each that the second rule adds.
+        """
+        config = self.problem.config
+        least = min(config.accepted, config.accepted_agreed)
+        return explained >= config.accepted or (explained >= least and self._agreement(surface) >= config.agreed)
+
+    def _agreement(self, surface: Surface) -> float:
+        """Share of the correspondences on the object whose segment is that of the nearest place of the surface."""
+        seen = self.found.rows(self.found.observed)
+        if len(seen.points) == 0:  # a tracked frame, of which the network was not asked
+            return 0.0
+        face = surface.nearest(seen.points)[1]
+        model = self.problem.model
+        return float((model.labels[model.faces[surface.facing[face], 0]] == seen.labels).mean())
+
+    def displaced(self, registration: Registration, most: float) -> float | None:
+        """``Signs.displaced`` of a registration of this frame; None where the network was not asked."""
+        if len(self.found.points) == 0:
+            return None
+        model = self.problem.model
+        place = model.weights(self.found.rest, self.found.labels)(registration.material) / self.unit
+        apart = np.linalg.norm(place - self.found.points, axis=1) / model.half
+        return float(np.sqrt((np.minimum(apart, most) ** 2).mean()))
+
+
+def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: Judged | None = None) -> bool:
+    """Whether a state of the draws is to be preferred to the modes, or to the rest model, where that is given.
+
+    By the points that the answer was fitted to.
+    """
+    if rest is not None:
+        unbent = of_rest(problem.last, problem.found).misfit(rest.posed).total
+        return drawn.misfit + draws_narrowing(problem, drawn) < unbent
+    gain = drawn.misfit - problem.last.misfit(modes).total
+    return gain < 0 or gain < modes_narrowing(problem.base, modes) - draws_narrowing(problem, drawn)
+
+
+def fit_frame(
+    cloud: PointCloud,
+    network: Model,
+    model: StatisticalModel,
+    scene_unit: float | None = None,
+    config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+    code: EncodedCloud | None = None,
+    stated_unit: float | None = None,
+    doubtful: Float[np.ndarray, "d 3"] | None = None,
+) -> ModesFit:
+    """Fit of the modes to a cloud, from the network's correspondences.
+
+    Args:
+        cloud: observed points, camera frame, any unit.
+        network: trained on this object, with rest coordinates.
+        model: statistical model of the same object.
+        scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
+        config: constants.
+        code: of the cloud, where it is known already.
+        stated_unit: what the input says that ``scene_unit`` is, which is believed where the correspondences agree.
+        doubtful: points that were left out of the cloud as strays.
+
+    Raises ``ValueError`` for a network without rest coordinates or of other segments, and where it finds too little.
+    """
+    started = time.perf_counter()
+    if network.names != model.rest.names:
+        raise ValueError(
+            f"the weights know the segments {', '.join(network.names)} but the statistical model has "
+            f"{', '.join(model.rest.names)}; they must be of one object: build the model from the weights' own scene"
+        )
+    code = network.encode(cloud) if code is None else code
+    found = _asked(network, model, code)
+    if scene_unit is None and stated_unit is not None and agree(estimate_unit(found), stated_unit):
+        scene_unit = stated_unit
+    asked = time.perf_counter() - started
+
+    def ask(points: Float[np.ndarray, "s 3"]) -> Correspondences:
+        return _asked(network, model, network.encode(PointCloud(points)))
+
+    fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask)
+    known = network.calibration
+    scales = (None, None) if known is None else known.radius_scales(fitted.problem.noisy)
+    return replace(fitted, seconds=fitted.seconds + asked, radius_scale=scales[0], draws_radius_scale=scales[1])
+
+
+def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
+    """Correspondences that the network states for a cloud, evenly."""
+    found = find_correspondences(network, code, model.rest_center, model.half)
+    if found is None:
+        raise ValueError(
+            "the weights predict no rest coordinates, from which a fit starts; train with a dataset that has a template"
+        )
+    return found.evenly()
+
+
+def fit(
+    cloud: PointCloud,
+    network: Model,
+    model: StatisticalModel,
+    scene_unit: float | None = None,
+    states: DrawnStates | None = None,
+    config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+    code: EncodedCloud | None = None,
+) -> Registration:
+    """``fit_frame``'s answer; with ``states`` of the model's scene, the better of modes and the scene's own draws."""
+    fitted = fit_frame(cloud, network, model, scene_unit, config, code)
+    return fitted.registration() if states is None else fitted.with_draws(states)
+
+
+def fit_correspondences(
+    points: Float[np.ndarray, "n 3"],
+    found: Correspondences,
+    model: StatisticalModel,
+    scene_unit: float | None = None,
+    states: DrawnStates | None = None,
+    config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+) -> Registration:
+    """``fit`` from given correspondences; ``points`` are the observed cloud, seen from the origin."""
+    fitted = ModesFit.of(points, found, model, scene_unit, config)
+    return fitted.registration() if states is None else fitted.with_draws(states)

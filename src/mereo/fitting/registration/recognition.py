@@ -1,0 +1,285 @@
+"""Is it my object, in a state that I know? One answer from what a fit and the network leave unexplained.
+
+    Registration, correspondences, stated unit -Signs.of-> Signs -recognize-> Recognition (known or not, and why)
+
+A sign is a number that is small for the object in states that were learned, and grows with what is wrong. Views of the
+object say how large it usually is, clean and under a camera's noise (``Calibration.recognizing``; conservative values
+here for weights that were not calibrated). How far the logarithms of all signs lie above the usual, in standard
+deviations and together, is the frame's strangeness; two limits make three answers of it. The sign that is strangest
+gives the reason, so there is one voice.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from mereo.fitting.registration.readings import FittedFrame
+from mereo.fitting.registration.registration import BELIEVED, Registration
+from mereo.models.calibration import Calibration, Recognizing, SignName, Usual
+from mereo.models.model import Model
+
+Known = bool | Literal["unsure"]
+
+MOST = 1e3
+"""Strangeness that is not exceeded, and that of a frame in which nothing was found."""
+
+LEAST: Mapping[SignName, float] = {
+    "size": 0.01,
+    "unexplained": 0.1,
+    "ruled_out": 0.01,
+    "beyond": 0.1,
+    "unusual": 0.05,
+    "displaced": 0.005,
+}
+"""What is added to a sign before its logarithm is taken: less than that means nothing."""
+
+SIZE = Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.5)
+"""Usual logarithm of how far sizes are off, of all weights: by 3 %, and by 15 % at most where the unit is right."""
+
+WIDE = 0.5
+"""Standard deviations of logarithms for weights that were not calibrated: those of single objects are smaller."""
+
+CONSERVATIVE = Recognizing(
+    clean={
+        "unexplained": Usual(mean=float(np.log(0.3)), std=WIDE),
+        "ruled_out": Usual(mean=float(np.log(0.015)), std=WIDE),
+        "beyond": Usual(mean=float(np.log(0.15)), std=WIDE),
+        "unusual": Usual(mean=float(np.log(0.6)), std=WIDE),
+        "displaced": Usual(mean=float(np.log(0.06)), std=0.4),
+    },
+    noisy={
+        "unexplained": Usual(mean=float(np.log(0.6)), std=WIDE),
+        "ruled_out": Usual(mean=float(np.log(0.03)), std=WIDE),
+        "beyond": Usual(mean=float(np.log(0.2)), std=WIDE),
+        "unusual": Usual(mean=float(np.log(0.6)), std=WIDE),
+        "displaced": Usual(mean=float(np.log(0.09)), std=0.4),
+    },
+    unsure=4.0,
+    refused=8.0,
+)
+"""For weights that were not calibrated."""
+
+LEAST_LEFT = 0.01
+"""Smallest share of the points that a believed fit may leave unexplained, whatever a caller has set."""
+
+CLIPPED = 0.5
+"""Largest distance of one place that counts in ``Signs.displaced``."""
+
+
+@dataclass(frozen=True)
+class Signs:
+    """Signs that a frame does not show the object in a state that was learned; None where one is not known.
+
+    Attributes:
+        size: logarithm, without its sign, of the size found over the one that the frame's unit says; None where no
+            unit is stated.
+        unexplained: share of the observed points that the model does not explain, in shares that a believed fit may
+            leave (5 % of a clean frame, 25 % of a noisy one).
+        ruled_out: share of the model's surface that the frame rules out.
+        beyond: how far the state lies outside all that were learned, scene units; None at rest.
+        unusual: mean square of the state's coefficients; None at rest.
+        displaced: root mean square distance between where the network and the registered model have the same places of
+            the object, each ``CLIPPED`` at most, as a share of half its length; None where the network was not asked.
+    """
+
+    size: float | None = None
+    unexplained: float | None = None
+    ruled_out: float | None = None
+    beyond: float | None = None
+    unusual: float | None = None
+    displaced: float | None = None
+
+    @classmethod
+    def of(
+        cls, registration: Registration, displaced: float | None = None, stated_unit: float | None = None
+    ) -> "Signs":
+        """Signs of a registration; ``stated_unit`` is the length of a scene unit in its unit as the input says it."""
+        at_rest, z = registration.method == "rest", registration.modes_z  # at rest it is known, whatever was learned
+        return cls(
+            size=None if stated_unit is None else abs(float(np.log(registration.scene_unit / stated_unit))),
+            unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, LEAST_LEFT),
+            ruled_out=registration.ruled_out,
+            beyond=None if at_rest else registration.beyond_states,
+            unusual=None if at_rest or not len(z) else float((z**2).mean()),
+            displaced=displaced,
+        )
+
+    @property
+    def logarithms(self) -> dict[SignName, float]:
+        """Logarithms of the signs that are known."""
+        found = {name: getattr(self, name) for name in LEAST}
+        return {name: float(np.log(value + LEAST[name])) for name, value in found.items() if value is not None}
+
+    def strange(self, usual: Mapping[SignName, Usual]) -> dict[SignName, float]:
+        """Standard deviations by which each sign lies above what is usual; 0 where it does not."""
+        known = {"size": SIZE, **usual}
+        return {
+            name: min(max((value - known[name].mean) / known[name].std, 0.0), MOST)
+            for name, value in self.logarithms.items()
+            if name in known
+        }
+
+
+def strangeness(strange: Mapping[SignName, float]) -> float:
+    """Strangeness of a frame by all its signs: the root of the sum of their squares."""
+    return min(float(np.sqrt(sum(value**2 for value in strange.values()))), MOST)
+
+
+def is_noisy(registration: Registration) -> bool:
+    """Whether the frame was fitted as one with more noise than the paper's."""
+    return registration.needed < BELIEVED
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """Whether a frame shows the object, in a state that was learned.
+
+    Attributes:
+        known: true, false, or "unsure".
+        reason: why it is not true, a sentence with what to do; None where it is.
+        strangeness: of all signs together, in standard deviations of what is usual.
+        signs: what it was made of; None where no registration was found.
+        calibrated: whether the limits are the weights' own.
+    """
+
+    known: Known
+    reason: str | None
+    strangeness: float
+    signs: Signs | None = None
+    calibrated: bool = False
+
+    @property
+    def told(self) -> str | None:
+        """Sentence for people; None where the object is known."""
+        return None if self.reason is None else told_of(self.known, self.reason)
+
+    def facts(self) -> dict[str, Any]:
+        """Content of ``recognition`` in a result's summary."""
+        return {
+            "known": self.known,
+            "reason": self.reason,
+            "strangeness": self.strangeness,
+            "calibrated": self.calibrated,
+            "signs": None if self.signs is None else asdict(self.signs),
+        }
+
+
+def told_of(known: Known, reason: str) -> str:
+    """Sentence for people about a frame that is not known for sure."""
+    return f"{'doubtful' if known == 'unsure' else 'not the object in a state that was learned'}: {reason}"
+
+
+NOT_ASKED = Recognition("unsure", "the network alone cannot tell its object from others: use --fit auto", 0.0)
+"""Recognition of a frame to which no model was registered."""
+
+
+def recognize(
+    registration: Registration | None,
+    calibration: Calibration | None = None,
+    displaced: float | None = None,
+    stated_unit: float | None = None,
+    refusal: str | None = None,
+) -> Recognition:
+    """Whether a frame shows the object, in a state that was learned.
+
+    Args:
+        registration: of the object's model to the frame; None where none was found or none was asked for.
+        calibration: of the weights, with what is usual.
+        displaced: as in ``Signs``.
+        stated_unit: length of a scene unit in the frame's unit, where the input states that.
+        refusal: why no registration was found; None where none was asked for, and then it cannot be told.
+    """
+    if registration is None:
+        return NOT_ASKED if refusal is None else Recognition(False, refusal, MOST)
+    own = None if calibration is None else calibration.recognizing
+    limits = CONSERVATIVE if own is None else own
+    signs = Signs.of(registration, displaced, stated_unit)
+    each = signs.strange(limits.noisy if is_noisy(registration) else limits.clean)
+    total = strangeness(each)
+    if total <= limits.unsure:
+        return Recognition(True, None, total, signs, own is not None)
+    known: Known = False if total >= limits.refused else "unsure"
+    reason = REASONS[max(each, key=lambda name: each[name])](registration, signs)
+    return Recognition(known, reason, total, signs, own is not None)
+
+
+def recognized(
+    found: FittedFrame, registration: Registration | None, model: Model, stated_unit: float | None = None
+) -> Recognition:
+    """Whether a frame shows the object that ``registration``, made of it, is of."""
+    displaced = None if registration is None or found.modes is None else found.modes.displaced(registration, CLIPPED)
+    refusal = None if found.error is None else str(found.error)
+    return recognize(registration, model.calibration, displaced, stated_unit, refusal)
+
+
+# --- reasons ----------------------------------------------------------------------------------------------------------
+
+HARDLY = 0.5
+"""Share of the observed points below which it is probably another object, or no camera frame."""
+
+BEYOND = 0.5
+"""Scene units outside all states that were learned from which on they are worth telling."""
+
+LOOK = "look at the result before you rely on it"
+
+WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it anew"
+
+
+def _size(registration: Registration, signs: Signs) -> str:
+    return (
+        f"its size differs by a factor of {np.exp(signs.size or 0.0):.3g} from the object's in the frame's unit: "
+        "correct the unit (--unit-m, --depth-scale), or name the object's own weights"
+    )
+
+
+def _unexplained(registration: Registration, signs: Signs) -> str:
+    if registration.explained < HARDLY:
+        return (
+            f"only {registration.explained:.0%} of the points can be the model's: this is probably another object, "
+            "not the object alone, or no camera frame: leave out what is not the object, turn the cloud (--frame), or "
+            "name the object's own weights"
+        )
+    return (
+        f"{1 - registration.explained:.0%} of the points are not the model's: {LOOK}, or leave out of the cloud what "
+        "is not the object"
+    )
+
+
+def _ruled_out(registration: Registration, signs: Signs) -> str:
+    return (
+        f"{registration.ruled_out:.0%} of the model's surface lies where the frame shows none of it, beside or in "
+        f"front of what was seen: {LOOK}, or take the frame from nearer"
+    )
+
+
+def _beyond(registration: Registration, signs: Signs) -> str:
+    return (
+        f"the state lies {registration.beyond_states:.1f} scene units outside those that were learned, and rigid parts "
+        f"may be bent: {WIDEN}"
+    )
+
+
+def _unusual(registration: Registration, signs: Signs) -> str:
+    if registration.beyond_states > BEYOND:
+        return _beyond(registration, signs)
+    return f"the object would be bent farther than in the states that were learned: {WIDEN}"
+
+
+def _displaced(registration: Registration, signs: Signs) -> str:
+    return (
+        f"network and registered model have the same places of the object {signs.displaced or 0.0:.0%} of half its "
+        f"length apart: {LOOK}, or name the object's own weights"
+    )
+
+
+REASONS: Mapping[SignName, Callable[[Registration, Signs], str]] = {
+    "size": _size,
+    "unexplained": _unexplained,
+    "ruled_out": _ruled_out,
+    "beyond": _beyond,
+    "unusual": _unusual,
+    "displaced": _displaced,
+}
+"""Sentences by the sign that is strangest."""

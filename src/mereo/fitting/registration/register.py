@@ -1,0 +1,229 @@
+"""The object's own deformation model, registered to frames: set up once for an object, asked for every frame.
+
+EncodedFrame -Registrar-> Registration
+"""
+
+import warnings
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.fitting.config import FitChoice, FitConfig
+from mereo.fitting.draws.playback import DrawnStates
+from mereo.fitting.registration.fit import ModesFit, fit_frame
+from mereo.fitting.registration.registration import Registration
+from mereo.geometry.brief import listed
+from mereo.geometry.camera import PointCloud
+from mereo.models.model import EncodedCloud, Model
+from mereo.scenes.assets import AssetUnavailable
+from mereo.scenes.random_states import built_in_model
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.statistical_model import StatisticalModel
+
+
+class ChangedSceneWarning(UserWarning):
+    """Scene with other meshes than when the weights were trained on it: its draws are not fitted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registrar:
+    """Registers one object's deformation model to frames.
+
+    Attributes:
+        network: the weights, from whose correspondences a fit starts.
+        model: statistical model of the same object.
+        choice: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
+            misfit; "auto" does the same where the scene is at hand, and else fits the modes.
+        given: the object's scene, where it is not the built-in one that the weights were trained on.
+        config: constants of the fit of the modes.
+    """
+
+    network: Model
+    model: StatisticalModel
+    choice: FitChoice = "auto"
+    given: Scene | None = None
+    config: FitConfig = FitConfig()  # noqa: RUF009 (frozen)
+
+    @classmethod
+    def of(cls, network: Model, choice: FitChoice = "auto", scene: Scene | str | None = None) -> "Registrar":
+        """Registrar of the model that the weights carry, or of that of their built-in scene, which takes seconds.
+
+        Args:
+            network: the weights.
+            choice: which description of the states is fitted.
+            scene: the object's scene, its name or its file, where it is not the built-in one of the weights.
+
+        Raises ``ValueError`` where the weights carry no statistical model and know no built-in scene, and where
+        ``choice`` is "full" without a scene or with one of another object.
+        """
+        given = load_scene(scene) if isinstance(scene, str) else scene
+        result = cls(network, statistical_model_of(network), choice, given)
+        if choice == "full" and result.scene is None:
+            raise ValueError(
+                f"the weights were trained on {network.provenance.get('scene')!r}, which is no built-in scene; the fit "
+                "of a scene's draws plays it: name its file with --scene, or use --fit modes"
+            )
+        return result
+
+    @cached_property
+    def scene(self) -> Scene | None:
+        """Scene whose draws can be played: the given one, or the built-in one of the weights; None where neither is.
+
+        Also None, with a ``ChangedSceneWarning``, where ``choice`` is "auto" and the scene that the weights were
+        trained on has other meshes since. Raises ``ValueError`` for such a scene with other choices and for a given
+        scene of another object, and ``AssetUnavailable`` where its mesh cannot be had.
+        """
+        name = str(self.network.provenance.get("scene"))
+        scene = self.given if self.given is not None else load_scene(name) if name in SCENES else None
+        fault = None if scene is None else other_mesh(scene, self.model)
+        if scene is None or fault is None:
+            return scene
+        if self.choice == "auto" and scene.name == name:
+            warnings.warn(
+                f"{fault}: it has changed since they were trained, so only the modes of that model are fitted; train "
+                "them again for the fit of its draws",
+                ChangedSceneWarning,
+                stacklevel=2,
+            )
+            return None
+        raise ValueError(f"{fault}, so its draws move other points: {CURE}, or use --fit modes")
+
+    @cached_property
+    def states(self) -> DrawnStates | None:
+        """Random states of the scene, among which a fit of its draws starts; they take seconds once."""
+        return None if self.scene is None else DrawnStates.of(self.scene, self.model)
+
+    @property
+    def at_once(self) -> "Registrar":
+        """The same without the patience to ask about a frame again with the camera turned."""
+        return replace(self, config=replace(self.config, turned=False))
+
+    @property
+    def at_last(self) -> "Registrar":
+        """The same, which asks about a frame with the camera turned however noisy it may be."""
+        return replace(self, config=replace(self.config, turned_anyway=True))
+
+    def asking(self, network: Model) -> "Registrar":
+        """The same, asking the same weights on another device; scene and states that are known stay so."""
+        if network is self.network:
+            return self
+        moved = copy(self)
+        object.__setattr__(moved, "network", network)  # `replace` would forget what is cached
+        return moved
+
+    def stated_unit(self, unit_m: float) -> float | None:
+        """Length of a scene unit in a cloud's unit of ``unit_m`` metres; None where the object's size is not known."""
+        frame = self.model.source_frame
+        return None if frame is None or frame.unit_m is None else frame.unit_m / unit_m
+
+    def fit_modes(
+        self,
+        seen: PointCloud,
+        code: EncodedCloud | None = None,
+        scene_unit: float | None = None,
+        stated_unit: float | None = None,
+        doubtful: Float[np.ndarray, "d 3"] | None = None,
+    ) -> ModesFit:
+        """Fit of the modes, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
+        return fit_frame(
+            seen, self.network, self.model, scene_unit, self.config, code, stated_unit=stated_unit, doubtful=doubtful
+        )
+
+    def register(
+        self,
+        seen: PointCloud,
+        code: EncodedCloud | None = None,
+        scene_unit: float | None = None,
+        stated_unit: float | None = None,
+    ) -> Registration:
+        """Registration of the model to a cloud, as ``choice`` says.
+
+        Args:
+            seen: observed points, camera frame, any unit.
+            code: what ``network`` made of them, where it is known already.
+            scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
+            stated_unit: the same as the input states it, believed only where the network's own estimate agrees.
+
+        Raises ``ValueError`` as ``fit_frame`` does.
+        """
+        return self.finish(self.fit_modes(seen, code, scene_unit, stated_unit))
+
+    def finish(self, fitted: ModesFit) -> Registration:
+        """The answer from a fit of the modes: the draws too where ``choice`` asks for them."""
+        states = None if self.choice == "modes" or not fitted.asks_draws else self.at_hand
+        return fitted.registration() if states is None else fitted.with_draws(states)
+
+    def takes(self, registration: Registration) -> bool:
+        """Whether a registration is the answer: with "auto" one that explains its frame, with other choices any."""
+        return registration.accepted or self.choice != "auto"
+
+    @cached_property
+    def at_hand(self) -> DrawnStates | None:
+        """``states``, but None where "auto" cannot have the scene's mesh: the weights carry all that the modes need."""
+        try:
+            return self.states
+        except AssetUnavailable:
+            if self.choice == "auto":
+                return None
+            raise
+
+
+def registrar_for(model: Model, choice: FitChoice, scene: Scene | str | None = None) -> Registrar | None:
+    """Registrar for a choice; None where the network alone answers: "auto" needs weights that carry a model."""
+    if choice == "off" or (choice == "auto" and model.statistical_model is None):
+        return None
+    return Registrar.of(model, choice, scene)
+
+
+CURE = "name the scene that the weights were trained on, train them again if it has changed since"
+"""What to do about a scene of other meshes."""
+
+
+def other_mesh(scene: Scene, model: StatisticalModel) -> str | None:
+    """How a scene's segments differ from a model's, in names or in numbers of vertices or faces; None where they agree.
+
+    Places of a statistical model mean nothing on another mesh.
+    """
+    said = f"the scene {scene.name!r} has other segments or meshes than the weights' own model"
+    if scene.rest.names != model.rest.names:
+        return f"{said} ({listed(scene.rest.names)}; theirs: {listed(model.rest.names)})"
+    for now, then in zip(scene.rest.segments, model.rest.segments, strict=True):
+        for count, before, what in (
+            (len(now.vertices), len(then.vertices), "vertices"),
+            (len(now.faces), len(then.faces), "faces"),
+        ):
+            if count != before:
+                return f"{said} (its segment {now.name!r} has {count} {what}, theirs {before})"
+    return None
+
+
+def statistical_model_of(model: Model) -> StatisticalModel:
+    """Statistical model that the weights carry; older ones get that of their built-in scene, which takes seconds."""
+    found = model.statistical_model or built_in_model(str(model.provenance.get("scene")), model.names)
+    if found is None:
+        raise ValueError(
+            f"the weights of {', '.join(model.names)} carry no statistical model of their object's states; a "
+            "registration needs one: finish the dataset with `mereo generate ... --resume` and train again, or use "
+            "--fit off"
+        )
+    return found
+
+
+def describe(registration: Registration) -> dict[str, object]:
+    """Facts of a registration for a result's summary."""
+    return {
+        "method": registration.method,
+        "explained": registration.explained,
+        "accepted": registration.accepted,
+        "residual": registration.residual,
+        "ruled_out": registration.ruled_out,
+        "beyond_states": registration.beyond_states,
+        "scene_unit": registration.scene_unit,
+        "unit": "known" if registration.unit_known else "found",
+        "coefficients": registration.z.tolist(),
+        "seconds": registration.seconds,
+    }

@@ -1,0 +1,262 @@
+"""The model registered to a frame: where each point of the object is, and where each of the frame was at rest."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy.typing import ArrayLike
+
+from mereo.deformation.maps import newton
+from mereo.deformation.moving_least_squares import Anchors
+from mereo.fitting.draws.playback import Drawn
+from mereo.fitting.uncertainty.explanation import Explanation
+from mereo.fitting.uncertainty.optimum import Optimum
+from mereo.fitting.uncertainty.uncertainty import Uncertainty
+from mereo.geometry.brief import counted
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.moments import owned_centroids
+from mereo.geometry.solids import Solids, signed_distance_and_direction
+from mereo.geometry.transforms import fit_rigid
+from mereo.scenes.statistical_model import StatisticalModel, following
+
+Method = Literal["rest", "modes", "draws"]
+"""Description of the state that was found: the rest model, unbent; coefficients of the modes; the scene's own draws."""
+
+AT_ONCE = 20_000
+
+BELIEVED = 0.95
+"""Share of a clean frame's points that a fit must explain to be believed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Answer of a registration about points of the frame.
+
+    Attributes:
+        label: 0 for empty space, i + 1 for segment i.
+        distance: to the nearest segment surface, negative inside; input unit.
+        direction: unit vector to that surface.
+        rest: where the point was at rest, scene units; outside, as if it moved along with the nearest segment.
+    """
+
+    label: UInt8[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]
+    direction: Float[np.ndarray, "n 3"]
+    rest: Float[np.ndarray, "n 3"]
+
+    def __repr__(self) -> str:
+        return f"Located({counted(len(self.label), 'point')}, {int((self.label > 0).sum()):,} in a segment)"
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentMotion:
+    """Motion from rest to the frame, for points of one segment. Satisfies ``Deformation``."""
+
+    rest: Anchors
+    moved: Float[np.ndarray, "m 3"]
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Positions in the frame of points at rest."""
+        return self.rest.weights(points)(self.moved)
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A state of the object's own deformation model, in the frame of an observed cloud.
+
+    Attributes:
+        model: the statistical model: rest mesh and material points.
+        material: positions of all material points in the camera frame, input unit.
+        method: which description of the states it was found in.
+        z: coefficients of the modes (at rest those nearest to it), or standard normal draws of the scene.
+        scene_unit: length of a scene unit in the input's.
+        unit_known: whether that was known beforehand; otherwise it was found together with the pose.
+        explained: share of the observed points that lie on the model's facing surface, up to the tolerance.
+        accepted: whether that is enough to believe it.
+        seconds: of the fit alone.
+        residual: root mean square distance of the observed points from the model's facing surface, input unit; None
+            where the registration was read from a file.
+        drawn: the scene's draws where ``method`` is "draws", with their seed: what plays the state again.
+        ruled_out: share of the surface's vertices that the frame rules out, by more than a scene unit: they lie beside
+            all that was seen of the object or in front of it; None where the registration was read from a file.
+        needed: least ``explained`` of a frame of this noise to be believed.
+        optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
+            where the registration was read from a file.
+        radius_scale: factor of the radii by the weights' calibration of such fits; None without one.
+    """
+
+    model: StatisticalModel
+    material: Float[np.ndarray, "m 3"]
+    method: Method
+    z: Float[np.ndarray, " k"]
+    scene_unit: float
+    unit_known: bool
+    explained: float
+    accepted: bool
+    seconds: float
+    drawn: Drawn | None = None
+    residual: float | None = None
+    ruled_out: float | None = None
+    needed: float = BELIEVED
+    optimum: Optimum | None = None
+    radius_scale: float | None = None
+
+    def __repr__(self) -> str:
+        trust = "" if self.accepted else "not believed, "
+        unit = f"a scene unit is {self.scene_unit:.4g}"
+        return f"Registration({self.told}, {trust}{unit}; {self.seconds:.1f} s)"
+
+    @property
+    def told(self) -> str:
+        """Phrase on how well the frame is explained."""
+        return f"registered model ({self.method}) explains {self.explained:.1%} of the observed points"
+
+    @cached_property
+    def modes_z(self) -> Float[np.ndarray, " k"]:
+        """Coefficients of the modes nearest to the state, whatever describes it."""
+        return self.z if self.method != "draws" else self.model.project(self.material / self.scene_unit)[1]
+
+    @property
+    def beyond_states(self) -> float:
+        """How far the state lies outside all that the model has seen (``StatisticalModel.beyond``), scene units."""
+        return self.model.beyond(self.modes_z)
+
+    @cached_property
+    def mesh(self) -> SegmentedMesh:
+        """The segments, with the rest mesh's own faces, in the camera frame and input unit."""
+        return self.model.mesh(self.material)
+
+    @cached_property
+    def solids(self) -> Solids:
+        """Segments in the camera frame, to be asked what is inside and how far."""
+        return Solids(self.mesh)
+
+    @cached_property
+    def rest_solids(self) -> Solids:
+        """Segments at rest, to be asked the same."""
+        return Solids(self.model.rest)
+
+    def to_camera(self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None) -> Float[np.ndarray, "n 3"]:
+        """Positions of points of the rest model in the camera frame.
+
+        Args:
+            points: n x 3, rest pose, scene units.
+            labels: of the segments that they move along with, 1 or more; by default those that hold them or come
+                nearest.
+        """
+        points = rows_of_three(points)
+        labels = nearest_labels(self.rest_solids, points) if labels is None else labels
+        result = np.empty_like(points)
+        for first in range(0, len(points), AT_ONCE):  # the weights of a large mesh would take gigabytes
+            rows = slice(first, first + AT_ONCE)
+            result[rows] = self.model.weights(points[rows], labels[rows])(self.material)
+        return result
+
+    def to_rest(self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None) -> Float[np.ndarray, "n 3"]:
+        """Inverse of ``to_camera``: where n x 3 points of the camera frame are in the rest model, scene units."""
+        points = rows_of_three(points)
+        labels = nearest_labels(self.solids, points) if labels is None else labels
+        guess = following(self._moved_anchors, points, labels)(self.model.rest_points)
+        result = guess.copy()
+        for label in np.unique(labels):
+            rows = np.flatnonzero(labels == label)
+            motion = SegmentMotion(self.model.rest_anchors[label - 1], self.material)
+            found, converged = newton(motion, points[rows], guess[rows])
+            result[rows[converged]] = found[converged]
+        return result
+
+    def query(self, points: ArrayLike) -> Located:
+        """Segment, signed distance, direction and rest position of n x 3 points of the camera frame."""
+        points = rows_of_three(points)
+        labels = self.solids.label(points)
+        distance, direction = signed_distance_and_direction(self.solids, points, labels)
+        nearest = np.where(labels > 0, labels, nearest_labels(self.solids, points)).astype(np.uint8)
+        return Located(labels, distance, direction, self.to_rest(points, nearest))
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty | None:
+        """How far the true places may be from the registered ones; None where the registration was read from a file."""
+        return None if self.optimum is None else Uncertainty(self.optimum, self.model, self.radius_scale)
+
+    def radius95(
+        self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Literal["camera", "rest"]
+    ) -> Float[np.ndarray, " n"] | None:
+        """Radius around each point that holds its true place with probability 0.95, in the input's unit.
+
+        The point is one of the object: that which the registration has at the given place of the camera frame, or
+        that which was at the given place of the rest model. ``uncertainty`` has the radii of all vertices, and says
+        whether they are calibrated. None where the registration was read from a file.
+
+        Args:
+            points: n x 3.
+            labels: of the segments that they move along with, 1 or more; by default those that hold them or come
+                nearest.
+            at: "camera" for points of the camera frame in the input's unit, "rest" for scene units of the rest model.
+        """
+        if self.uncertainty is None:
+            return None
+        points = rows_of_three(points)
+        if labels is None:
+            labels = nearest_labels(self.solids if at == "camera" else self.rest_solids, points)
+        return self.uncertainty.of_rest(self.to_rest(points, labels) if at == "camera" else points, labels)
+
+    def explain(self, what: ArrayLike | str, *, at: Literal["camera", "rest"] = "camera") -> Explanation | None:
+        """What decides where a point of the object is: observed points, the network, or what was known of its states.
+
+        Args:
+            what: x, y, z of a point; or the name of a segment, for its centroid.
+            at: "camera" for a point of the camera frame in the input's unit, "rest" for scene units of the rest model.
+
+        Returns None where the registration was read from a file. Raises ``ValueError`` for a name of no segment and
+        for other than three coordinates.
+        """
+        if self.uncertainty is None:
+            return None
+        if isinstance(what, str):
+            names = self.model.rest.names
+            if what not in names:
+                raise ValueError(f"there is no segment {what!r}; the segments are {', '.join(names)}: name one of them")
+            place = owned_centroids(self.mesh)[names.index(what)]
+            decided = self.uncertainty.decided_centroid(names.index(what))
+        else:
+            point = rows_of_three(np.asarray(what, dtype=np.float64)[None])
+            label = nearest_labels(self.solids if at == "camera" else self.rest_solids, point)
+            rest = self.to_rest(point, label) if at == "camera" else point
+            place = self.to_camera(rest, label)[0]
+            decided = self.uncertainty.decided_point(rest, label)
+        return Explanation.of(place, decided, self.uncertainty.optimum, self._T_here_fit)
+
+    @cached_property
+    def _T_here_fit(self) -> Float[np.ndarray, "4 4"]:
+        """From the camera frame of the fit, in the input's unit, to that in which this registration is."""
+        assert self.optimum is not None
+        return fit_rigid(self.optimum.unit * self.optimum.posterior.material, self.material)
+
+    def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
+        """Registration in another frame."""
+        return replace(self, material=self.material @ T_new_camera[:3, :3].T + T_new_camera[:3, 3])
+
+    @cached_property
+    def _moved_anchors(self) -> tuple[Anchors, ...]:
+        return tuple(Anchors(index, self.material[index]) for index in self.model.anchors)
+
+
+def rows_of_three(points: ArrayLike) -> Float[np.ndarray, "n 3"]:
+    """Points as an array of numbers; raises ``ValueError`` for another shape."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(
+            f"the points have the shape {array.shape}; they must be rows of x, y, z: reshape them to (n, 3)"
+        )
+    return array
+
+
+def nearest_labels(solids: Solids, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    """The segment that holds each point, or else the nearest."""
+    labels = solids.label(points)
+    outside = np.flatnonzero(labels == 0)
+    if len(outside):
+        labels[outside] = solids.nearest(points[outside]).owner + 1
+    return labels

@@ -1,0 +1,213 @@
+"""One frame's fit of the modes, from the state of the frame before.
+
+    Track (state, time), cloud -next_fit-> ModesFit, another Track
+
+Against a fit of a frame by itself: no network, no wide start, no other states. What takes the network's place is the
+expectation that material points are where they were (or where they were going), up to a speed; as hidden ones hardly
+have any other evidence, they come to rest.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mereo.fitting.config import FitConfig
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, in_space
+from mereo.fitting.problem.noise import constants_for
+from mereo.fitting.problem.priors import Prior
+from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.residuals import NetworkTerm
+from mereo.fitting.registration.fit import KNOWN_SCALE_STD, ModesFit
+from mereo.fitting.tracking.config import TrackConfig
+from mereo.geometry.downsampling import means_along_sight
+from mereo.io.cores import one_blas_thread
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """State of an object at a time, from which the next frame is fitted.
+
+    Attributes:
+        problem: of that frame, without correspondences: the model, and constants by the frame's noise.
+        unit: length of a scene unit in the clouds' unit.
+        posed: the state, scene units, without a scale.
+        time_s: of the frame.
+        velocity: of the parameters, in the order of ``gauss_newton``, a second.
+        unsure: how far the velocity may be off because little is known yet, scene units per second.
+        noise: of the frames, smoothed, scene units.
+        clean: constants of frames without noise; ``problem`` has those for ``noise``.
+        radius_scale: as ``ModesFit`` has it.
+    """
+
+    problem: Problem
+    unit: float
+    posed: Posed
+    time_s: float
+    velocity: Float[np.ndarray, " p"]
+    unsure: float
+    noise: float
+    clean: FitConfig
+    radius_scale: float | None = None
+
+    @classmethod
+    def of(
+        cls,
+        fitted: ModesFit,
+        time_s: float,
+        config: TrackConfig,
+        clean: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+    ) -> "Track":
+        """Track that begins with a frame's own fit."""
+        posed, scale = without_scale(fitted.posed)
+        base, model = fitted.problem, fitted.problem.model
+        scale_std = KNOWN_SCALE_STD if base.scale_std == KNOWN_SCALE_STD else config.scale_std
+        problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
+        share_surfaces(base, problem)
+        still, noise = np.zeros(POSE + model.count), fitted.problem.noise_beside(fitted.surface)
+        unit, unsure = fitted.unit * scale, config.first_speed
+        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, fitted.radius_scale)
+
+    def expected(self, time_s: float, config: TrackConfig) -> Posed:
+        """State that is expected at a time."""
+        if config.motion == "pose":
+            return self.posed
+        # James and Stein's estimate of a mean, positive part: small motion may be noise alone, large motion is not
+        counted = max(1.0 - (config.dead / max(self.speed, 1e-9)) ** 2, 0.0)
+        return self.posed.moved(counted * self.velocity * (time_s - self.time_s))
+
+    @cached_property
+    def squared(self) -> Float[np.ndarray, "p p"]:
+        """Mean square of a material point's way, as a form of the parameters' step."""
+        model = self.problem.model
+        rows = model.sparse
+        modes = model.modes[rows]
+        place = self.posed.place(model.mean[rows] + modes @ self.posed.z.astype(np.float32))
+        jacobian = in_space(self.posed, place, modes).astype(np.float64)
+        form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(rows)
+        return form
+
+    @property
+    def speed(self) -> float:
+        """Speed that the object seems to have: root mean square of its points, scene units per second."""
+        return float(np.sqrt(self.velocity @ self.squared @ self.velocity))
+
+
+def without_scale(posed: Posed) -> tuple[Posed, float]:
+    """A state in the unit that its own scale makes of the scene's, and that scale."""
+    scale = float(np.exp(posed.log_scale))
+    return replace(posed, translation=posed.translation / scale, log_scale=0.0), scale
+
+
+def share_surfaces(base: Problem, other: Problem) -> None:
+    """Give a problem of the same model what another has prepared of the model's surface."""
+    vars(other).update({"pairs": base.pairs, "samples": base.samples})
+
+
+def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig) -> Bool[np.ndarray, " n"]:
+    """Which points, in the cloud's unit, lie near the expected surface; others are strays, or the object is lost."""
+    samples = track.problem.samples.every(2)
+    place = samples.posed(track.expected(time_s, config)).place
+    most = config.gate * track.problem.model.half + samples.spacing
+    distance = cKDTree(place).query(points / track.unit, distance_upper_bound=most)[0]
+    return np.isfinite(distance)
+
+
+def next_fit(
+    track: Track,
+    points: Float[np.ndarray, "n 3"],
+    doubtful: Float[np.ndarray, "d 3"],
+    time_s: float,
+    config: TrackConfig,
+) -> tuple[ModesFit, Track]:
+    """Fit of the modes to a frame, and the track that ends with it.
+
+    Args:
+        track: up to the frame before.
+        points: of the object, camera frame, the clouds' unit.
+        doubtful: points that are none of it (``Evidence.of``).
+        time_s: of the frame.
+        config: constants.
+    """
+    started = time.perf_counter()
+    with one_blas_thread():
+        few = means_along_sight(points / track.unit, config.points)
+        problem = replace(track.problem, evidence=Evidence.of(few, doubtful / track.unit, config.partners))
+        share_surfaces(track.problem, problem)
+        start = track.expected(time_s, config)
+        passed = max(time_s - track.time_s, 0.0)
+        posed = descend(problem, start, Expectation.of(track, start, passed, config), config)
+    seconds = time.perf_counter() - started
+    fitted = ModesFit(problem, nothing(), track.unit, posed, seconds, radius_scale=track.radius_scale)
+    return fitted, followed(track, fitted, time_s, config)
+
+
+def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig) -> Track:
+    """Track with a further frame."""
+    posed, scale = without_scale(fitted.posed)
+    passed = max(time_s - track.time_s, 1e-3)
+    velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
+    unsure = track.unsure * (1 - config.smoothing)
+    noise = track.noise + config.smoothing * (fitted.problem.noise_beside(fitted.surface) - track.noise)
+    problem = replace(fitted.problem, config=constants_for(noise, track.clean))
+    share_surfaces(fitted.problem, problem)
+    return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise, track.clean, track.radius_scale)
+
+
+def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:
+    """Step of the parameters from one state to another: ``first.moved(step)`` is ``second``."""
+    turn = Rotation.from_matrix(second.rotation @ first.rotation.T).as_rotvec()
+    scale = [second.log_scale - first.log_scale]
+    return np.concatenate([turn, second.translation - first.translation, scale, second.z - first.z])
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Expectation of where material points are: a Gaussian of the parameters around a state.
+
+    Attributes:
+        state: the expected one.
+        precision: of the step from it.
+    """
+
+    state: Posed
+    precision: Float[np.ndarray, "p p"]
+
+    @classmethod
+    def of(cls, track: Track, state: Posed, passed_s: float, config: TrackConfig) -> "Expectation":
+        """Expectation after a time: each point is where ``state`` has it, up to its speeds times that."""
+        speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
+        # noisy frames weigh less, and a moving object must not lag behind for that
+        coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
+        sigma = coarser * (speed * passed_s + config.least)
+        return cls(state, track.squared * (config.motion_worth / sigma**2))
+
+    def add_to(self, normal: NormalEquations, posed: Posed) -> NormalEquations:
+        """Sum with the squared distance from the expectation."""
+        gradient = self.precision @ between(self.state, posed)
+        return NormalEquations(normal.matrix + self.precision, normal.gradient + gradient)
+
+
+def descend(problem: Problem, start: Posed, expectation: Expectation, config: TrackConfig) -> Posed:
+    """State that explains cloud, silhouette, prior and expectation, from nearby."""
+    constants, half = problem.config, problem.model.half
+    prior = Prior.whole(problem.model)
+    posed, steps = start, config.steps + config.exact_steps
+    for step in range(steps):
+        sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)
+        normal = expectation.add_to(problem.known(posed, prior, 0.0), posed)
+        normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
+        posed = posed.moved(normal.step(constants.damping))
+    return posed
+
+
+def nothing() -> Correspondences:
+    """No correspondences."""
+    none = np.empty((0, 3))
+    return Correspondences(none, none, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))
