@@ -196,3 +196,13 @@ def test_every_column_is_seen_on_a_phone_too(tmp_path: Path, width: int) -> None
         assert "-63.64" in words and "± 0.60" in words and "35.1 (34.3 to 35.9)" in words
         room = page.evaluate("(t => [t.scrollWidth, t.parentElement.clientWidth])(document.getElementById('table'))")
         assert room[0] <= room[1], "the table is wider than its card"
+
+
+def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:
+    """Two digits of the radius, and as many decimals of all: 593 mm ± 0.187 would be neither."""
+    place = np.array([-0.02474, -0.000001, 1.592631])
+    assert Unit(1.0).place(place, 0.000187) == "-24.74 0.00 1,592.63 ± 0.19"
+    assert Unit(1.0).place(place, 0.0403) == "-25 0 1,593 ± 40"
+    assert Unit(None).place(place, 0.0) == "-0.0247 -1e-06 1.59 ± 0", "without an error as without a radius"
+    assert Unit(0.01).volume(648.0, (633.2, 663.1)) == "648 (633 to 663)"
+    assert Unit(None).volume(4.9012, (4.889, 4.9204)) == "4.901 (4.889 to 4.920)"

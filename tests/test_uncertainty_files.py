@@ -238,7 +238,7 @@ def test_the_viewer_colours_it_and_says_it_of_a_place_and_shows_why(
     assert [len(part) for part in colors] == [len(s.vertices) for s in page.mesh.segments] and "mm" in legend
     place = page.mesh.segments[0].vertices[0]
     page.probe(place)
-    assert re.search(r"± [\d.]+ mm \(95 %\)", page.told.content) and not page.why.told.visible
+    assert re.search(r"± [\d.]+ mm \(95\s%\)", page.told.content) and not page.why.told.visible
     page.why.box.value = True
     page.probe(place)
     assert "what leaves it unsure" in page.why.told.content and page.why._points is not None

@@ -215,19 +215,14 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
 
 
 def test_a_place_on_a_surface_is_its_segments(states: StatisticalModel, model: Model) -> None:
-    """Rounding puts about half of such places outside; a click on a segment asks about it all the same."""
-    inspection = Inspection.of_registration(by_modes(states), model, np.eye(4))
-    assert inspection.registration is not None
-    segment = inspection.registration.mesh.segments[0]
-    places = segment.vertices[segment.faces[::7]].mean(axis=1)
-    outside = inspection.registration.query(places).label == 0
-    found = inspection.ask(places)
-    met = np.abs(found.distance) <= ON_SURFACE * np.abs(places).max(axis=1)
-    assert (outside & met).any() and (found.label[outside & met] == 1).all()
-    corners = segment.vertices[segment.faces[::7]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    away = places + 0.01 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    assert (inspection.ask(away).label == 0).any(), "beside it is empty space"
+    """Rounding puts some of them outside; a click on a segment asks about it all the same."""
+    registration = by_modes(states)
+    base = registration.mesh.segments[0]
+    places = base.vertices[base.faces[::7]].mean(axis=1)
+    found = Inspection.of_registration(registration, model, np.eye(4)).ask(np.concatenate([places, 1.01 * places]))
+    met = np.abs(found.distance) <= ON_SURFACE * np.abs(places).max()
+    outside = registration.query(places).label == 0
+    assert (outside & met[: len(places)]).any() and found.label[met].all() and not found.label[~met].all()
 
 
 @needs_browser
