@@ -215,14 +215,16 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
 
 
 def test_a_place_on_a_surface_is_its_segments(states: StatisticalModel, model: Model) -> None:
-    """Rounding puts some of them outside; a click on a segment asks about it all the same."""
     registration = by_modes(states)
-    base = registration.mesh.segments[0]
-    places = base.vertices[base.faces[::7]].mean(axis=1)
+    places = (base := registration.mesh.segments[0]).vertices[base.faces[::7]].mean(axis=1)
     found = Inspection.of_registration(registration, model, np.eye(4)).ask(np.concatenate([places, 1.01 * places]))
     met = np.abs(found.distance) <= ON_SURFACE * np.abs(places).max()
-    outside = registration.query(places).label == 0
-    assert (outside & met[: len(places)]).any() and found.label[met].all() and not found.label[~met].all()
+    # rounding puts some of the places outside, and a click on a segment asks about it all the same
+    assert (
+        ((registration.query(places).label == 0) & met[: len(places)]).any()
+        and found.label[met].all()
+        and not found.label[~met].all()
+    )
 
 
 @needs_browser
@@ -237,7 +239,7 @@ def test_the_page_of_a_state_shows_its_mesh_and_answers(states: StatisticalModel
         until(lambda: pixels_of(browser.screenshot()[:, :420], base) > 150)
         page._move_probe(page.mesh.segments[0].vertices[0])
         until(lambda: "at rest at" in browser.text() and "on the surface" in browser.text())
-        assert not page.coloring.visible, "there is one colouring"
+        assert not page.coloring.visible
     server.stop()
 
 
