@@ -219,7 +219,8 @@ def print_segments(answered: Result) -> None:
     for column in (volume, confidence_title(result.calibrated), "components", centroid):
         table.add_column(column, justify="right")
     for found in result.segments:
-        place = unit.place(found.centroid, radii.get(found.name))
+        # the radius gives the digits; it is in the report, and would break the lines of 80 columns
+        place = unit.place(found.centroid, radii.get(found.name)).partition(" ±")[0]
         row = (unit.volume(found.volume), f"{found.confidence:.2f}", str(found.components), place)
         table.add_row(found.name, *(row if found.voxels else ("0", "not found", "0", "")))
     console = Console(markup=False, emoji=False)
