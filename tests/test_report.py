@@ -4,12 +4,13 @@ import base64
 import json
 import re
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from browser import BROWSER
+from browser import BROWSER, Page, until
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -177,3 +178,31 @@ def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
         assert (cosine > 0.99).sum() > 1000, f"{segment.name} is not to be seen"
     drawn = np.flatnonzero((np.ptp(stage, axis=-1) > 60).any(axis=0))
     assert np.ptp(drawn) > 0.8 * stage.shape[1], "the object does not fill the canvas"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome in PATH")
+@pytest.mark.parametrize("width", [390, 990, 1280])
+def test_every_column_is_seen_on_a_phone_too(tmp_path: Path, width: int) -> None:
+    cloud, mesh, summary = example()
+    sure = {"volume": 3.51e-5, "centroid": [-0.06364, 0.12345, 0.58857], "centroid_radius95": 0.0006}
+    segments = [{**told, **sure, "volume95": [3.43e-5, 3.59e-5]} for told in summary["segments"]]
+    names = [replace(one, name=f"finger_{k}") for k, one in enumerate(mesh.segments)]
+    summary = {**summary, "segments": segments, "radius95": {"median": 1e-4, "max": 1e-3, "calibrated": True}}
+    write_report(tmp_path / "r.html", cloud, SegmentedMesh(tuple(names)), summary, unit=Unit(1.0))
+    with Page(tmp_path, (tmp_path / "r.html").as_uri(), (width, 800)) as page:
+        until(lambda: page.evaluate("document.body.dataset.drawing"))
+        words = page.text().replace("\N{NO-BREAK SPACE}", " ")
+        assert "-63.64" in words and "± 0.60" in words and "35.1 (34.3 to 35.9)" in words
+        room = page.evaluate("(t => [t.scrollWidth, t.parentElement.clientWidth])(document.getElementById('table'))")
+        assert room[0] <= room[1], "the table is wider than its card"
+
+
+def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:
+    """Two digits of the radius, and as many decimals of all: 593 mm ± 0.187 would be neither."""
+    place = np.array([-0.02474, -0.000001, 1.592631])
+    assert Unit(1.0).place(place, 0.000187) == "-24.74 0.00 1,592.63 ± 0.19"
+    assert Unit(1.0).place(place, 0.0403) == "-25 0 1,593 ± 40"
+    assert Unit(None).place(place, 0.0) == "-0.0247 -1e-06 1.59 ± 0", "without an error as without a radius"
+    assert Unit(0.01).volume(648.0, (633.2, 663.1)) == "648 (633 to 663)"
+    assert Unit(None).volume(4.9012, (4.889, 4.9204)) == "4.901 (4.889 to 4.920)"

@@ -178,6 +178,9 @@ def test_weights_health_and_the_page_are_there(tmp_path: Path) -> None:
             page = (await server.client.get("/docs")).text
             assert "depth-range" in page and "POST /v1/{weights}/reconstruct" in page
             assert "http://" not in page and "https://" not in page and "<script" not in page
+            assert "width=device-width" in page and "`" not in page and "<code>error</code>" in page
+            assert "Parts of a form: <code>frame</code>, <code>mask</code> (where there is one)" in page
+            assert page.count("<td>text/plain<td>Always") == 1 and "<td>503<td>application/json<td>Not ready" in page
 
     run(ask())
 

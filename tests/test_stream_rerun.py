@@ -12,7 +12,7 @@ import pytest
 
 from mereo.cli.stream import stream_reconstructions
 from mereo.cli.stream_answers import FrameAnswer
-from mereo.cli.stream_rerun import RerunTarget, messages, series
+from mereo.cli.stream_rerun import CURVES, RerunTarget, messages, series
 from mereo.fitting.registration.recognition import Recognition
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -47,7 +47,8 @@ def answer(*segments: Segment, tracked: bool = True, recognition: Recognition = 
     frame = SensorFrame(Path("a.png"), cloud, 1.0, "camera", image)
     reading = Reading(cloud, np.array([True, True, False, True]))
     mesh, seen = SegmentedMesh(segments), Observation(frame, cloud)
-    return FrameAnswer(mesh, {}, reading, "modes", tracked, 0.75, recognition, {"max": 2.5}, seen, 0.05)
+    radii = {"median": 0.5, "max": 2.5, "calibrated": True}
+    return FrameAnswer(mesh, {}, reading, "modes", tracked, 0.75, recognition, radii, seen, 0.05)
 
 
 def outcome(number: int, result: FrameAnswer | None, error: str = "") -> Outcome[FrameAnswer]:
@@ -134,6 +135,8 @@ def test_numbers_and_sentences_are_those_of_the_answers(rows: Rows) -> None:
     assert [value for _, value in curve("points/dropped_frames")] == [0, 1, 2, 3, 4]
     assert {value for _, value in curve("points/strays")} == {1}
     assert {value for _, value in curve("radius95/max")} == {2.5}
+    shown = {name.split()[0].split("/")[1] for name in rows if name.endswith("Scalars:scalars")}
+    assert shown == set(CURVES), "a curve that no view shows, or a view without one"
     parts = [dict(curve(f"milliseconds/{name}")) for name in ("waiting", "decoding", "answering", "latency")]
     assert sum(part[0.0] for part in parts[:3]) == pytest.approx(parts[3][0.0]) == pytest.approx(100.0)
     assert dict(curve("milliseconds/failing")) == {0.25: pytest.approx(70.0)}

@@ -161,7 +161,7 @@ def test_the_summary_tells_centroids_volumes_and_the_whole(found: Answer, folder
 def test_the_report_says_and_shows_it(found: Answer, folder: Path, cloud: PointCloud) -> None:
     page = (folder / "report.html").read_text(encoding="utf-8")
     data = json.loads(re.search(r"const DATA = (.*);\n", page)[1])  # type: ignore[index]
-    assert data["words"]["heads"][1:3] == ["centre x, y, z, ± 95 % (mm)", "volume and 95 % of it (cm³)"]
+    assert data["words"]["heads"][1:3] == ["centre x, y, z, ± 95 % (mm)", "volume, 95 % range (cm³)"]
     assert "±" in data["words"]["rows"][0][0] and " to " in data["words"]["rows"][0][1]
     assert any("(95 %, not calibrated)" in fact and " mm in the median" in fact for fact in data["words"]["facts"])
     for shown in data["segments"]:
@@ -238,7 +238,7 @@ def test_the_viewer_colours_it_and_says_it_of_a_place_and_shows_why(
     assert [len(part) for part in colors] == [len(s.vertices) for s in page.mesh.segments] and "mm" in legend
     place = page.mesh.segments[0].vertices[0]
     page.probe(place)
-    assert re.search(r"± [\d.]+ mm \(95 %\)", page.told.content) and not page.why.told.visible
+    assert re.search(r"± [\d.]+ mm \(95\s%\)", page.told.content) and not page.why.told.visible
     page.why.box.value = True
     page.probe(place)
     assert "what leaves it unsure" in page.why.told.content and page.why._points is not None

@@ -30,7 +30,7 @@ from mereo.visualization.viewer import display, serve
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, ModeShapes
 from mereo.visualization.viewer.laboratory import Laboratory, QuickRegistrar
-from mereo.visualization.viewer.probe import Inspection
+from mereo.visualization.viewer.probe import ON_SURFACE, Inspection
 
 AWAY = np.array([0.0, 0.0, 150.0])
 needs_browser = pytest.mark.skipif(find_spec("viser") is None or BROWSER is None, reason="no viser or no browser")
@@ -214,6 +214,14 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
     assert sentence in error
 
 
+def test_a_place_on_a_surface_is_its_segments(states: StatisticalModel, model: Model) -> None:
+    base = (registration := by_modes(states)).mesh.segments[0]
+    places = base.vertices[base.faces[::7]].mean(axis=1)  # rounding puts some of them outside
+    found = Inspection.of_registration(registration, model, np.eye(4)).ask(np.concatenate([places, 1.01 * places]))
+    met = np.abs(found.distance) <= ON_SURFACE * np.abs(places).max()
+    assert met.any() and found.label[met].all() and not found.label[~met].all()
+
+
 @needs_browser
 def test_the_page_of_a_state_shows_its_mesh_and_answers(states: StatisticalModel, model: Model, tmp_path: Path) -> None:
     server = display.start_server(0, "mereo")
@@ -226,6 +234,7 @@ def test_the_page_of_a_state_shows_its_mesh_and_answers(states: StatisticalModel
         until(lambda: pixels_of(browser.screenshot()[:, :420], base) > 150)
         page._move_probe(page.mesh.segments[0].vertices[0])
         until(lambda: "at rest at" in browser.text() and "on the surface" in browser.text())
+        assert not page.coloring.visible
     server.stop()
 
 

@@ -42,7 +42,7 @@ def print_sure(registered: Registration | None, unit: Unit) -> None:
     told = registered.uncertainty.summary()
     middle, most = (f"{rounded(told[key] * unit.length_factor)} {unit.length_name}" for key in ("median", "max"))
     level = level_told(registered.uncertainty.calibrated)
-    print(f"true places are within {middle} of its own in the median, within {most} where it is least sure ({level})")
+    print(f"its points are within {middle} of their true places in the median, {most} where it is least sure ({level})")
 
 
 def explain(
@@ -73,7 +73,7 @@ def explain(
         assert found is not None
         named = f"the centre of {wish}" if isinstance(wish, str) else "the object's point"
         level = level_told(registered.uncertainty.calibrated)
-        said = f"{named} is at {unit.place(found.place)} ± {rounded(radius * unit.length_factor)} {unit.length_name}"
+        said = f"{named} is at {unit.place(found.place, radius)} {unit.length_name}"
         told = f"{said} ({level}); what leaves it unsure: {shares_told(found)}"
         lost = len(found.unexplained)
         print(f"{told}; {lost} points are not the model's" if lost else told)

@@ -210,14 +210,18 @@ def print_source(found: Answer) -> None:
 
 def print_segments(answered: Result) -> None:
     """Print a table of the segments, and a line of the stages' seconds."""
-    result, seen = answered.reconstruction, answered.seen
+    result, seen, unit = answered.reconstruction, answered.seen, answered.unit
+    sure = None if answered.registered is None else answered.registered.uncertainty
+    radii = {} if sure is None else {one.name: one.centroid_radius95 for one in sure.segments}
     table = Table(title=f"{seen.frame.source}, {len(seen.cloud)} points", title_justify="left")
     table.add_column("segment")
-    for column in ("volume", confidence_title(result.calibrated), "components", "centroid"):
+    volume, centroid = f"volume ({unit.volume_name})", f"centroid ({unit.length_name})"
+    for column in (volume, confidence_title(result.calibrated), "components", centroid):
         table.add_column(column, justify="right")
     for found in result.segments:
-        place = " ".join(f"{value:.4g}" for value in found.centroid)
-        row = (f"{found.volume:.4g}", f"{found.confidence:.2f}", str(found.components), place)
+        # the radius gives the digits; it is in the report, and would break the lines of 80 columns
+        place = unit.place(found.centroid, radii.get(found.name)).partition(" ±")[0]
+        row = (unit.volume(found.volume), f"{found.confidence:.2f}", str(found.components), place)
         table.add_row(found.name, *(row if found.voxels else ("0", "not found", "0", "")))
     console = Console(markup=False, emoji=False)
     console.print(table)

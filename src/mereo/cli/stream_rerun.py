@@ -38,6 +38,9 @@ REACH_S, FLUSH_S = 2.0, 60.0
 DATED_S = 1e8
 """Seconds, three years, from which on a frame's time is one since 1970, as in ROS recordings, and shown as a date."""
 
+CURVES = ("answer", "milliseconds", "points", "radius95")
+"""Roots of the entities of ``series``: each is a view of its own, as their numbers have other units."""
+
 CLOUD_COLOR, STRAY_COLOR, POINT_PX = (200, 200, 200), (230, 60, 60), 1.5
 
 
@@ -135,7 +138,7 @@ def blueprint() -> Any:
     import_rerun()
     import rerun.blueprint as rrb
 
-    curves = [rrb.TimeSeriesView(origin=origin, name=origin) for origin in ("answer", "milliseconds", "points")]
+    curves = [rrb.TimeSeriesView(origin=origin, name=origin) for origin in CURVES]
     beside = rrb.Vertical(
         rrb.Spatial2DView(origin="camera", name="depth image"),
         rrb.Tabs(*curves, active_tab=0),
@@ -257,8 +260,8 @@ def series(outcome: Outcome[FrameAnswer]) -> dict[str, float]:
             facts["answer/explained"] = found.explained
         if found.recognition is not NOT_ASKED:
             facts["answer/known"] = 0.5 if found.recognition.known == "unsure" else float(found.recognition.known)
-        for name, value in (found.radius95 or {}).items():
-            facts[f"radius95/{name}"] = float(value)
+        if found.radius95 is not None:
+            facts |= {f"radius95/{name}": float(found.radius95[name]) for name in ("median", "max")}
     return facts | {f"milliseconds/{name}": 1e3 * seconds for name, seconds in parts.items()}
 
 

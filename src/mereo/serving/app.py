@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Request, Response
+from fastapi import Path as InPath
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
@@ -78,6 +79,9 @@ ANSWERS: dict[int | str, dict[str, Any]] = {
     503: {"description": "The server is being stopped"},
     504: {"description": "No answer in time"},
 }
+
+ALWAYS: dict[int | str, dict[str, Any]] = {200: {"description": "Always"}}
+TEXT = CONTENT_TYPE_LATEST.partition(";")[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,27 +171,31 @@ def make_app(service: Service) -> Any:
     @app.post(
         "/v1/{weights}/reconstruct", response_class=Response, responses=ANSWERS, openapi_extra={"requestBody": BODY}
     )
-    async def reconstruct(request: Request, weights: str, options: Annotated[FrameOptions, Query()]) -> Response:
+    async def reconstruct(
+        request: Request,
+        weights: Annotated[str, InPath(description="Name of the object's weights, one of /v1/weights")],
+        options: Annotated[FrameOptions, Query()],
+    ) -> Response:
         """All segments of the object in a frame, a depth image or point cloud, in the frame's own axes and unit."""
         return await service.answer(request, weights, options)
 
-    @app.get("/v1/weights")
+    @app.get("/v1/weights", responses=ALWAYS)
     async def weights() -> JSONResponse:
         """What is served: names, segments, and what is known of how far the answers can be trusted."""
         return JSONResponse({"weights": list(service.facts), "formats": list(SUFFIXES)})
 
-    @app.get("/healthz")
+    @app.get("/healthz", responses=ALWAYS)
     async def healthz() -> JSONResponse:
         """Whether the server's process runs."""
         return JSONResponse({"status": "ok"})
 
-    @app.get("/readyz")
+    @app.get("/readyz", responses={200: {"description": "Ready"}, 503: {"description": "Not ready"}})
     async def readyz() -> JSONResponse:
         """Whether frames are taken and there is a process to answer them (503 where not)."""
         ready = service.dispatcher.ready
         return JSONResponse({"status": "ready" if ready else "not ready"}, 200 if ready else 503)
 
-    @app.get("/metrics", response_class=Response)
+    @app.get("/metrics", response_class=Response, responses={200: {"description": "Always", "content": {TEXT: {}}}})
     async def metrics() -> Response:
         """Numbers for Prometheus: requests by code, what waits, batches, seconds of each stage."""
         return Response(service.metrics.text(), media_type=CONTENT_TYPE_LATEST)

@@ -5,11 +5,17 @@ from html import escape
 from typing import Any
 
 STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-h2 { margin-top: 2.5rem; } code, pre { background: #f3f4f6; padding: .1rem .3rem; border-radius: 4px; }
-table { border-collapse: collapse; width: 100%; } td, th { text-align: left; padding: .25rem .75rem .25rem 0;
-border-bottom: 1px solid #ddd; vertical-align: top; }
-@media (prefers-color-scheme: dark) { body { background: #16191f; color: #ddd; } code { background: #2a2f38; } }
+:root { color-scheme: light dark; --ink: #1d2430; --soft: #667085; --line: #e3e6ec; --code: #f1f3f6; --bg: #fff; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e8ebf1; --soft: #98a2b3; --line: #2b323f; --code: #222936; --bg: #12151b; } }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
+  color: var(--ink); background: var(--bg); }
+h2 { margin: 3rem 0 .5rem; font-size: 1.25rem; overflow-wrap: anywhere; }
+code { background: var(--code); padding: .1rem .3rem; border-radius: 4px; }
+table { border-collapse: collapse; width: 100%; margin: 0 0 1.5rem; }
+td, th { text-align: left; padding: .3rem .75rem .3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+th { color: var(--soft); font-weight: 500; } td:first-child { white-space: nowrap; }
+@media (max-width: 560px) { td, th { font-size: .875rem; } td + td { overflow-wrap: anywhere; } }
 """
 
 
@@ -17,8 +23,10 @@ def docs_page(description: Mapping[str, Any]) -> str:
     """HTML of an OpenAPI description: every address with its parameters and answers."""
     info = description["info"]
     parts = [
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{escape(info['title'])}</title>",
-        f"<style>{STYLE}</style><h1>{escape(info['title'])}</h1><p>{escape(info.get('description', ''))}</p>",
+        "<!doctype html><html lang=en><meta charset=utf-8>",
+        '<meta name=viewport content="width=device-width, initial-scale=1">',
+        f"<title>{escape(info['title'])}</title><style>{STYLE}</style>",
+        f"<h1>{escape(info['title'])}</h1><p>{_words(info.get('description', ''))}</p>",
         "<p>For programs: <a href=/openapi.json>openapi.json</a>.</p>",
     ]
     for path, methods in description["paths"].items():
@@ -28,10 +36,14 @@ def docs_page(description: Mapping[str, Any]) -> str:
 
 
 def _operation(method: str, path: str, operation: Mapping[str, Any]) -> Iterator[str]:
-    yield f"<h2><code>{method} {escape(path)}</code></h2><p>{escape(operation.get('description', ''))}</p>"
+    yield f"<h2><code>{method} {escape(path)}</code></h2><p>{_words(operation.get('description', ''))}</p>"
     body = operation.get("requestBody", {}).get("content", {})
     if body:
         yield f"<p>Body: {', '.join(f'<code>{escape(media)}</code>' for media in body)}</p>"
+    form = body.get("multipart/form-data", {}).get("schema", {})
+    if form:
+        parts = [f"<code>{escape(name)}</code>{_needed(name, form)}" for name in form["properties"]]
+        yield f"<p>Parts of a form: {', '.join(parts)}</p>"
     rows = [
         (parameter["name"], _kind(parameter.get("schema", {})), parameter.get("description", ""))
         for parameter in operation.get("parameters", ())
@@ -40,12 +52,23 @@ def _operation(method: str, path: str, operation: Mapping[str, Any]) -> Iterator
         yield _table(("parameter", "value", "meaning"), rows)
     answers = operation.get("responses", {})
     yield _table(
-        ("answer", "", "when"),
+        ("answer", "kind", "when"),
         [
             (code, ", ".join(found.get("content", {})) or "application/json", found.get("description", ""))
             for code, found in answers.items()
         ],
     )
+
+
+def _needed(name: str, form: Mapping[str, Any]) -> str:
+    """What is said behind a part of a form that may be left out."""
+    return "" if name in form.get("required", ()) else " (where there is one)"
+
+
+def _words(text: str) -> str:
+    """Text in HTML, what lies between backticks as code."""
+    parts = escape(text).split("`")
+    return "".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
 
 
 def _kind(schema: Mapping[str, Any]) -> str:
@@ -61,5 +84,5 @@ def _kind(schema: Mapping[str, Any]) -> str:
 
 def _table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     head = "".join(f"<th>{escape(word)}" for word in heads)
-    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}' for cell in row)}" for row in rows)
+    body = "".join(f"<tr>{''.join(f'<td>{_words(cell)}' for cell in row)}" for row in rows)
     return f"<table><tr>{head}{body}</table>"

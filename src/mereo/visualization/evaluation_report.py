@@ -31,7 +31,8 @@ h2 { font-size: 12px; font-weight: 650; margin: 0 0 10px; color: var(--soft); le
 p { margin: 0 0 18px; color: var(--soft); overflow-wrap: anywhere; }
 section { background: var(--card); border: 1px solid var(--line); border-radius: 14px; padding: 16px; margin-bottom: 16px; overflow-x: auto; }
 .pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 16px; }
-.big { display: flex; flex-wrap: wrap; gap: 12px 44px; } .big b { display: block; font-size: 34px; line-height: 1.15; font-weight: 650; }
+section p:last-child { margin-bottom: 0; }
+.big { display: grid; grid-template-columns: repeat(auto-fit, minmax(130px, max-content)); gap: 12px 44px; } .big b { display: block; font-size: 34px; line-height: 1.15; font-weight: 650; }
 .big span, th { color: var(--soft); font-weight: 500; font-size: 13px; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { text-align: right; padding: 5px 10px; white-space: nowrap; } td { border-top: 1px solid var(--line); }
@@ -43,7 +44,9 @@ th:first-child, td:first-child { text-align: left; padding-left: 0; }
 img { width: 100%; border-radius: 8px; background: #fff; display: block; }
 .rel { width: min(100%, 320px); } .rel rect { fill: none; stroke: var(--line); } .rel line { stroke: var(--soft); stroke-dasharray: 5 5; }
 .rel polyline { fill: none; stroke: rgb(var(--accent)); stroke-width: 2; } .rel circle { fill: rgb(var(--accent) / .45); }
+.rel text { fill: var(--soft); font-size: 11px; } .rel .m { text-anchor: middle; } .rel .e { text-anchor: end; }
 footer { color: var(--soft); font-size: 13px; }
+@media (max-width: 560px) { main { padding: 16px 10px 30px; } .bar { width: 56px; } th, td { padding: 5px 6px; } }
 """  # noqa: E501 (lines of CSS)
 
 DASH = "–"
@@ -148,16 +151,27 @@ def _reliability(bins: Sequence[Mapping[str, float]], ece: float | None, calibra
         for b in bins
     )
     svg = (
-        f'<svg class="rel" viewBox="-12 -12 {side + 24} {side + 24}" role="img" '
+        f'<svg class="rel" viewBox="-34 -12 {side + 46} {side + 46}" role="img" '
         f'aria-label="share of right answers over confidence"><rect width="{side}" height="{side}"/>'
         f'<line x1="0" y1="{side}" x2="{side}" y2="0"/>'
-        f'<polyline points="{points}"/>{dots}</svg>'
+        f'<polyline points="{points}"/>{dots}{_axes(side)}</svg>'
     )
     kind = "calibrated" if calibrated else "not calibrated"
     return (
         f"<section><h2>Reliability of the network's probabilities ({kind})</h2><p>Expected calibration error "
-        f"{format_score(ece, DASH)}. Across: confidence in a cell's label, 0 to 1; up: share of these that are right; "
-        f"a point's size: how many cells. On the diagonal it is as often right as it says.</p>{svg}</section>"
+        f"{format_score(ece, DASH)}. A point's size: how many cells. On "
+        f"the diagonal the network is as often right as it says.</p>{svg}</section>"
+    )
+
+
+def _axes(side: int) -> str:
+    """Words along two sides of a square from 0 to 1."""
+    foot, middle = side + 14, side // 2
+    return (
+        f'<text y="{foot}">0</text><text class="e" x="{side}" y="{foot}">1</text>'
+        f'<text class="m" x="{middle}" y="{foot + 14}">confidence in a cell\'s label</text>'
+        f'<text class="e" x="-5" y="{side}">0</text><text class="e" x="-5" y="9">1</text>'
+        f'<text class="m" transform="translate(-18 {middle}) rotate(-90)">share that is right</text>'
     )
 
 

@@ -3,7 +3,7 @@
 ``reconstruction_report`` is about the page's shapes and bytes; here is all of its text that depends on a result.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -83,7 +83,7 @@ def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
 def _heads(summary: Mapping[str, Any], unit: Unit, confidence: str) -> list[str]:
     """Heads of the table; with radii of 95 % its centres and volumes say how sure they are."""
     sure = isinstance(summary.get("radius95"), Mapping)
-    centre, volume = (", ± 95 %", " and 95 % of it") if sure else ("", "")
+    centre, volume = (", ± 95 %", ", 95 % range") if sure else ("", "")
     heads = [f"centre x, y, z{centre} ({unit.length_name})", f"volume{volume} ({unit.volume_name})"]
     return ["segment", *heads, confidence]
 
@@ -137,12 +137,13 @@ def _warnings(summary: Mapping[str, Any]) -> list[str]:
 
 def _row(told: Mapping[str, Any], unit: Unit) -> list[Any]:
     centre, volume = told.get("centroid"), _number(told.get("volume"))
-    place: Sequence[str] = [] if centre is None else unit.place(np.asarray(centre, dtype=float)).split()
     radius, between = _number(told.get("centroid_radius95")), told.get("volume95")
-    off = "" if radius is None else f"{GAP}± {rounded(radius * unit.length_factor)}"
-    span = "" if between is None else f"{GAP}{unit.volume(between[0])} to {unit.volume(between[1])}"
-    words = [GAP.join(place) + off or DASH, DASH if volume is None else unit.volume(volume) + span]
-    return [*words, _number(told.get("confidence"))]
+    words = DASH if centre is None else unit.place(np.asarray(centre, dtype=float), radius)
+    place, sign, off = words.partition(" ± ")
+    # a narrow page breaks these lines at their plain spaces
+    place = GAP.join(place.split()) + (f"{GAP} ±\N{NO-BREAK SPACE}{off}" if sign else "")
+    size = DASH if volume is None else unit.volume(volume, between)
+    return [place, size, _number(told.get("confidence"))]
 
 
 def _number(value: object) -> float | None:

@@ -1,6 +1,8 @@
 """Lengths and volumes for people: in millimetres and cubic centimetres where the unit is known."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import floor, isfinite, log10
 
 import numpy as np
 from jaxtyping import Float
@@ -36,13 +38,22 @@ class Unit:
         """Factor from a volume of the frame to one that is told."""
         return 1.0 if self.metres is None else (100 * self.metres) ** 3
 
-    def place(self, point: Float[np.ndarray, "3"]) -> str:
-        """Coordinates of a point of the frame, without the unit's name."""
-        return " ".join(rounded(float(value)) for value in point * self.length_factor)
+    def place(self, point: Float[np.ndarray, "3"], radius: float | None = None) -> str:
+        """Coordinates of a point of the frame, without the unit's name; with a radius all as exact as that, and it."""
+        told = [float(value) for value in point * self.length_factor]
+        if radius is None:
+            return " ".join(rounded(value) for value in told)
+        *near, off = as_exact_as(radius * self.length_factor, *told, radius * self.length_factor)
+        return f"{' '.join(near)} ± {off}"
 
-    def volume(self, volume: float) -> str:
-        """Volume of the frame, without the unit's name."""
-        return rounded(volume * self.volume_factor)
+    def volume(self, volume: float, between: Sequence[float] | None = None) -> str:
+        """Volume of the frame, without the unit's name; with its bounds all as exact as they are wide, and these."""
+        told = volume * self.volume_factor
+        if between is None:
+            return rounded(told)
+        low, high = (bound * self.volume_factor for bound in between)
+        middle, least, most = as_exact_as(high - low, told, low, high)
+        return f"{middle} ({least} to {most})"
 
 
 UNKNOWN = Unit(None)
@@ -52,3 +63,12 @@ UNKNOWN = Unit(None)
 def rounded(value: float) -> str:
     """Number with three digits, or all before the point: 0.0123, 4.56, 78.9, 12,345."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def as_exact_as(error: float, *values: float) -> list[str]:
+    """Numbers with as many decimals as show two digits of an error: 0.187 makes 24.7 into 24.70, and 3.75 into 24.7."""
+    if not (isfinite(error) and error > 0):
+        return [rounded(value) for value in values]
+    decimals = max(0, 1 - floor(log10(error)))
+    # adding 0.0 makes a zero of a negative zero
+    return [f"{round(value, decimals) + 0.0:,.{decimals}f}" for value in values]

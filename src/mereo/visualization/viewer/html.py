@@ -10,11 +10,9 @@ from mereo.evaluation.metrics import Scores, format_score
 from mereo.geometry.mesh import Color
 from mereo.visualization.units import Unit, rounded
 from mereo.visualization.vertex_colors import ColorScale
-from mereo.visualization.viewer.probe import Probed
+from mereo.visualization.viewer.probe import ON_SURFACE, Probed
 
 SOFT = "opacity:.62"
-NOTHING = 1e-6
-"""Distance, as a share of a place's coordinates, that is none: a click meets the surface up to rounding."""
 
 BOX = "padding:2px 0.9em 6px;font-size:0.82em;line-height:1.5"
 
@@ -93,13 +91,14 @@ def answer(
     said = (
         "distance not trained" if np.isnan(distance) else _length(abs(distance), unit) + f" {side} the nearest surface"
     )
-    if abs(distance) <= NOTHING * float(np.abs(place).max()):
+    if abs(distance) <= ON_SURFACE * float(np.abs(place).max()):
         said = "on the surface"
     toward = "" if np.isnan(direction).any() else f"towards {_vector(direction.tolist())}"
     rest = "" if found.rest is None else f"<br>at rest at {_vector(found.rest[0].tolist())} scene units"
-    where = f"at {unit.place(place)} {unit.length_name}"
-    if found.radius95 is not None:
-        where += f" ± {_length(float(found.radius95[0]), unit)} (95 %)"
+    radius = None if found.radius95 is None else float(found.radius95[0])
+    where = f"at {unit.place(place, radius)} {unit.length_name}" + (
+        "" if radius is None else " (95\N{NO-BREAK SPACE}%)"
+    )
     return (
         f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">{where}</span></div>'
         f'{_likeliest(found, names, colors)}<div style="{BOX}">{escape(said)}<br><span style="{SOFT}">{toward}{rest}'

@@ -9,12 +9,15 @@ from jaxtyping import Float, UInt8
 from mereo.fitting.registration.answer import Answer as FrameAnswer
 from mereo.fitting.registration.recognition import Recognition, recognize
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.registration.registration import Registration
+from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
 from mereo.models.model import Answer, EncodedCloud, Model
+
+ON_SURFACE = 1e-6
+"""Distance, as a share of a place's coordinates, that is none: a click meets the surface up to rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +121,12 @@ class Inspection:
         if self.registration is not None:
             seen = transform_points(self.T_camera_input, points)
             found = self.registration.query(seen)
+            # a click on a segment asks about it, whichever side rounding has put the place on
+            on_it = (found.label == 0) & (np.abs(found.distance) <= ON_SURFACE * np.abs(points).max(axis=1))
+            label = np.where(on_it, nearest_labels(self.registration.solids, seen), found.label).astype(np.uint8)
             chances = None if told is None else told.probability
             radius = self.registration.radius95(seen, at="camera")
-            return Probed(found.label, found.distance, self._turned(found.direction), chances, found.rest, radius)
+            return Probed(label, found.distance, self._turned(found.direction), chances, found.rest, radius)
         told = self.network(points) if told is None else told
         return Probed(told.label, told.distance, told.direction, told.probability, None)
 
