@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from mereo.evaluation.sample_views import load_view
+from mereo.experiments.speed.roofline import count_operations
 from mereo.models.config import Precision
 from mereo.models.model import CPU_QUERY_CHUNK
 from mereo.models.threads import in_threads
@@ -65,6 +66,14 @@ def test_the_first_error_is_raised_and_the_next_call_works() -> None:
     with pytest.raises(ValueError, match="piece 3"):
         in_threads(work, range(50))
     assert in_threads(work, range(3)) == [0, 1, 2]
+
+
+@pytest.mark.usefixtures("threads")
+def test_operations_are_counted_whoever_does_them() -> None:
+    ones = torch.ones(10, 20)
+    torch.set_num_threads(2)
+    assert count_operations(lambda: in_threads(lambda _: ones @ ones.T, range(3))) == 3 * 2 * 10 * 20 * 10
+    assert torch.get_num_threads() == 2
 
 
 FORKED = """

@@ -77,6 +77,11 @@ def _median(work: Callable[[], object], device: torch.device, repeats: int = 15)
 
 def count_operations(work: Callable[[], object]) -> int:
     """Number of floating-point operations in the matrix products that ``work`` asks torch for."""
-    with FlopCounterMode(display=False, custom_mapping=ONEDNN) as counter:
-        work()
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the counter sees what its own thread asks for
+    try:
+        with FlopCounterMode(display=False, custom_mapping=ONEDNN) as counter:
+            work()
+    finally:
+        torch.set_num_threads(threads)
     return counter.get_total_flops()
