@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from toy_scene import Shear, toy_scene
 
-from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
+from mereo.evaluation.calibration_views import (
+    CalibrationView,
+    clean_views,
+    frames_beyond,
+    other_objects,
+    own_views,
+    strange_frames,
+)
 from mereo.evaluation.recognition_gauge import RecognitionGauge, usual_of
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem.correspondences import CLIPPED
@@ -209,6 +216,14 @@ def test_views_are_clean_and_noisy_in_turn_and_the_same_every_time() -> None:
     assert [view.scene_unit for view in views] == [1.0] * 4 + [None]
     again = next(own_views(SCENE, 1, 710_000))
     np.testing.assert_array_equal(views[0].seen.points, again.seen.points)
+
+
+def test_further_views_are_clean_and_others_than_those_before_them() -> None:
+    before = next(own_views(SCENE, 1, 710_000))
+    again, further = clean_views(SCENE, 2, 710_000, first=0)
+    assert [(view.camera, view.scene_unit) for view in (again, further)] == [("paper", 1.0)] * 2
+    np.testing.assert_array_equal(before.seen.points, again.seen.points)
+    assert not np.array_equal(before.mesh.bounds, further.mesh.bounds)
 
 
 def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.MonkeyPatch) -> None:
