@@ -25,6 +25,9 @@ SPACING = 0.6
 SHELL = 3.0
 """Nodes up to this many spacings outside the body have shares of their own."""
 
+KEPT = 5000
+"""Points up to which shares are kept: of a grid's they would take hundreds of megabytes, and no two grids are alike."""
+
 TAIL = 0.005
 STEPS = 3
 """Implicit steps of diffusion: with three the kernel is nearly a normal distribution."""
@@ -155,7 +158,8 @@ class PosedBody:
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Images of points, shaped and posed."""
-        shares, turned = _shares(np.ascontiguousarray(points, dtype=np.float64).tobytes())
+        known = _kept_shares(np.asarray(points, dtype=np.float64).tobytes()) if len(points) <= KEPT else _shares(points)
+        shares, turned = known
         moved = self._shaped(points, shares)
         heads, angles = self.heads(), np.linalg.norm(self.rotations, axis=1)
         # Rodrigues' formula for a fixed axis is two products with these and their squares
@@ -183,11 +187,16 @@ class PosedBody:
         return (points + growth) * self._scale()
 
 
-@lru_cache(maxsize=16)
-def _shares(points: bytes) -> tuple[Float[np.ndarray, "n j"], tuple[Int[np.ndarray, " _"], ...]]:
-    """Joints' shares in points, and which of them each joint turns; kept, as every state is asked for the same."""
-    shares = read_only(share_field()(np.frombuffer(points).reshape(-1, 3)))
+def _shares(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n j"], tuple[Int[np.ndarray, " _"], ...]]:
+    """Joints' shares in points, and which of them each joint turns."""
+    shares = read_only(share_field()(points))
     return shares, tuple(np.flatnonzero(column > 1e-9) for column in shares.T)
+
+
+@lru_cache(maxsize=16)
+def _kept_shares(points: bytes) -> tuple[Float[np.ndarray, "n j"], tuple[Int[np.ndarray, " _"], ...]]:
+    """The same of few points, kept: a fit asks every state for the same ones."""
+    return _shares(np.frombuffer(points).reshape(-1, 3))
 
 
 @cache
