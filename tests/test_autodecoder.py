@@ -193,7 +193,8 @@ def test_gradient_reaches_every_parameter(data: Dataset) -> None:
     prediction, coarse = network(data.cloud, data.viewpoint, data.positions, index)
     sum(output.square().sum() for output in (*prediction, coarse) if output is not None).backward()
     for name, parameter in network.named_parameters():
-        assert parameter.grad is not None and parameter.grad.abs().max() > 1e-7, name
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().max() > 1e-7 or name.endswith("score.bias"), name  # a softmax takes nothing of it
     assert (network.encoder.codes.grad.abs().amax(dim=1) > 1e-7).all()
 
 

@@ -147,13 +147,17 @@ def test_its_levels_are_prefixes_of_the_cloud() -> None:
 
 
 def test_gradient_reaches_every_parameter() -> None:
-    """With two points or more in the last block: one alone has nothing to weigh."""
+    """With two points or more in the last block: one alone has nothing to weigh.
+
+    But for the bias of scores, of which a softmax takes nothing: its gradient is rounding, of any size.
+    """
     torch.manual_seed(0)
     network = Network(TINY.changed(points=512, width=24, local_neighbors=3, local_width=8), segments=3).train()
     prediction, coarse = network(cloud_of(512, batch=4), torch.tensor([[0.0, 0.0, -8.0]] * 4), torch.randn(4, 30, 3))
     sum(output.square().sum() for output in (*prediction, coarse) if output is not None).backward()
     for name, parameter in network.named_parameters():
-        assert parameter.grad is not None and parameter.grad.abs().max() > 1e-7, name
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().max() > 1e-7 or name.endswith("score.bias"), name
 
 
 def test_paper_sizes() -> None:

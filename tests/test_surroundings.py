@@ -183,13 +183,13 @@ def test_examples_can_be_made_again_and_their_queries_are_exact(name: str) -> No
 
 
 def test_the_paper_makes_the_examples_it_always_made() -> None:
-    """Values from before there were other sensors."""
+    """Values from before there were other sensors, within the single precision of rays: 4e-7 of an image's sum."""
     config = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
     example, view = (make(SCENE, config, example_rng(3, 5)) for make in (synthesize, sample_view))
-    assert view.depth.valid.sum() == 243 and view.depth.depth.sum() == pytest.approx(31193.81641960286, rel=1e-12)
-    assert example.normalizer.scale == pytest.approx(0.04896887255792319, rel=1e-12)
-    assert np.allclose(example.cloud[1], [-0.9883676, -0.23809237, 0.19280505], atol=1e-8)
-    assert np.allclose(example.queries.positions[0], [-0.70238803, 0.09261255, 0.62152631], atol=1e-8)
+    assert view.depth.valid.sum() == 243 and view.depth.depth.sum() == pytest.approx(31193.8164, rel=1e-6)
+    assert example.normalizer.scale == pytest.approx(0.0489688726, rel=1e-6)
+    assert np.allclose(example.cloud[1], [-0.9883676, -0.23809237, 0.19280505], atol=1e-5)
+    assert np.allclose(example.queries.positions[0], [-0.70238803, 0.09261255, 0.62152631], atol=1e-5)
 
 
 def test_every_view_shows_enough_of_the_object() -> None:

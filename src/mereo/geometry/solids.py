@@ -141,9 +141,10 @@ class Solids:
     def label(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
         """Labels of points: 0 in empty space, else index + 1; of overlapping segments the first (so a nested one).
 
-        Rays are cast in single precision, so nearer to a surface than a ten-millionth of its segment's longest side (at
-        most 2e-6 units in the built-in scenes) the label may be that of the other side. Beyond that it is right where
-        no surface folds over itself. Beside such a fold, a pocket of winding number -1, both rays may meet the
+        Rays are cast in single precision, so nearer to a surface than two millionths of its segment's longest side the
+        label may be that of the other side, on some processors and not on others (0.4 millionths were the most with
+        AVX-512 and AVX2, 1.6 with SSE; most wrong labels lie within 0.1). Beyond that it is right where no surface
+        folds over itself. Beside such a fold, a pocket of winding number -1, both rays may meet the
         pocket's wall from behind, and a point outside then counts as inside. Of the built-in scenes the cranium of the
         skull has folds: they mislead six in 10,000 of the outside points drawn within 0.1 units of its surface, none of
         them further from it than 0.05.
