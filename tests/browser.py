@@ -87,7 +87,8 @@ def until(condition: Callable[[], Any], timeout_s: float = 120.0) -> Any:
     """Wait for something to be true and return it; fails after ``timeout_s``, which a busy machine may need."""
     end = time.monotonic() + timeout_s
     while not (found := condition()):
-        assert time.monotonic() < end, f"it did not happen within {timeout_s:g} s"
+        if time.monotonic() > end:
+            raise TimeoutError(f"it did not happen within {timeout_s:g} s")
         time.sleep(0.2)
     return found
 

@@ -5,7 +5,6 @@ import hashlib
 import http.server
 import re
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -134,32 +133,30 @@ def test_wrong_or_missing_download_leaves_nothing(
     assert not [path for path in empty_cache.rglob("*") if path.is_file()]
 
 
-def test_no_network_is_one_sentence_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_network_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     asset = register(monkeypatch, "http://127.0.0.1:9/toy.off")  # the discard port: refused
-    start = time.monotonic()
     with pytest.raises(
         AssetUnavailable, match="cannot be reached: put the file from .* and set MEREO_ASSETS"
     ) as caught:
         assets.get(asset.name)
-    assert time.monotonic() - start < 2
     assert "\n" not in str(caught.value)
 
 
-def test_silent_network_is_given_up_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_network_is_given_up_while_it_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     """A look-up that hangs has no time limit of its own, so the limit must hold without its help."""
     asset = register(monkeypatch, "http://127.0.0.1:9/toy.off")
-    release = threading.Event()
+    release, ended = threading.Event(), threading.Event()
 
     def hang(*_: object, **__: object) -> None:
-        release.wait(30)
+        release.wait(60)
+        ended.set()
         raise ConnectionError
 
     monkeypatch.setattr(assets, "ANSWER_SECONDS", 0.2)
     monkeypatch.setattr(pooch.HTTPDownloader, "__call__", hang)
-    start = time.monotonic()
     with pytest.raises(AssetUnavailable, match="cannot be reached"):
         assets.get(asset.name)
-    assert time.monotonic() - start < 2
+    assert not ended.is_set()
     release.set()
 
 

@@ -1,6 +1,7 @@
 """What an earlier mereo wrote is still good: datasets, interrupted runs, weights (how: ``before/README.md``).
 
-Values are compared within the precision of what computes them: other processors add in another order. Public names and the command line only, so that the tests outlive any move of modules.
+Values are compared within the precision of what computes them: other processors add in another order. Public names and
+the command line only, so that the tests outlive any move of modules.
 """
 
 import json

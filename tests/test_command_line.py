@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import get_args
@@ -37,12 +36,6 @@ def assert_one_line_error(result: subprocess.CompletedProcess[str], *parts: str)
     assert all(part in result.stderr for part in parts), result.stderr
 
 
-def processor_time_of_children() -> float:
-    """Seconds, of the processes that have ended: unlike the clock's, the same on a busy machine."""
-    times = os.times()
-    return times.children_user + times.children_system
-
-
 def raising(error: BaseException) -> SimpleNamespace:
     """A command whose work raises ``error``."""
 
@@ -55,29 +48,28 @@ def raising(error: BaseException) -> SimpleNamespace:
 # --- help and version -------------------------------------------------------------------------------------------------
 
 
-def test_help_is_instant_and_names_every_command() -> None:
-    seconds = []
-    for _ in range(3):
-        start = processor_time_of_children()
-        result = mereo("--help")
-        seconds.append(processor_time_of_children() - start)
+def test_help_names_every_command() -> None:
+    result = mereo("--help")
     assert result.returncode == 0
     names = ("demo", "doctor", "scene", "assets", "generate", "train", "evaluate", "reconstruct", "align")
     assert all(f"• {name} " in result.stdout for name in names)
-    assert min(seconds) < 0.5
 
 
 @pytest.mark.parametrize("command", ["", "generate", "train", "evaluate", "reconstruct", "scene", "assets"])
-def test_help_loads_no_heavy_library(command: str) -> None:
+def test_help_loads_no_heavy_library_and_few_modules(command: str) -> None:
+    """So that it comes at once: what it takes is the time of its imports, 270 to 340 modules where torch has 2,000."""
     code = (
         "import sys, mereo.__main__ as m\n"
         "try: m.main(sys.argv[1:])\n"
         "except SystemExit as end: assert not end.code\n"
-        "print(sorted({'torch', 'numpy', 'scipy', 'trimesh', 'matplotlib'} & set(sys.modules)))"
+        "heavy = {'torch', 'numpy', 'scipy', 'trimesh', 'matplotlib', 'rich'}\n"
+        "print(sorted(heavy & set(sys.modules)), len(sys.modules))"
     )
     arguments = [*command.split(), "--help"]
     result = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
-    assert result.stdout.splitlines()[-1] == "[]", result.stderr
+    heavy, _, modules = result.stdout.splitlines()[-1].rpartition(" ")
+    assert heavy == "[]", result.stderr
+    assert int(modules) < 450
 
 
 def test_no_argument_shows_the_help() -> None:
@@ -167,11 +159,9 @@ def test_library_errors_are_one_line() -> None:
     assert_one_line_error(mereo("scene", "check", "cube"), "'cube' is unknown", ", ".join(SCENES))
 
 
-def test_missing_network_is_one_line_at_once(tmp_path: Path) -> None:
-    start = time.perf_counter()
+def test_missing_network_is_one_line(tmp_path: Path) -> None:
     result = mereo("assets", "get", "bunny/bunny.off", MEREO_ASSETS="", XDG_CACHE_HOME=str(tmp_path), **WITHOUT_NETWORK)
     assert_one_line_error(result, "bunny/bunny.off is not here", "set MEREO_ASSETS")
-    assert time.perf_counter() - start < 8
 
 
 @pytest.mark.parametrize(

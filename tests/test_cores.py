@@ -3,8 +3,8 @@
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -34,8 +34,10 @@ def test_free_cores_are_idle_ones_and_those_that_this_process_uses(
     monkeypatch.setattr(os, "sysconf", lambda _: 100, raising=False)
     (tmp_path / "stat").write_text(counts)
     assert FreeCores().idle_s == 11.5
-    before = FreeCores(time.monotonic() - 2.0, time.process_time() - 0.5, 10.0)
-    assert before.now() == pytest.approx(1.0, abs=0.1)
+    monkeypatch.setattr(cores, "time", SimpleNamespace(monotonic=lambda: 9.0, process_time=lambda: 3.5))
+    monkeypatch.setattr(cores.time, "sleep", lambda _: None, raising=False)
+    before = FreeCores(7.0, 3.0, 10.0)
+    assert before.now() == 1.0
     monkeypatch.setattr(cores, "STATISTICS", tmp_path / "none")
     monkeypatch.setattr(os, "getloadavg", lambda: (1.5, 0.0, 0.0), raising=False)
     assert FreeCores().now() == cores.cores() - 1.5

@@ -1,8 +1,11 @@
 """Room for one item between two threads: what is newest is taken, and both sides can leave."""
 
 import threading
-import time
+from types import SimpleNamespace
 
+import pytest
+
+from mereo.reconstruction import latest_slot
 from mereo.reconstruction.latest_slot import LatestSlot
 
 
@@ -18,18 +21,21 @@ def test_the_newest_item_is_taken_once_and_counts_those_it_replaced() -> None:
     assert taken is not None and (taken.item, taken.replaced) == (4, 0)
 
 
-def test_a_patient_item_waits_its_turn_and_arrives_then() -> None:
+def test_a_patient_item_waits_its_turn_and_arrives_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1.0]
+    monkeypatch.setattr(latest_slot, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     slot = LatestSlot[str]()
     slot.put("first")
     thread = threading.Thread(target=lambda: slot.put("second", wait=True))
     thread.start()
-    time.sleep(0.05)
-    now = time.perf_counter()
+    thread.join(0.05)
+    assert thread.is_alive(), "it waits"
+    now[0] = 2.0
     first, second = slot.take(), slot.take(10)
     thread.join(10)
     assert first is not None and second is not None
     assert (first.item, second.item, second.replaced) == ("first", "second", 0)
-    assert first.arrived_s < now <= second.arrived_s
+    assert (first.arrived_s, second.arrived_s) == (1.0, 2.0)
 
 
 def test_what_waits_is_still_taken_after_the_end() -> None:

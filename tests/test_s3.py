@@ -147,7 +147,7 @@ def test_a_put_that_breaks_off_leaves_what_was_there(folder: ObjectPath, endpoin
         ({}, "dataset check s3://bucket/nothing", "s3://bucket/nothing has no manifest.json; a dataset is"),
     ],
 )
-def test_what_goes_wrong_is_one_sentence_soon_and_without_credentials(
+def test_what_goes_wrong_is_one_sentence_without_credentials(
     folder: ObjectPath,
     change: dict[str, str | None],
     text: str,
@@ -160,9 +160,7 @@ def test_what_goes_wrong_is_one_sentence_soon_and_without_credentials(
     for name, value in change.items():
         monkeypatch.delenv(name) if value is None else monkeypatch.setenv(name, value)
     s3fs.S3FileSystem.clear_instance_cache()
-    begun = time.monotonic()
     assert main(text.split()) == 2
-    assert time.monotonic() - begun < 30  # 1 s; a busy machine is no fault
     said = capsys.readouterr()
     assert said.err.startswith("mereo: error: s3://") and sentence in said.err and said.err.count("\n") == 1
     assert "testing-" not in said.err + said.out

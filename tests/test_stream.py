@@ -5,11 +5,13 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mereo.geometry.camera import PointCloud
+from mereo.reconstruction import stream as stream_module
 from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, stream
 
 
@@ -148,11 +150,14 @@ def test_a_broken_sequence_is_raised_after_its_frames() -> None:
     assert found == [0]
 
 
-def test_frames_keep_their_recorded_pace() -> None:
-    start = time.perf_counter()
-    outcomes = list(stream((frame(i, 7.0 + 0.1 * i) for i in range(4)), number_of, recorded_pace=True))
-    assert time.perf_counter() - start >= 0.29
-    assert outcomes[-1].result == 3
+def test_frames_keep_their_recorded_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a time that passes by waiting alone."""
+    now = [100.0]
+    waiting = SimpleNamespace(perf_counter=lambda: now[0], sleep=lambda seconds: now.append(now.pop() + seconds))
+    monkeypatch.setattr(stream_module, "time", waiting)
+    frames = (frame(i, 7.0 + 0.1 * i) for i in range(4))
+    outcomes = list(stream(frames, number_of, recorded_pace=True, every_frame=True))
+    assert now == pytest.approx([100.3]) and [outcome.result for outcome in outcomes] == [0, 1, 2, 3]
 
 
 def test_leaving_early_ends_a_thread_for_which_nothing_comes() -> None:

@@ -3,7 +3,6 @@
 import json
 import struct
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -159,13 +158,11 @@ def test_a_push_wants_a_login_and_a_card(
 
 
 @pytest.mark.parametrize("arguments", [("push", "rope", "lab/rope"), ("pull", "lab/rope")])
-def test_no_network_is_one_sentence_at_once(
+def test_no_network_is_one_sentence(
     arguments: tuple[str, ...], hub: ModelHub, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")  # the discard port: refused
-    start = time.monotonic()
     assert "http://127.0.0.1:9 cannot be reached (ConnectError): check" in refused(capsys, *arguments)
-    assert time.monotonic() - start < 3
 
 
 def test_without_the_extra_one_sentence_names_it(
