@@ -19,9 +19,9 @@ def reads_clock(node: ast.AST, clocks: set[str]) -> bool:
     for part in ast.walk(node):
         if isinstance(part, ast.Name) and part.id in clocks:
             return True
-        if isinstance(part, ast.Attribute) and isinstance(part.value, ast.Name) and part.value.id in MODULES:
-            if part.attr.removesuffix("_ns") in CLOCKS:
-                return True
+        clock = isinstance(part, ast.Attribute) and part.attr.removesuffix("_ns") in CLOCKS
+        if clock and isinstance(part.value, ast.Name) and part.value.id in MODULES:
+            return True
     return False
 
 
