@@ -113,7 +113,7 @@ def test_a_frame_of_nothing_is_refused(folder: Path, capsys: pytest.CaptureFixtu
 def test_without_a_registration_nothing_is_written(
     folder: Path, view: SampleView, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    np.save(folder / "stretched.npy", view.depth.to_points().points * np.array([1.0, 1.6, 1.0]))
+    np.save(folder / "stretched.npy", view.depth.to_points().points * np.array([1.0, 2.5, 1.0]))
     assert run(folder, *carrying(folder, "grasp.csv"), cloud="stretched.npy", output="none") != 0
     assert "the network's answer is kept, but --carry needs a registration" in capsys.readouterr().err
     assert not (folder / "none").exists()

@@ -37,6 +37,9 @@ from mereo.scenes.farther_states import FartherDraws, with_farther_states
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
 
 SCENE = toy_scene()
 
@@ -245,7 +248,8 @@ def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.Monkey
 @pytest.mark.slow
 def test_shipped_weights_tell_their_object_from_another_and_from_a_wrong_unit() -> None:
     rope = load_model("rope")
-    own, other = (load_view(name).depth.to_points() for name in ("rope", "robot"))
+    own = load_view("rope").depth.to_points()
+    other = sample_view(load_scene("robot"), GenerateConfig(), example_rng(5, 0)).depth.to_points()
     registrar = Registrar.of(rope, "modes")
     assert answer(own, rope, registrar, 24, stated_unit=1.0).recognition.known is True
     found = answer(other, rope, "auto", 24)

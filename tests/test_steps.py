@@ -68,5 +68,5 @@ def test_the_lines_of_the_readme_run_as_printed(tmp_path: Path, monkeypatch: pyt
     assert names["result"].taken and names["here"].shape == (1, 3)
     np.testing.assert_allclose(names["result"].registration.to_rest(names["here"]), [[0, 1, 2]], atol=0.01)
     assert sorted(path.name for path in (tmp_path / "result").glob("[!.]*")) == [
-        *("labels.npz", "preview.png", "report.html", "segments.glb", "state.json", "summary.json")
+        *("labels.npz", "preview.png", "radius95.glb", "report.html", "segments.glb", "state.json", "summary.json")
     ]

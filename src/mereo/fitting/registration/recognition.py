@@ -39,6 +39,9 @@ LEAST: Mapping[SignName, float] = {
 SIZE = Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.5)
 """Usual logarithm of how far sizes are off, of all weights: by 3 %, and by 15 % at most where the unit is right."""
 
+WRONG_UNIT = float(np.log(2.0))
+"""Logarithm of a size from which on the frame's unit, or its object, is another one, however wide other signs vary."""
+
 WIDE = 0.5
 """Standard deviations of logarithms for weights that were not calibrated: those of single objects are smaller."""
 
@@ -196,10 +199,11 @@ def recognize(
     signs = Signs.of(registration, displaced, stated_unit)
     each = signs.strange(limits.noisy if is_noisy(registration) else limits.clean)
     total = strangeness(each)
-    if total <= limits.unsure:
+    is_unit_wrong = signs.size is not None and signs.size > WRONG_UNIT
+    if total <= limits.unsure and not is_unit_wrong:
         return Recognition(True, None, total, signs, own is not None)
-    known: Known = False if total >= limits.refused else "unsure"
-    reason = REASONS[max(each, key=lambda name: each[name])](registration, signs)
+    known: Known = False if total >= limits.refused or is_unit_wrong else "unsure"
+    reason = REASONS["size" if is_unit_wrong else max(each, key=lambda name: each[name])](registration, signs)
     return Recognition(known, reason, total, signs, own is not None)
 
 
