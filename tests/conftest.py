@@ -4,6 +4,7 @@ Files that are not in the repository are found, or the test that needs them is s
 """
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,10 @@ from jaxtyping import install_import_hook
 
 # before torch is loaded: the tests' products are small, and others may hold the second core
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# a shell lets what it runs in the background ignore it, and whatever that starts: tests interrupt what they start
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # before the first import of mereo: from here on a wrong shape or dtype is an error
 install_import_hook("mereo", "type_checker.check")

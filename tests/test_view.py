@@ -146,16 +146,19 @@ def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -
     command = [sys.executable, "-m", "mereo", "view", "--scene", "robot", "--port", "0"]
     variables = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=variables) as process:
-        assert process.stdout and process.stderr
-        line = process.stdout.readline()
-        address = re.search(r"open (http://127\.0\.0\.1:\d+) in a browser", line)
-        assert address, line
-        with urllib.request.urlopen(address[1], timeout=60) as answer:
-            assert b"<html" in answer.read()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 0
-        assert process.stdout.read() == "closed\n"
-        assert process.stderr.read() == ""
+        try:
+            assert process.stdout and process.stderr
+            line = process.stdout.readline()
+            address = re.search(r"open (http://127\.0\.0\.1:\d+) in a browser", line)
+            assert address, line
+            with urllib.request.urlopen(address[1], timeout=60) as answer:
+                assert b"<html" in answer.read()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=60) == 0
+            assert process.stdout.read() == "closed\n"
+            assert process.stderr.read() == ""
+        finally:
+            process.kill()
 
 
 @pytest.mark.parametrize(
