@@ -99,6 +99,15 @@ def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def without_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a frame that is not explained be so at once: turning the camera, which may help, is most of a fit's time.
+
+    For tests whose subject is what comes of such a frame; ``test_turned_camera.py`` is about the turns.
+    """
+    monkeypatch.setattr("mereo.fitting.registration.fit.with_turns", lambda start, ask: start)
+
+
+@pytest.fixture
 def server() -> Iterator[object]:
     """A viewer's server on a free port, without pages."""
     from mereo.visualization.viewer import display

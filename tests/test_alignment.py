@@ -113,6 +113,7 @@ def test_loss_without_rest_coordinates_is_zero() -> None:
     assert loss.item() == 0 and predicted.grad is not None and torch.isfinite(predicted.grad).all()
 
 
+@pytest.mark.slow
 def test_aligner_learns_a_turned_object() -> None:
     """An asymmetric cloud in random orientations: after a few steps, most of the turn is found."""
     torch.manual_seed(0)

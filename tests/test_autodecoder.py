@@ -281,6 +281,7 @@ def test_reconstruct_and_evaluate(dataset: Path, model: Model) -> None:
     assert 0 < found.segments[1].volume < 0.5 * found.segments[0].volume
 
 
+@pytest.mark.slow
 def test_distances_alone_give_one_object_and_no_miou(dataset: Path, tmp_path: Path) -> None:
     """The paper's "DeepSDF with L1"."""
     config = replace(SMALL, loss="l1", epochs=100, holdout=1)

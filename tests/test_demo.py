@@ -30,6 +30,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> list[EncodedCloud]:
     return encoded
 
 
+@pytest.mark.slow
 def test_weights_with_a_statistical_model_show_the_fit_and_write_it(
     rope: Model,
     shown: list[EncodedCloud],

@@ -29,7 +29,7 @@ ASSETS = {
 OPTIONS = {"loop.py": ("--fps", "1"), "shipped_weights.py": ("--weights", "rope", "--cells", "24")}
 """What keeps an example short."""
 
-LONG = ("isolate_object.py", "loop.py", "shipped_weights.py")
+LONG = ("isolate_object.py", "loop.py", "reconstruct_cloud.py", "shipped_weights.py", "simulate_liver.py")
 """Those that take longer; what they call has tests of its own."""
 
 EXTRAS = {"simulate_liver.py": "mujoco"}

@@ -69,7 +69,8 @@ def export(case: str, place: Path, kind: str) -> tuple[Model, Path]:
     return load_model(weights), place / "out"
 
 
-@pytest.mark.parametrize("case", ["plain", pytest.param("everything", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["plain", "everything"])
 def test_a_reloaded_torch_program_answers_as_the_network(tmp_path: Path, case: str) -> None:
     model, folder = export(case, tmp_path, "torch")
     assert sorted(path.name for path in folder.glob("[!.]*")) == ["encoder.pt2", "model.json", "query.pt2"]

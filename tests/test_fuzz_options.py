@@ -81,7 +81,7 @@ def read_only(arguments: list[str]) -> int:
     return 0
 
 
-@pytest.mark.parametrize("examples", [8, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [4, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_odd_values_of_options_are_refused(
     command: str,

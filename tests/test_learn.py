@@ -179,7 +179,7 @@ def test_the_command_names_the_scene_where_it_is_not_built_in() -> None:
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
+def small(monkeypatch: pytest.MonkeyPatch, without_turns: None) -> None:
     """So little of everything that a run takes seconds."""
     for module, name, value in (
         (check_states, "STATES", 3),

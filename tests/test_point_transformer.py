@@ -216,6 +216,7 @@ def half_balls(center: np.ndarray, radius: float) -> SegmentedMesh:
     return SegmentedMesh(tuple(parts))
 
 
+@pytest.mark.slow
 def test_it_learns_and_goes_the_whole_path(dataset: Path, tmp_path: Path) -> None:
     """Train, evaluate, reconstruct: the two halves of a ball, from its front."""
     config = replace(CONFIG, epochs=24, augment=AugmentConfig())

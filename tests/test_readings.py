@@ -59,6 +59,7 @@ def frame(model: Model, registrar: Registrar, points: np.ndarray, **options: boo
     return fitted_frame(PointCloud(points), model, registrar, scene_unit=1.0, **options)
 
 
+@pytest.mark.usefixtures("without_turns")
 def test_strays_are_left_out_and_all_else_is_kept(model: Model, registrar: Registrar, points: np.ndarray) -> None:
     clean, found = frame(model, registrar, points), frame(model, registrar, with_rim(points))
     assert clean.reading.dropped == 0 and clean.seen is clean.unaided
@@ -118,6 +119,7 @@ def noisy(points: np.ndarray, std: float) -> np.ndarray:
     return points + noise * points / np.linalg.norm(points, axis=1)[:, None]
 
 
+@pytest.mark.slow
 def test_a_noisy_frame_is_fitted_by_its_own_noise(model: Model, registrar: Registrar, points: np.ndarray) -> None:
     """Seen in the constants, in what is believed, and in any unit."""
     clean, found = frame(model, registrar, points).modes, frame(model, registrar, noisy(points, 0.4)).modes

@@ -93,6 +93,7 @@ def test_weights_without_states_say_what_to_do() -> None:
         statistical_model_of(other)
 
 
+@pytest.mark.slow
 def test_the_command_says_which_answer_it_is(model: Model, view: SampleView, few_states: None, tmp_path: Path) -> None:
     save_model(model, tmp_path / "rope.safetensors")
     np.save(tmp_path / "cloud.npy", view.depth.to_points().points)
@@ -178,6 +179,7 @@ def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> N
     assert registrar_for(model, "off") is None and registrar_for(model, "auto") is not None
 
 
+@pytest.mark.usefixtures("without_turns")
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
     stretched = view.depth.to_points().points * np.array([1.0, 2.5, 1.0])
     without_scene = replace(model, provenance={"scene": "mine"})

@@ -78,6 +78,7 @@ def oracle(folder: Path, shift_mm: float) -> Scores:
     return evaluation.scores
 
 
+@pytest.mark.slow
 def test_evaluate_takes_the_truth(bar: tuple[Path, Scene, np.ndarray]) -> None:
     """The truth scores one, and less when it is moved by a tenth of the bar's length."""
     exact = oracle(bar[0], 0.0)

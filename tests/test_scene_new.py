@@ -56,6 +56,7 @@ def test_every_example_in_the_comments_is_valid(tmp_path: Path) -> None:
     scene.sample_state(np.random.default_rng(0)).mesh.check()
 
 
+@pytest.mark.slow
 def test_a_model_and_a_label_volume(tmp_path: Path) -> None:
     model = trimesh.Scene()
     for name, low in (("Body", 0.0), ("Lid #2", 1.0)):

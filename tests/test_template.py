@@ -107,6 +107,7 @@ def test_autocast_does_not_touch_rest_coordinates() -> None:
     assert torch.equal(rest, placed)
 
 
+@pytest.mark.slow
 def test_an_older_dataset_gets_its_template_on_resume(tmp_path: Path) -> None:
     scene, settings = toy_scene(), GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
     for resume in (False, True):

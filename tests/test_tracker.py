@@ -237,6 +237,7 @@ def test_the_speed_of_a_track_is_that_of_its_points(registrar: Registrar, scene:
     assert replace(track, velocity=shift).speed == pytest.approx(3.0, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_frames_that_become_noisier_are_met_with_their_own_constants(
     registrar: Registrar, scene: Scene, here: SegmentedMesh
 ) -> None:

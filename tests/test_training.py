@@ -218,6 +218,7 @@ def test_a_dataset_without_template_is_refused(dataset: Path, tmp_path: Path) ->
     trainer.train(old, tmp_path / "run", plain)
 
 
+@pytest.mark.slow
 def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:
     """Under torchrun, both halves of every batch count: the result is finite, complete, and resumable."""
     run = train_in_two_processes(dataset, tmp_path, "test_training", "replace(SMALL, epochs=0.5)")

@@ -72,6 +72,7 @@ def test_a_frame_that_is_explained_is_asked_about_once(model: StatisticalModel) 
     assert network.asked == 0
 
 
+@pytest.mark.slow
 def test_no_better_answer_leaves_the_fit_as_it_is(model: StatisticalModel) -> None:
     """Another object in the frame: what is stated of it turned is nonsense, and never taken."""
     points, material = shown(model, 0.5)

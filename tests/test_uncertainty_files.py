@@ -182,6 +182,7 @@ def test_results_of_the_network_say_nothing_of_it(found: Answer, cloud: PointClo
     assert '"sure": null' in page and "±" not in page.split("</script>")[0].split("const DATA")[1].split("\n")[0]
 
 
+@pytest.mark.usefixtures("without_turns")
 def test_points_that_the_model_does_not_explain_are_red(model: Model, cloud: PointCloud) -> None:
     """A lump beside the object, taken for it."""
     lump = cloud.points[:40] - [0.0, 0.0, 3.0 * load_unit(model, cloud)]

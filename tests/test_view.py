@@ -108,6 +108,7 @@ def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object)
         display.start_server(port, "mereo")
 
 
+@pytest.mark.slow
 @needs_viser
 def test_pages_that_were_closed_leave_nothing_behind(server: object, monkeypatch: pytest.MonkeyPatch) -> None:
     from viser import __version__ as version

@@ -123,6 +123,7 @@ def test_weights_without_a_model_are_asked_alone_and_it_is_said(model: Model, se
     assert found.rest is None and found.probability is not None
 
 
+@pytest.mark.usefixtures("without_turns")
 def test_an_answer_that_is_not_taken_says_why(model: Model, seen: PointCloud, registrar: Registrar) -> None:
     stretched = PointCloud(seen.points * [1.0, 2.5, 1.0])
     inspection = inspected(stretched, model, registrar)

@@ -37,7 +37,8 @@ def test_a_tiny_network_finds_the_rope(tmp_path: Path) -> None:
     np.save(tmp_path / "cloud.npy", view.depth.to_points().points)
     mereo("reconstruct", tmp_path / "cloud.npy", "--weights", weights, "--resolution", 64, "--output", result)
     assert {path.name for path in result.glob("[!.]*")} == {
-        "segments.glb", "labels.npz", "summary.json", "state.json", "preview.png", "report.html"
+        "config.json", "segments.glb", "labels.npz", "summary.json", "state.json", "preview.png", "radius95.glb",
+        "report.html"
     }  # fmt: skip
     nodes = trimesh.load(result / "segments.glb").graph.nodes_geometry
     assert "base" in nodes

@@ -88,7 +88,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", ["release over another", "scene export"])
+@pytest.mark.parametrize("name", [pytest.param("release over another", marks=pytest.mark.slow), "scene export"])
 def test_a_killed_command_is_finished_by_the_next(name: str, commands: Commands, inputs: Path, tmp_path: Path) -> None:
     check_boundaries(commands, CASES[name], inputs, tmp_path, every_call=False)
 
@@ -140,7 +140,7 @@ def check_full_disk(commands: Commands, case: Case, inputs: Path, place: Path, r
     assert not list(place.rglob("*.partial"))
 
 
-@pytest.mark.parametrize("name", ["release over another", "scene export"])
+@pytest.mark.parametrize("name", [pytest.param("release over another", marks=pytest.mark.slow), "scene export"])
 def test_a_full_disk_is_said_and_leaves_nothing(name: str, commands: Commands, inputs: Path, small_disk: Path) -> None:
     check_full_disk(commands, CASES[name], inputs, small_disk, room=40_000)
 
