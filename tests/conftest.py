@@ -6,6 +6,7 @@ Files that are not in the repository are found, or the test that needs them is s
 import os
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -105,6 +106,16 @@ def without_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     For tests whose subject is what comes of such a frame; ``test_turned_camera.py`` is about the turns.
     """
     monkeypatch.setattr("mereo.fitting.registration.fit.with_turns", lambda start, ask: start)
+
+
+@pytest.fixture
+def small_previews(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let results have small previews: six large ones take half a second to draw."""
+    from mereo.visualization import result_files
+
+    monkeypatch.setattr(
+        result_files, "render_cloud_and_segments", partial(result_files.render_cloud_and_segments, size=40)
+    )
 
 
 @pytest.fixture

@@ -19,6 +19,8 @@ from mereo.models.model import Model
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
 
+pytestmark = pytest.mark.usefixtures("small_previews")
+
 
 @pytest.fixture(scope="module")
 def weights(rope: Model) -> Model:

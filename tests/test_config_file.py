@@ -14,6 +14,8 @@ from mereo.cli.config_file import options_of
 from mereo.synthesis.config import SENSORS
 from mereo.training.config import PRESETS
 
+pytestmark = pytest.mark.usefixtures("small_previews")
+
 LINES = {
     "generate": "generate rope --examples 7 --output out --seed 3 --sensor time-of-flight --sensor.hand 0.5 "
     "--points 512 --sampler nested-sort-sample --observations all",

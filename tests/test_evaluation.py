@@ -26,6 +26,8 @@ from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 from mereo.visualization.result_files import evaluate_weights
 
+pytestmark = pytest.mark.usefixtures("small_previews")
+
 NAMES = ("left", "right")
 
 

@@ -31,6 +31,8 @@ from mereo.visualization.units import Unit
 from mereo.visualization.viewer import result_page, serve
 from mereo.visualization.viewer.open_page import OpenPage
 
+pytestmark = pytest.mark.usefixtures("small_previews")
+
 NAMES = ("big", "<small>", "absent")
 CENTERS = ((0.02, -0.03, 0.6), (0.02, 0.0605, 0.6))
 RADII = (0.06, 0.03)

@@ -14,6 +14,8 @@ from mereo.io.config import InputConfig
 from mereo.io.output_folders import MARKER
 from mereo.models.config import InferenceConfig
 
+pytestmark = pytest.mark.usefixtures("small_previews")
+
 
 @pytest.fixture
 def loads(monkeypatch: pytest.MonkeyPatch) -> list[str]:

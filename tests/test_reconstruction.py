@@ -26,6 +26,8 @@ from mereo.reconstruction.observation import SizeWarning
 from mereo.reconstruction.pipeline import Reconstruction, reconstruct
 from mereo.visualization.result_files import summarize, write_reconstruction
 
+pytestmark = pytest.mark.usefixtures("small_previews")
+
 NAMES = ("big", "small", "absent")
 BIG, SMALL = ((0.02, -0.03, 0.6), 0.06), ((0.02, 0.0605, 0.6), 0.03)
 

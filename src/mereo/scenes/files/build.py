@@ -6,8 +6,10 @@ Document -validated-> SceneFile -read_segments-> SegmentedMesh in the file's uni
 import hashlib
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -88,12 +90,46 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     else:
         blocks = file.deformations
         if blocks is None:
-            blocks = list(default_deformations(mesh))
+            blocks = list(_default_deformations(_Keyed(_content(mesh), mesh)))
             definition += str([block.model_dump() for block in blocks])
         motions = _random_motion(document, placement, rest, blocks)
-        rest = refined(rest, motions)
+        key = f"{_content(rest)} {placement.matrix.tolist()} {[block.model_dump() for block in blocks]}"
+        rest = _refined(_Keyed(key, (rest, motions)))
         scene = Scene(file.name, rest, replace(motions, rest=rest), workspace, file.source)
     return replace(scene, unit_m=unit_m, T_scene_source=placement.matrix, definition=definition)
+
+
+# --- what takes most of the time of loading a scene, which one command does several times ----------------------------
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class _Keyed(Generic[Value]):
+    """A value that is equal to another one of the same key."""
+
+    key: str
+    value: Value = field(compare=False)
+
+
+@lru_cache(maxsize=4)
+def _default_deformations(mesh: _Keyed[SegmentedMesh]) -> tuple[AnyDeformation, ...]:
+    return default_deformations(mesh.value)
+
+
+@lru_cache(maxsize=4)
+def _refined(scene: _Keyed[tuple[SegmentedMesh, RandomMotion]]) -> SegmentedMesh:
+    return refined(*scene.value)
+
+
+def _content(mesh: SegmentedMesh) -> str:
+    """Key of a mesh's exact content."""
+    digest = hashlib.sha256(repr(mesh.nested).encode())
+    for segment in mesh.segments:
+        digest.update(repr((segment.name, segment.color, segment.solid, segment.vertices.shape)).encode())
+        digest.update(np.ascontiguousarray(segment.vertices).tobytes())
+        digest.update(np.ascontiguousarray(segment.faces).tobytes())
+    return digest.hexdigest()
 
 
 def _recorded(
