@@ -42,6 +42,15 @@ def find_asset(name: str) -> Path:
         pytest.skip(str(error))
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Iterator[None]:
+    """Skip a test whose scene needs a mesh that neither mirror nor network has."""
+    try:
+        return (yield)
+    except assets.AssetUnavailable as error:
+        pytest.skip(str(error))
+
+
 @pytest.fixture(scope="session")
 def require_asset() -> Callable[[str], Path]:
     """``require_asset("bunny/bunny.off")`` is the file's path, or the test is skipped."""
