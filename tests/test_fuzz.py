@@ -1,7 +1,7 @@
 """Every reader, with damaged files: each is taken, or refused with one sentence (``fuzz_rule``).
 
-The fast tests try a few inputs of each kind in this process. The slow ones spend ``MEREO_FUZZ_MINUTES`` (30) on as many
-as they allow, in processes of their own, so that a crash of a library is a finding and not the end.
+The fast tests try a few inputs of each kind in this process. The nightly ones spend ``MEREO_FUZZ_MINUTES`` (30) on as
+many as they allow, in processes of their own, so that a crash of a library is a finding and not the end.
 """
 
 import json
@@ -154,7 +154,7 @@ PARTS = 4
 """Processes, one after the other: each takes seconds to begin, and a crash of a library ends one."""
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("part", range(PARTS))
 def test_many_damaged_files(part: int, tmp_path: Path) -> None:
     names = list(TARGETS)[part::PARTS]
