@@ -138,6 +138,16 @@ def test_calibrated_weights_have_their_own_limits(registration: Registration) ->
     assert recognize(odd, Calibration(seed=1, views=8, recognizing=strict)).known is False
 
 
+@pytest.mark.parametrize("unit, known", [(0.45, False), (0.55, True), (1.9, True), (2.2, False)])
+def test_a_size_off_by_a_factor_of_two_is_never_the_objects(
+    registration: Registration, unit: float, known: bool
+) -> None:
+    """Not even by weights whose other signs vary so much that their limits are wide."""
+    wide = Calibration(seed=1, views=8, recognizing=CONSERVATIVE.model_copy(update={"unsure": 90.0, "refused": 99.0}))
+    said = recognize(registration, wide, stated_unit=unit)
+    assert said.known is known and (known or "its size differs by a factor of" in str(said.reason))
+
+
 def test_signs_add_up() -> None:
     """Two signs of three standard deviations are stranger than one, by the root of two; what is usual adds none."""
     usual = {name: Usual(mean=0.0, std=1.0) for name in ("unusual", "displaced", "beyond")}

@@ -15,6 +15,7 @@ from mereo.deformation.maps import jacobian_determinant
 from mereo.deformation.samplers import RandomMotion
 from mereo.deformation.warps import Bend, FreeFormLattice
 from mereo.geometry.mesh import PALETTE
+from mereo.scenes.files import build
 from mereo.scenes.files.deformation_blocks import AnyDeformation
 from mereo.scenes.files.schema import SceneFile
 from mereo.scenes.motion import motion
@@ -54,6 +55,21 @@ def test_without_deformations_it_bends_as_much_as_the_default_should(tmp_path: P
     assert maps[0] is maps[1]
     assert motion(scene.rest, scene.sample_deformations).mean == pytest.approx(0.05, rel=0.1)
     assert scene.definition != load_scene(write_bar(tmp_path, "deformations: [{type: lattice}]\n")).definition
+
+
+def test_a_scene_that_is_loaded_again_is_not_refined_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its content: not by its path, and other deformations are another scene."""
+    refined, calls = build.refined, []
+    monkeypatch.setattr(build, "refined", lambda *scene: (calls.append(1), refined(*scene))[1])
+    build._refined.cache_clear()
+    scenes = []
+    for folder, text in (("a", ""), ("b", ""), ("c", "deformations:\n  - {type: squash, factor: [0.5, 2.0]}\n")):
+        (tmp_path / folder).mkdir()
+        scenes.append(load_scene(write_bar(tmp_path / folder, text)))
+    assert len(calls) == 2
+    meshes = [scene.rest.merged()[0] for scene in scenes]
+    np.testing.assert_array_equal(meshes[0], meshes[1])
+    assert meshes[2].shape != meshes[0].shape
 
 
 def test_every_deformation_keeps_space_from_folding(tmp_path: Path) -> None:
