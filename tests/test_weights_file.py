@@ -99,6 +99,7 @@ def test_the_command_line_says_so_and_writes_nothing(tmp_path: Path, capsys: pyt
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_names_that_look_like_markup_are_printed_as_they_are(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
