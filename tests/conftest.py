@@ -16,7 +16,7 @@ from jaxtyping import install_import_hook
 # before torch is loaded: the tests' products are small, and others may hold the second core
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# a shell lets what it runs in the background ignore it, and whatever that starts: tests interrupt what they start
+# a shell makes background processes ignore interrupts, and their children inherit that; tests interrupt children
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -110,16 +110,16 @@ def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def without_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a frame that is not explained be so at once: turning the camera, which may help, is most of a fit's time.
+    """Skip the search over turned cameras, which takes most of the time of a frame that no fit explains.
 
-    For tests whose subject is what comes of such a frame; ``test_turned_camera.py`` is about the turns.
+    For tests of what happens to such a frame afterwards; ``test_turned_camera.py`` tests the search.
     """
     monkeypatch.setattr("mereo.fitting.registration.fit.with_turns", lambda start, ask: start)
 
 
 @pytest.fixture
 def small_previews(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let results have small previews: six large ones take half a second to draw."""
+    """Draw small previews: the six large ones of a result take half a second."""
     from mereo.visualization import result_files
 
     monkeypatch.setattr(

@@ -45,7 +45,7 @@ def test_example_runs(name: str, tmp_path: Path, require_asset: Callable[[str], 
     for asset in ASSETS.get(name, ()):
         require_asset(asset)
     if name in EXTRAS:
-        pytest.importorskip(EXTRAS[name], reason=f"{name} needs {EXTRAS[name]}")
+        pytest.importorskip(EXTRAS[name], reason=f"{EXTRAS[name]} is not installed: pip install 'mereo[simulation]'")
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / name), *OPTIONS.get(name, ())],
         cwd=tmp_path,

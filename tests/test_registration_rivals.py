@@ -41,7 +41,7 @@ def nearby() -> np.ndarray:
 
 
 def test_icp_finds_a_rigid_motion(model: StatisticalModel) -> None:
-    pytest.importorskip("small_gicp", reason="small_gicp is not installed")
+    pytest.importorskip("small_gicp", reason="small_gicp is not installed: pip install 'mereo[align]'")
     truth = transform_points(POSE, model.rest_points)
     frame = started(model, model.rest_points, truth[surface_points(model)], nearby())
     assert off(frame.posed, truth) > 0.3
@@ -49,7 +49,7 @@ def test_icp_finds_a_rigid_motion(model: StatisticalModel) -> None:
 
 
 def test_rigid_cpd_without_scale_finds_a_rigid_motion(model: StatisticalModel) -> None:
-    pytest.importorskip("rustcpd", reason="rustcpd is not installed")
+    pytest.importorskip("rustcpd", reason="rustcpd is not installed: pip install rustcpd")
     frame = started(model, model.rest_points, np.empty((0, 3)), nearby())
     truth = transform_points(POSE, model.rest_points)
     frame = replace(frame, cloud=truth[frame.source(500, False)])
@@ -58,7 +58,7 @@ def test_rigid_cpd_without_scale_finds_a_rigid_motion(model: StatisticalModel) -
 
 
 def test_atlas_cpd_finds_a_state_of_the_model(model: StatisticalModel) -> None:
-    pytest.importorskip("rustcpd", reason="rustcpd is not installed")
+    pytest.importorskip("rustcpd", reason="rustcpd is not installed: pip install rustcpd")
     frame = started(model, model.mean, np.empty((0, 3)), POSE)
     z = np.random.default_rng(0).normal(size=model.count)
     truth = transform_points(POSE, model.material(z))
@@ -70,8 +70,8 @@ def test_atlas_cpd_finds_a_state_of_the_model(model: StatisticalModel) -> None:
 
 def test_all_points_follow_deformable_cpd_as_its_own_do(model: StatisticalModel) -> None:
     """Ours at the source points is what the library answers, and the other library answers the same everywhere."""
-    pycpd = pytest.importorskip("pycpd", reason="pycpd is not installed")
-    pytest.importorskip("rustcpd", reason="rustcpd is not installed")
+    pycpd = pytest.importorskip("pycpd", reason="pycpd is not installed: pip install pycpd")
+    pytest.importorskip("rustcpd", reason="rustcpd is not installed: pip install rustcpd")
     cloud = transform_points(POSE, model.material(np.ones(model.count)))[::7]
     frame = started(model, model.rest_points, cloud, POSE)
     chosen = frame.source(200, False)

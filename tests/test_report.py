@@ -156,7 +156,9 @@ def browse(page: str, tmp_path: Path, *options: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome in PATH")
+@pytest.mark.skipif(
+    BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
+)
 @pytest.mark.parametrize("mode", ["", "#2d"])
 def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
     cloud, mesh, summary = example()
@@ -181,7 +183,9 @@ def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome in PATH")
+@pytest.mark.skipif(
+    BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
+)
 @pytest.mark.parametrize("width", [390, 990, 1280])
 def test_every_column_is_seen_on_a_phone_too(tmp_path: Path, width: int) -> None:
     cloud, mesh, summary = example()

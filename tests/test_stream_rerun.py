@@ -26,6 +26,8 @@ from mereo.synthesis.config import SENSORS
 from mereo.synthesis.recording import CAMERA, FRAMES, write_recording
 from mereo.synthesis.sequence_config import SequenceConfig
 
+RERUN = "rerun-sdk is not installed: pip install 'mereo[rerun]'"
+
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
 CAMERA_3X2 = Camera(3, 2, 4.0, 5.0, 1.5, 1.0)
@@ -60,7 +62,7 @@ Rows = dict[str, list[tuple[float, Any]]]
 
 
 def read_rows(path: Path) -> Rows:
-    chunk = pytest.importorskip("rerun.chunk")
+    chunk = pytest.importorskip("rerun.chunk", reason=RERUN)
     found: Rows = {}
     for one in chunk.RrdReader(path).stream().to_chunks():
         table = one.to_record_batch()
@@ -77,7 +79,7 @@ def read_rows(path: Path) -> Rows:
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> Rows:
     """Five frames: one of two segments, one in which a segment is gone, a bad one, and two more."""
-    pytest.importorskip("rerun")
+    pytest.importorskip("rerun", reason=RERUN)
     path = tmp_path_factory.mktemp("log") / "stream.rrd"
     both = answer(tetrahedron("left ear"), tetrahedron("a/b", 2.0), tracked=False)
     with RerunTarget(str(path)).opened("frames", "camera") as log:
@@ -156,7 +158,7 @@ def test_without_a_model_nothing_is_said_of_the_network() -> None:
 
 
 def test_a_scanners_frames_and_dates_are_shown_as_such(tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
+    pytest.importorskip("rerun", reason=RERUN)
     late = Outcome("0", 1.7e9, answer(tetrahedron("a")), "", 0.1, 0.1, 0)
     with RerunTarget(str(tmp_path / "a.rrd")).opened("frames", "scanner") as log:
         log.add(late)
@@ -176,7 +178,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_stream_is_recorded_as_it_is_printed(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("rerun")
+    pytest.importorskip("rerun", reason=RERUN)
     path = tmp_path / "walk.rrd"
     summary = stream_reconstructions(str(walk), "engine", every_frame=True, rerun=str(path))
     lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
@@ -201,7 +203,7 @@ def test_a_stream_is_recorded_as_it_is_printed(walk: Path, tmp_path: Path, capsy
 
 
 def test_where_nothing_is_answered_nothing_is_recorded(walk: Path, tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
+    pytest.importorskip("rerun", reason=RERUN)
     for name in ("a", "b"):
         (tmp_path / f"{name}.ply").write_bytes(b"no cloud")
     with pytest.raises(ValueError, match="none of the 2 frames could be answered"):
@@ -216,7 +218,7 @@ def refusal(error: type[Exception], act: Callable[[], object]) -> str:
 
 
 def test_what_is_no_destination_is_refused_in_one_sentence(tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
+    pytest.importorskip("rerun", reason=RERUN)
     there = tmp_path / "there.rrd"
     there.write_bytes(b"mine")
     assert refusal(ValueError, lambda: RerunTarget("walk.mp4")) == (

@@ -29,7 +29,9 @@ from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.probe import Inspection, Probed
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
-needs_browser = pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome in PATH")
+needs_browser = pytest.mark.skipif(
+    BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
+)
 
 
 class Told(Inspection):

@@ -22,8 +22,8 @@ TEMPLATE_REACH = 1.25
 """The grid covers rest coordinates from -1.25 to 1.25: whatever is farther out is far outside."""
 
 ROUNDED_TO = 7.3e-7
-"""Share of the longest side to which a mesh is recognized; of no simple fraction, as those that designs are made of
-would lie between two steps."""
+"""Vertices are rounded to this share of the longest side before they are hashed. It is no simple fraction, or the round
+numbers of a design would lie halfway between two steps."""
 
 
 def rest_frame(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "3"], float]:

@@ -40,7 +40,7 @@ SIZE = Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.5)
 """Usual logarithm of how far sizes are off, of all weights: by 3 %, and by 15 % at most where the unit is right."""
 
 WRONG_UNIT = float(np.log(2.0))
-"""Logarithm of a size from which on the frame's unit, or its object, is another one, however wide other signs vary."""
+"""Logarithm of the ratio of sizes above which the frame's unit, or its object, is another one: a factor of two."""
 
 WIDE = 0.5
 """Standard deviations of logarithms for weights that were not calibrated: those of single objects are smaller."""
