@@ -33,9 +33,7 @@ from mereo.visualization.viewer.laboratory import Laboratory, QuickRegistrar
 from mereo.visualization.viewer.probe import ON_SURFACE, Inspection
 
 AWAY = np.array([0.0, 0.0, 150.0])
-needs_browser = pytest.mark.skipif(
-    find_spec("viser") is None or BROWSER is None, reason="viser (extra `view`) or Chromium is not installed"
-)
+needs_browser = pytest.mark.skipif(find_spec("viser") is None or BROWSER is None, reason="no viser or no Chromium")
 
 
 @pytest.fixture(scope="module")
