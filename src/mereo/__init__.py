@@ -12,9 +12,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mereo.evaluation.sample_views import load_frame as load_frame
-    from mereo.fitting.registration.register import Registrar as Registrar
-    from mereo.fitting.tracking.tracker import Tracker as Tracker
+    from mereo.api.frames import load_frame as load_frame
+    from mereo.api.objects import Object as Object
+    from mereo.api.objects import load_object as load_object
+    from mereo.api.reconstruct import reconstruct as reconstruct
+    from mereo.api.result import Result as Result
+    from mereo.api.steps import evaluate as evaluate
+    from mereo.api.steps import export as export
+    from mereo.api.steps import generate as generate
+    from mereo.api.steps import learn as learn
+    from mereo.api.steps import train as train
+    from mereo.api.tracker import Tracker as Tracker
     from mereo.geometry.camera import Camera as Camera
     from mereo.geometry.camera import DepthImage as DepthImage
     from mereo.geometry.camera import PointCloud as PointCloud
@@ -24,23 +32,14 @@ if TYPE_CHECKING:
     from mereo.io.intrinsics import read_camera as read_camera
     from mereo.io.readers import read_depth_image as read_depth_image
     from mereo.io.readers import read_point_cloud as read_point_cloud
-    from mereo.learning.steps import evaluate as evaluate
-    from mereo.learning.steps import export as export
-    from mereo.learning.steps import generate as generate
-    from mereo.learning.steps import learn as learn
-    from mereo.learning.steps import train as train
     from mereo.models.config import InferenceConfig as InferenceConfig
     from mereo.models.model import Model as Model
     from mereo.models.weights import load_model as load_model
     from mereo.reconstruction.config import IsolationConfig as IsolationConfig
-    from mereo.reconstruction.pipeline import reconstruct as reconstruct
     from mereo.scenes.registry import load_scene as load_scene
     from mereo.synthesis.config import GenerateConfig as GenerateConfig
     from mereo.synthesis.examples import synthesize as synthesize
     from mereo.training.config import TrainConfig as TrainConfig
-    from mereo.visualization.answering import answer as answer
-    from mereo.visualization.result import Result as Result
-    from mereo.visualization.result_files import write_reconstruction as write_reconstruction
     from mereo.visualization.viewer.serve import view as view
 
 # Here and not where torch is used, because this runs before every import of torch that mereo makes. A thread that spins
@@ -56,28 +55,27 @@ _HOME = {
     "IsolationConfig": "reconstruction.config",
     "Model": "models.model",
     "PointCloud": "geometry.camera",
-    "Registrar": "fitting.registration.register",
-    "Result": "visualization.result",
+    "Object": "api.objects",
+    "Result": "api.result",
     "Segment": "geometry.mesh",
     "SegmentedMesh": "geometry.mesh",
-    "Tracker": "fitting.tracking.tracker",
+    "Tracker": "api.tracker",
     "TrainConfig": "training.config",
-    "answer": "visualization.answering",
-    "evaluate": "learning.steps",
-    "export": "learning.steps",
-    "generate": "learning.steps",
-    "learn": "learning.steps",
-    "load_frame": "evaluation.sample_views",
+    "evaluate": "api.steps",
+    "export": "api.steps",
+    "generate": "api.steps",
+    "learn": "api.steps",
+    "load_frame": "api.frames",
     "load_model": "models.weights",
+    "load_object": "api.objects",
     "load_scene": "scenes.registry",
     "read_camera": "io.intrinsics",
     "read_depth_image": "io.readers",
     "read_point_cloud": "io.readers",
-    "reconstruct": "reconstruction.pipeline",
+    "reconstruct": "api.reconstruct",
     "synthesize": "synthesis.examples",
-    "train": "learning.steps",
+    "train": "api.steps",
     "view": "visualization.viewer.serve",
-    "write_reconstruction": "visualization.result_files",
 }
 """Module of each public name, below ``mereo``."""
 

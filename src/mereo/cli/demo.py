@@ -10,37 +10,26 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
 from rich.console import Console
 from rich.table import Table
 
+from mereo.api.frames import load_frame
+from mereo.api.objects import Method, Object, load_object
+from mereo.api.reconstruct import reconstruct
+from mereo.api.result import Result
 from mereo.cli.reconstruct import print_source
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.results import grid_confusion
-from mereo.evaluation.sample_views import load_view
-from mereo.evaluation.scans import bunny_posed
-from mereo.evaluation.scoring import predict_grid
-from mereo.fitting.registration.answer import Answer, answer_fitted
-from mereo.fitting.registration.readings import fitted_frame
-from mereo.fitting.registration.register import Registrar, registrar_for
-from mereo.fitting.registration.state import write_state
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.solids import label_grid
-from mereo.io.config import DEFAULT_FILES
-from mereo.io.output_folders import check_new_directory, new_directory
+from mereo.evaluation.results import grid_confusion, labels_on
+from mereo.evaluation.sample_views import SHIPPED_SCAN, T_MODEL_SCAN, load_view
+from mereo.fitting.registration.register import statistical_model_of
+from mereo.io.output_folders import check_new_directory
 from mereo.io.scratch_folders import check_place
-from mereo.models.model import Model
-from mereo.models.weights import load_model
-from mereo.reconstruction.pipeline import Reconstruction, extract, segment_names
-from mereo.scenes.assets import AssetUnavailable
+from mereo.io.sensor_frame import SensorFrame
+from mereo.reconstruction.pipeline import segment_names
 from mereo.visualization.report_words import confidence_title
-from mereo.visualization.result import registration_facts
-from mereo.visualization.result_files import write_files
 from mereo.visualization.units import Unit
 
-REAL_SCAN = "bun000"
 FRAMES = ("liver", "rope")
 RESOLUTION = 100
 
@@ -62,41 +51,33 @@ class Case:
     Attributes:
         name: of the output folder.
         title: one line about it.
-        weights: a shipped name.
-        cloud, frame: the input as its sensor gives it.
-        truth: the right answer, in a camera frame.
-        unit_m: metres in the input's unit; None for scene units.
+        object: that is found in it.
+        frame: as its sensor gives it.
+        truth: the right answer, in the frame's axes and unit.
     """
 
     name: str
     title: str
-    weights: str
-    cloud: PointCloud
-    frame: CloudAxes
+    object: Object
+    frame: SensorFrame
     truth: TruthGrid
-    unit_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """Scores of one answer to a case, and the seconds that it took from the cloud on."""
+    """Scores of one answer to a case, and the seconds that it took from the frame on."""
 
     scores: Scores
     seconds: float
 
 
 def main(output: str | Path = Path("out/demo")) -> None:
-    """Reconstruct every input that can be had, print tables, and write a folder each below ``output``."""
+    """Reconstruct every input, print tables, and write a folder each below ``output``."""
     check_place(Path(output), may_be_link=True)
     console, started = Console(markup=False, emoji=False), time.perf_counter()
     for make in _inputs():
-        try:
-            case = make()
-        except AssetUnavailable as error:
-            console.print(f"The real scan {REAL_SCAN} is left out: {error}\n", highlight=False, soft_wrap=True)
-            continue
-        folder = _folder(Path(output) / case.name)
-        _show(case, load_model(case.weights), folder, console)
+        case = make()
+        _show(case, _folder(Path(output) / case.name), console)
     console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
     console.print(OWN_OBJECT, markup=True, highlight=False, soft_wrap=True)
 
@@ -126,90 +107,63 @@ def _inputs() -> Iterator[Callable[[], Case]]:
 
 
 def _scan_case() -> Case:
-    scan = bunny_posed(REAL_SCAN)
-    _, truth, _ = scan.in_camera()
-    title = f"{REAL_SCAN}: a real Cyberware range scan of the Stanford bunny, metres"
-    return Case(REAL_SCAN, title, "bunny", scan.cloud, scan.frame, truth_grid(truth), 1.0)
+    frame, known = load_frame(SHIPPED_SCAN), load_object("bunny")
+    model = statistical_model_of(known.model)
+    assert model.source_frame is not None
+    truth = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source @ T_MODEL_SCAN))
+    title = f"{SHIPPED_SCAN}: a real range scan of the Stanford bunny"
+    return Case(SHIPPED_SCAN, title, known, frame, truth_grid(truth))
 
 
 def _frame_case(name: str) -> Case:
-    view = load_view(name)
+    frame, view = load_frame(name), load_view(name)
     camera = view.depth.camera
-    cloud = view.depth.to_points()
-    title = f"{name}: a rendered {camera.width} x {camera.height} depth image with noise, scene units"
-    return Case(name, title, name, cloud, "camera", view.truth)
+    title = f"{name}: a rendered {camera.width} x {camera.height} depth image with noise"
+    return Case(name, title, load_object(name), frame, view.truth.scaled(view.metres))
 
 
-def _show(case: Case, model: Model, folder: Path, console: Console) -> None:
-    """Reconstruct a case, print network and fit beside the truth, and write the folder of the default answer."""
-    registrar = registrar_for(model, "auto")
-    stated = None if case.unit_m is None or registrar is None else registrar.stated_unit(case.unit_m)
-    started = time.perf_counter()
-    fitted = fitted_frame(case.cloud, model, registrar, case.frame, stated_unit=stated)
-    spent = time.perf_counter() - started
-    network = extract(fitted.unaided, model, RESOLUTION)
-    labels = predict_grid(model, network.code, case.truth)
-    columns = {"network": Column(_scores(case, model, labels), seconds_of(network))}
-    found = Answer(network)
+def _show(case: Case, folder: Path, console: Console) -> None:
+    """Reconstruct a case, print network and registered model beside the truth, and write the default answer."""
+    columns: dict[str, Column] = {}
+    result, columns["network"] = _answer(case, "network")
+    registrar = case.object.registrar()
     if registrar is not None:
-        started = time.perf_counter()
-        found = answer_fitted(fitted, model, registrar, RESOLUTION, stated_unit=stated)
-        seconds = spent + time.perf_counter() - started
-        if found.registration is not None:
-            labels = label_grid(found.registration.mesh, *case.truth.grid.axes())
-            columns["fit"] = Column(_scores(case, model, labels), seconds)
-    console.print(_table(case, found.reconstruction, columns))
+        result, columns["fit"] = _answer(case, "auto")
+    console.print(_table(case, result, columns))
+    if registrar is None:
+        print(f"the network's answer: the weights {case.name!r} carry no statistical model that could be registered")
+    else:
+        print_source(result)
     started = time.perf_counter()
-    _write(case, found, registrar, folder)
+    result.save(folder, overwrite=True)
     written_s = time.perf_counter() - started
-    page = f", or in the browser: mereo view {folder}" if found.taken else ""
-    line = f"{len(case.cloud)} points; written in {written_s:.1f} s; look at {folder / 'report.html'}{page}\n"
+    page = f", or in the browser: mereo view {folder}" if result.taken else ""
+    line = f"{len(case.frame.cloud)} points; written in {written_s:.1f} s; look at {folder / 'report.html'}{page}\n"
     console.print(line, highlight=False, soft_wrap=True)
 
 
-def _write(case: Case, found: Answer, registrar: Registrar | None, folder: Path) -> None:
-    """Say which answer it is, and write its folder."""
-    facts: dict[str, object] = {"title": case.title, "weights": case.weights}
-    if registrar is None:
-        print(f"the network's answer: the weights {case.weights!r} carry no statistical model that could be registered")
-    else:
-        print_source(found)
-        facts["registration"] = registration_facts(found)
-        facts["recognition"] = found.recognition.facts()
-    with new_directory(folder, force=True) as directory:
-        write_files(
-            directory,
-            found.reconstruction,
-            case.cloud,
-            case.frame,
-            DEFAULT_FILES,
-            1.0,
-            facts,
-            unit=Unit(case.unit_m),
-            registered=found.registered,
-        )
-        write_state(directory, found, registrar, case.weights, case.frame, 1.0)
+def _answer(case: Case, method: Method) -> tuple[Result, Column]:
+    """Answer to a case, its scores and seconds."""
+    started = time.perf_counter()
+    result = reconstruct(case.frame, case.object, method, resolution=RESOLUTION)
+    seconds = time.perf_counter() - started
+    model = case.object.model
+    labels = labels_on(result.surfaces, case.truth.grid)
+    confusion = grid_confusion(case.truth, labels, len(segment_names(model)[0]))
+    return result, Column(intersection_over_union(confusion, model.segmented), seconds)
 
 
-def _scores(case: Case, model: Model, predicted: UInt8[np.ndarray, "x y z"]) -> Scores:
-    confusion = grid_confusion(case.truth, predicted, len(segment_names(model)[0]))
-    return intersection_over_union(confusion, model.segmented)
-
-
-def seconds_of(result: Reconstruction) -> float:
-    """Seconds of all stages of a reconstruction."""
-    return sum(result.timings_s.values())
-
-
-def _table(case: Case, result: Reconstruction, columns: dict[str, Column]) -> Table:
+def _table(case: Case, result: Result, columns: dict[str, Column]) -> Table:
     """Table of the scores of each segment by network and fit, and of what is written."""
+    unit = Unit(result.unit_m)
     table = Table(title=case.title, title_justify="left")
     table.add_column("IoU with the truth")
-    for column in (*columns, confidence_title(result.calibrated), "volume"):
+    for column in (*columns, confidence_title(result.reconstruction.calibrated), f"volume ({unit.volume_name})"):
         table.add_column(column, justify="right")
     each = [column.scores.per_segment for column in columns.values()]
-    for found, *ious in zip(result.segments, *each, strict=True):
-        table.add_row(found.name, *(f"{iou:.3f}" for iou in ious), f"{found.confidence:.2f}", f"{found.volume:.4g}")
+    for segment, *ious in zip(result, *each, strict=True):
+        row = (*(f"{iou:.3f}" for iou in ious), f"{segment.confidence:.2f}", unit.volume(segment.volume))
+        table.add_row(segment.name, *row)
     table.add_section()
     table.add_row("all as one (IoU)", *(f"{column.scores.iou:.3f}" for column in columns.values()))
     table.add_row("mean of segments (mIoU)", *(f"{column.scores.miou:.3f}" for column in columns.values()))

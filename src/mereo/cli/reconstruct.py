@@ -10,12 +10,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from mereo.api.objects import Method, Object, load_object
+from mereo.api.reconstruct import reconstruct
+from mereo.api.result import Result
 from mereo.cli.explain import explain, print_sure, wish_of
-from mereo.fitting.config import FitChoice
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried, Placed, place
 from mereo.fitting.registration.carry import carry as carry_one
-from mereo.fitting.registration.register import Registrar, registrar_for
+from mereo.fitting.registration.register import Registrar
 from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
@@ -25,13 +27,12 @@ from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.medical import MM_PER_M
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
-from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import files_of
-from mereo.visualization.answering import answer
 from mereo.visualization.report_words import confidence_title
-from mereo.visualization.result import Result
+from mereo.visualization.result_files import write_answer
+from mereo.visualization.units import Unit
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class FrameJob:
         isolation: what of a frame is left out.
         inference: where and how exactly the network computes.
         files: which files are written, and in which unit.
-        choice: whether the network answers, or the registered model.
+        method: whether the network answers, or the registered model.
         scene: whose draws are fitted, where it is not the built-in one that the weights were trained on.
         carry: files of what is defined in the rest model, to be brought to where the object is.
         carry_frame: their frame and unit: of the object's own files, or of its scene.
@@ -60,7 +61,7 @@ class FrameJob:
     isolation: IsolationConfig = field(default_factory=IsolationConfig)
     inference: InferenceConfig = field(default_factory=InferenceConfig)
     files: FilesConfig = DEFAULT_FILES
-    choice: FitChoice = "auto"
+    method: Method = "auto"
     scene: str | None = None
     carry: tuple[str | Path, ...] = ()
     carry_frame: CarryFrame = "source"
@@ -76,9 +77,9 @@ class FrameJob:
         chosen_formats(self.files.formats)
         if self.carry_frame != "source" and not self.attachments:
             raise ValueError(f"--carry-frame is {self.carry_frame!r} and nothing is carried: name a file with --carry")
-        if self.attachments and self.choice == "off":
+        if self.attachments and self.method == "network":
             raise ValueError("--fit is off, but --carry needs a registration, along which things move: use --fit auto")
-        if self.explain and self.choice == "off":
+        if self.explain and self.method == "network":
             raise ValueError("--fit is off, but --explain needs a registration, whose fit is explained: use --fit auto")
 
     @property
@@ -94,21 +95,22 @@ class FrameJob:
         return tuple(read_attachments(self.carry))
 
     @cached_property
-    def model(self) -> Model:
-        """Weights, on their device."""
-        return load_for(self.weights, self.inference)
+    def object(self) -> Object:
+        """Weights on their device, with the object's scene; what is carried needs a deformation model."""
+        inference = self.inference
+        loaded = load_object(self.weights, self.scene, device=inference.device, precision=inference.precision)
+        return loaded.with_deformation_model() if self.attachments else loaded
 
     @cached_property
     def registrar(self) -> Registrar | None:
         """Registrar of the object's model; None where the network alone answers."""
-        of = Registrar.of if self.attachments else registrar_for
-        return of(self.model, self.choice, self.scene)
+        return self.object.registrar(self.method)
 
     def asking(self, model: Model) -> "FrameJob":
         """The same, asking the same weights on another device; what is known of scene and attachments stays so."""
-        moved = copy(self)
-        registrar = None if self.registrar is None else self.registrar.asking(model)
-        vars(moved).update(model=model, registrar=registrar)
+        moved, _ = copy(self), self.registrar
+        vars(moved).pop("registrar")
+        vars(moved).update(object=self.object.asking(model))
         return moved
 
     @cached_property
@@ -145,23 +147,24 @@ def answer_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: Path)
     seen = find_object(frame, job.isolation)
     print(seen)
     placed = job.placed  # what is carried is refused before the work
-    wishes = [wish_of(text, job.model.names) for text in job.explain]
-    found = answer(
+    wishes = [wish_of(text, job.object.names) for text in job.explain]
+    found = reconstruct(
         seen,
-        job.model,
-        job.registrar,
-        job.resolution,
+        job.object,
+        job.method,
+        resolution=job.resolution,
         isolation=job.isolation,
         label_points="points" in chosen_formats(job.files.formats),
     )
-    if found.reconstruction.reading.dropped:
-        print(found.reconstruction.reading)
+    if found.hypothesis.dropped:
+        print(found.hypothesis)
+    unit = Unit(found.unit_m)
     if job.registrar is not None:
         print_source(found)
-        print_sure(found.registered, found.unit)
-    found.write(directory, job.files, carried_along(placed, found))
-    factor = MM_PER_M * frame.unit_m if job.files.millimetres else 1.0
-    explain(found.registered, wishes, directory, found.seen.cloud.points, factor, found.unit)
+        print_sure(found.registered, unit)
+    write_answer(directory, found, job.files, carried_along(placed, found))
+    factor = MM_PER_M * found.seen.frame.metres if job.files.millimetres else 1.0
+    explain(found.registered, wishes, directory, found.seen.cloud.points, factor, unit)
     if job.options is not None:
         write_json(directory / CONFIG, {**job.options, "inputs": [str(path)]})
     return found
@@ -210,7 +213,7 @@ def print_source(found: Answer) -> None:
 
 def print_segments(answered: Result) -> None:
     """Print a table of the segments, and a line of the stages' seconds."""
-    result, seen, unit = answered.reconstruction, answered.seen, answered.unit
+    result, seen, unit = answered.reconstruction, answered.seen, Unit(answered.unit_m)
     sure = None if answered.registered is None else answered.registered.uncertainty
     radii = {} if sure is None else {one.name: one.centroid_radius95 for one in sure.segments}
     table = Table(title=f"{seen.frame.source}, {len(seen.cloud)} points", title_justify="left")

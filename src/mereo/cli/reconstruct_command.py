@@ -85,7 +85,7 @@ class ReconstructCommand:
             self.isolation,
             for_tasks(self.inference, cluster),
             self.files,
-            self.fit,
+            "network" if self.fit == "off" else self.fit,
             self.scene,
             self.carry,
             self.carry_frame,

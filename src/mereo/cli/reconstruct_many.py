@@ -105,7 +105,7 @@ def reconstruct_frames(
             f"{output} is a folder of results; each frame gets a folder of its own in --output: choose another"
         )
     job.check()
-    _ = job.model, job.placed  # what is wrong with them is no frame's fault
+    _ = job.object, job.placed  # what is wrong with them is no frame's fault
     folders = [output / name for name in names]
     found: dict[Path, Told | None] = {}
     started = time.monotonic()

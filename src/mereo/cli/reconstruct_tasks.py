@@ -73,7 +73,7 @@ class _Answering:
     @cached_property
     def here(self) -> FrameJob:
         """The job with its weights where this is called, moved there once."""
-        return self.job.asking(arrived(self.job.model, self.gpu))
+        return self.job.asking(arrived(self.job.object.model, self.gpu))
 
     def __call__(self, frame: Frame, cancelled: Callable[[], bool]) -> _Answered | Exception:
         """Answer to a frame, or why there is none: a bad frame stops no other."""
@@ -124,8 +124,8 @@ def answer_in_tasks(
                 failed(path, problem)
                 lost.append(path)
 
-    job = job.asking(sent(job.model, cluster))
-    if job.registrar is not None and job.choice != "modes":
+    job = job.asking(sent(job.object.model, cluster))
+    if job.registrar is not None and job.method != "modes":
         _ = job.registrar.at_hand  # the states in which a fit begins are drawn once, here, and not in every task
     work = _Answering(job, cluster.gpus > 0)
     with closing(spread(work, frames(), cluster=cluster)) as answers:

@@ -7,14 +7,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.tracking.tracker import Followed, Tracker
+from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.moments import owned_centroids
 from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.pipeline import Reconstruction, extract, reconstruct
+from mereo.reconstruction.pipeline import Reconstruction
 from mereo.reconstruction.strays import Reading
 
 DIGITS = 6
@@ -79,7 +81,7 @@ class FrameAnswer:
         return cls(found.surfaces, segments, found.reading, "network", False, explained, recognition)
 
     @classmethod
-    def of_registration(cls, found: Followed, uncertainty: bool = False) -> "FrameAnswer":
+    def of_registration(cls, found: Answer, uncertainty: bool = False) -> "FrameAnswer":
         """Answer that is the registered model; with ``uncertainty`` it says how sure that is."""
         assert found.registration is not None
         mesh, registration = found.surfaces, found.registration
@@ -93,7 +95,7 @@ class FrameAnswer:
             segments[one.name] |= {"centroid_radius95": round(one.centroid_radius95, DIGITS), "volume95": one.volume95}
         radius95 = None if sure is None else sure.summary(sure.outline)
         method, known = registration.method, found.recognition
-        return cls(mesh, segments, found.reading, method, found.tracked, explained, known, radius95)
+        return cls(mesh, segments, found.hypothesis, method, found.tracked, explained, known, radius95)
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
@@ -122,22 +124,12 @@ class Answering:
         return replace(answer, observation=seen.observation, seconds=time.perf_counter() - started)
 
     def _answer(self, seen: Seen) -> FrameAnswer:
-        frame, cloud = seen.observation.frame, seen.observation.cloud
         if self.tracker is None:
-            found = reconstruct(cloud, self.model, self.resolution, frame.axes, keep_all=self.keep_all)
-            return FrameAnswer.of_network(found)
-        stated = self.tracker.registrar.stated_unit(frame.unit_m)
-        followed = self.tracker.follow(
-            cloud,
-            seen.time_s,
-            frame.axes,
-            stated_unit=stated,
-            keep_all=self.keep_all,
-            unit_assumed=not frame.unit_stated,
-        )
-        if followed.taken:
-            return FrameAnswer.of_registration(followed, self.uncertainty)
-        assert followed.asked is not None
-        explained = None if followed.registration is None else round(followed.registration.explained, 4)
-        found = extract(followed.asked.unaided, self.model, self.resolution)
-        return FrameAnswer.of_network(found, explained, followed.recognition)
+            found = answer_frame(seen.observation, self.model, None, keep_all=self.keep_all)
+        else:
+            found = self.tracker.follow(seen.observation, seen.time_s, keep_all=self.keep_all)
+        if found.taken:
+            return FrameAnswer.of_registration(found, self.uncertainty)
+        explained = None if found.registration is None else round(found.registration.explained, 4)
+        surfaces = replace(found, resolution=self.resolution).reconstruction
+        return FrameAnswer.of_network(surfaces, explained, found.recognition)

@@ -1,6 +1,6 @@
 """Calibration of weights on views of training seeds: what they say of these is compared with what is true.
 
-    Model, Scene -own_views, strange_frames-> FittedFrame -gauges-> Calibration
+    Model, Scene -own_views, strange_frames-> Answer -gauges-> Calibration
 
 Each gauge measures one part. It is given every view of the object, with its fit of the modes and its truth, and every
 strange frame, and says its fields of the ``Calibration`` at the end.
@@ -20,13 +20,13 @@ from mereo.evaluation.probability_gauge import ProbabilityGauge
 from mereo.evaluation.radius_gauge import RadiusGauge
 from mereo.evaluation.recognition_gauge import RecognitionGauge
 from mereo.evaluation.scoring import check_names, trained_scene
-from mereo.fitting.registration.readings import FittedFrame, fitted_frame
-from mereo.fitting.registration.register import Registrar, registrar_for
-from mereo.fitting.registration.registration import Registration
-from mereo.geometry.camera import PointCloud
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.register import registrar_for
 from mereo.io.progress import progress
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model
+from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
@@ -44,10 +44,10 @@ LEAST_VIEWS = 8
 class Gauge(Protocol):
     """Measurement of one part of a calibration."""
 
-    def add(self, view: CalibrationView, frame: FittedFrame, registration: Registration | None) -> None:
-        """Take in a view of the object; ``registration`` is of its modes, None where none was found."""
+    def add(self, view: CalibrationView, answer: Answer) -> None:
+        """Take in a view of the object, answered by its modes."""
 
-    def add_strange(self, frame: FittedFrame, registration: Registration | None) -> None:
+    def add_strange(self, answer: Answer) -> None:
         """Take in a frame that shows another thing than the object."""
 
     def fields(self) -> dict[str, Any]:
@@ -96,28 +96,20 @@ def calibrate(
     others = other_objects(scene) if each else []
     with progress("calibrate", views + more + each * (len(others) + 8), "views", quiet=quiet) as shown:
         for view in own_views(scene, views, seed):
-            frame, registration = _fitted(bare, registrar, view.seen, view.scene_unit)
+            answer = answer_frame(observe(view.seen), bare, registrar, scene_unit=view.scene_unit)
             for gauge in gauges:
-                gauge.add(view, frame, registration)
+                gauge.add(view, answer)
             shown.advance()
         for view in clean_views(scene, more, seed, first=views):
             assert radii is not None
-            radii.add(view, *_fitted(bare, registrar, view.seen, view.scene_unit))
+            radii.add(view, answer_frame(observe(view.seen), bare, registrar, scene_unit=view.scene_unit))
             shown.advance()
         for strange in strange_frames(scene, others, each, seed):
-            frame, registration = _fitted(bare, registrar, strange.cloud, None)
+            answer = answer_frame(observe(strange.cloud), bare, registrar)
             for gauge in gauges:
-                gauge.add_strange(frame, registration)
+                gauge.add_strange(answer)
             shown.advance()
     fields: dict[str, Any] = {}
     for gauge in gauges:
         fields |= gauge.fields()
     return Calibration(seed=seed, views=views, **fields)
-
-
-def _fitted(
-    model: Model, registrar: Registrar | None, seen: PointCloud, scene_unit: float | None
-) -> tuple[FittedFrame, Registration | None]:
-    """A cloud as the model understands it, and the registration of its modes."""
-    frame = fitted_frame(seen, model, registrar, scene_unit=scene_unit)
-    return frame, None if frame.modes is None else frame.modes.registration()

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from mereo.fitting.registration.readings import fitted_frame
-from mereo.fitting.registration.recognition import Known, recognized
+from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
@@ -16,6 +16,7 @@ from mereo.geometry.labels import LabelGrid
 from mereo.geometry.solids import label_grid
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
+from mereo.reconstruction.observation import observe
 
 AnswerName = Literal["network", "modes", "full"]
 """Who answers: the network alone, the registered modes, the better of these and the scene's own draws."""
@@ -83,28 +84,22 @@ def network_labels(model: Model, code: EncodedCloud, grid: LabelGrid) -> UInt8[n
 def find_candidates(
     model: Model, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
 ) -> Candidates:
-    """Answers to a frame; ``registrar`` None asks the network alone, "modes" leaves the draws out."""
-    frame = fitted_frame(cloud, model, registrar, scene_unit=scene_unit)
+    """Answers to a frame, scored on a grid: the one that a user gets, and all others that led to it."""
+    answer = answer_frame(observe(cloud), model, registrar, scene_unit=scene_unit)
+    assert answer.likelier is not None and answer.candidate is not None
     started = time.perf_counter()
-    code, encoding = frame.unaided.code, frame.unaided.timings_s["encode"]
+    code, encoding = answer.likelier.code, answer.likelier.timings_s["encode"]
     labels = network_labels(model, code, grid)
     each: dict[AnswerName, Candidate] = {"network": Candidate(labels, encoding + time.perf_counter() - started)}
     if registrar is None:
         return Candidates(code, each, "network")
-    if frame.modes is None:  # too little is found; then the network's answer is what a user gets, whoever is asked
-        known = recognized(frame, None, model).known
-        return Candidates(code, dict.fromkeys(names_for(registrar), each["network"]), "network", known)
-    each["modes"] = _registered(frame.modes.registration(), grid, encoding)
-    default: AnswerName = "modes"
-    if "full" in names_for(registrar):
-        assert registrar.at_hand is not None
-        each["full"] = _registered(frame.modes.with_draws(registrar.at_hand), grid, encoding)
-        default = "full"
-    found = each[default].registration
-    known = recognized(frame, found, model).known
-    if found is not None and not registrar.takes(found):
-        default = "network"
-    return Candidates(code, each, default, known)
+    known, names = answer.recognition.known, names_for(registrar)
+    if answer.candidate.modes is None or answer.registration is None:  # too little is found, whoever is scored
+        return Candidates(code, dict.fromkeys(names, each["network"]), "network", known)
+    each["modes"] = _registered(answer.candidate.modes.registration(), grid, encoding)
+    if "full" in names:
+        each["full"] = _registered(answer.registration, grid, encoding)
+    return Candidates(code, each, names[-1] if answer.taken else "network", known)
 
 
 def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:

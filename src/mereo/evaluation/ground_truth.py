@@ -1,6 +1,6 @@
 """Ground truth on a grid: what a reconstruction is scored against."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool
@@ -24,6 +24,11 @@ class TruthGrid:
 
     grid: LabelGrid
     kept: Bool[np.ndarray, "x y z"]
+
+    def scaled(self, factor: float) -> "TruthGrid":
+        """The same with all lengths ``factor`` times as long."""
+        grid = replace(self.grid, origin=factor * self.grid.origin, spacing=factor * self.grid.spacing)
+        return TruthGrid(grid, self.kept)
 
 
 def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:

@@ -9,8 +9,7 @@ from mereo.evaluation.calibration_views import CalibrationView
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.probability_scaling import ece_of, fit_scaling
 from mereo.evaluation.reliability import AskedCells
-from mereo.fitting.registration.readings import FittedFrame
-from mereo.fitting.registration.registration import Registration
+from mereo.fitting.registration.answer import Answer
 from mereo.models.model import Model
 
 CELLS = 60
@@ -31,16 +30,17 @@ class ProbabilityGauge:
         self.logits: list[Float[np.ndarray, "_ c"]] = []
         self.truth: list[UInt8[np.ndarray, " _"]] = []
 
-    def add(self, view: CalibrationView, frame: FittedFrame, registration: Registration | None) -> None:
+    def add(self, view: CalibrationView, answer: Answer) -> None:
         """Ask the network at some of a clean view's cells."""
         if not view.clean:
             return
         cells = AskedCells.of(truth_grid(view.mesh, CELLS), ASKED)
-        logits = self.model.logits(frame.unaided.code, cells.points)
+        assert answer.likelier is not None
+        logits = self.model.logits(answer.likelier.code, cells.points)
         self.logits.append(logits)
         self.truth.append(np.minimum(cells.truth, logits.shape[1] - 1).astype(np.uint8))
 
-    def add_strange(self, frame: FittedFrame, registration: Registration | None) -> None:
+    def add_strange(self, answer: Answer) -> None:
         """Nothing: what is not the object has no labels."""
 
     def fields(self) -> dict[str, Any]:

@@ -8,9 +8,8 @@ import numpy as np
 
 from mereo.evaluation.calibration_views import CalibrationView
 from mereo.evaluation.coverage import RadiusRatios, seen_points
-from mereo.fitting.registration.fit import ModesFit
-from mereo.fitting.registration.readings import FittedFrame
-from mereo.fitting.registration.recognition import displaced_of, is_noisy
+from mereo.fitting.registration.answer import Answer, Candidate
+from mereo.fitting.registration.recognition import is_noisy
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.models.calibration import RadiusFactors
@@ -50,14 +49,13 @@ class Measured:
     half: float
 
     @classmethod
-    def of(cls, view: CalibrationView, modes: ModesFit, registration: Registration) -> "Measured":
-        """Measurement of a registration that was made of a fit of the modes, by weights that are not calibrated."""
+    def of(cls, view: CalibrationView, candidate: Candidate, registration: Registration) -> "Measured":
+        """Measurement of a registration that was made of a candidate, by weights that are not calibrated."""
         truth = view.material(registration.model)
         ratios = RadiusRatios.of(registration, truth, seen_points(truth, view.seen, 1.0))
-        assert registration.optimum is not None
-        displaced = displaced_of(modes, registration)
-        misfit = modes.problem.cloud_misfit(registration.optimum.surface)
-        return cls(ratios, misfit, displaced or 0.0, registration.model.half)
+        assert registration.optimum is not None and candidate.modes is not None
+        misfit = candidate.modes.problem.cloud_misfit(registration.optimum.surface)
+        return cls(ratios, misfit, candidate.displaced(registration) or 0.0, registration.model.half)
 
     def widened(self, factors: RadiusFactors) -> RadiusRatios:
         """Ratios to the radii that a calibration makes wider; its scale is left out."""
@@ -78,19 +76,21 @@ class RadiusGauge:
         self.noisy: tuple[list[Measured], list[Measured]] = [], []
         self.asked = 0
 
-    def add(self, view: CalibrationView, frame: FittedFrame, registration: Registration | None) -> None:
+    def add(self, view: CalibrationView, answer: Answer) -> None:
         """Take in a view of the object where its registration is believed: of others users get no radii."""
-        modes = frame.modes
+        candidate, registration = answer.candidate, answer.registration
         self.asked += not view.clean
-        if modes is None or registration is None or not (view.clean or self.asked <= NOISY):
+        if candidate is None or candidate.modes is None or registration is None:
             return
-        full = None if self.full is None else self.full.finish(modes)
+        if not (view.clean or self.asked <= NOISY):
+            return
+        full = None if self.full is None else self.full.finish(candidate.modes)
         for number, one in enumerate((registration, full)):
             if one is None or not one.accepted or (number == 1 and one.method != "draws"):
                 continue
-            (self.noisy if is_noisy(one) else self.clean)[number].append(Measured.of(view, modes, one))
+            (self.noisy if is_noisy(one) else self.clean)[number].append(Measured.of(view, candidate, one))
 
-    def add_strange(self, frame: FittedFrame, registration: Registration | None) -> None:
+    def add_strange(self, answer: Answer) -> None:
         """Leave out what is not the object: there are no true places."""
 
     def fields(self) -> dict[str, Any]:

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from mereo.evaluation.calibration_views import CalibrationView
-from mereo.fitting.registration.readings import FittedFrame
-from mereo.fitting.registration.recognition import CONSERVATIVE, LEAST, Signs, displaced_of, is_noisy, strangeness
-from mereo.fitting.registration.registration import Registration
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.recognition import CONSERVATIVE, LEAST, Signs, is_noisy, strangeness
 from mereo.models.calibration import Recognizing, SignName, Usual
 
 MEASURED: tuple[SignName, ...] = tuple(name for name in LEAST if name != "size")
@@ -51,15 +50,16 @@ class RecognitionGauge:
         self.noisy: list[Signs] = []
         self.strange: list[tuple[Signs, bool]] = []
 
-    def add(self, view: CalibrationView, frame: FittedFrame, registration: Registration | None) -> None:
+    def add(self, view: CalibrationView, answer: Answer) -> None:
         """Take in the signs of a view of the object; one that was not registered has none."""
-        if registration is not None:
-            (self.noisy if is_noisy(registration) else self.clean).append(signs_of(frame, registration))
+        if answer.registration is not None and answer.recognition.signs is not None:
+            noisy = is_noisy(answer.registration)
+            (self.noisy if noisy else self.clean).append(answer.recognition.signs)
 
-    def add_strange(self, frame: FittedFrame, registration: Registration | None) -> None:
+    def add_strange(self, answer: Answer) -> None:
         """Take in the signs of a frame that shows something else."""
-        if registration is not None:
-            self.strange.append((signs_of(frame, registration), is_noisy(registration)))
+        if answer.registration is not None and answer.recognition.signs is not None:
+            self.strange.append((answer.recognition.signs, is_noisy(answer.registration)))
 
     def fields(self) -> dict[str, Any]:
         """What is usual, and both limits; nothing where too few views were registered."""
@@ -74,12 +74,6 @@ class RecognitionGauge:
         lowest = float(np.quantile(others, STRANGE)) if others else unsure * APART**2
         refused = max(float(np.sqrt(unsure * lowest)), APART * unsure)
         return {"recognizing": Recognizing(clean=clean, noisy=noisy, unsure=unsure, refused=refused)}
-
-
-def signs_of(frame: FittedFrame, registration: Registration) -> Signs:
-    """Signs of a registration of a frame whose unit says nothing."""
-    assert frame.modes is not None
-    return Signs.of(registration, displaced_of(frame.modes, registration))
 
 
 def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:

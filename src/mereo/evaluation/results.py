@@ -14,7 +14,9 @@ from mereo.evaluation.reliability import Reliability
 from mereo.fitting.registration.recognition import Known
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.mesh import Color
+from mereo.geometry.labels import LabelGrid
+from mereo.geometry.mesh import Color, SegmentedMesh
+from mereo.geometry.solids import label_grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +115,15 @@ def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segm
     """Confusion matrix of the points that count; where the model knows one segment, all true ones are taken as one."""
     labels = np.minimum(truth.grid.labels[truth.kept], segments)
     return confusion_matrix(labels, np.minimum(predicted[truth.kept], segments), segments + 1)
+
+
+def labels_on(surfaces: SegmentedMesh, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
+    """Labels of surfaces on a grid in their axes and unit; segments without faces are nowhere."""
+    present = [number for number, segment in enumerate(surfaces.segments) if len(segment.faces)]
+    if not present:
+        return np.zeros_like(grid.labels)
+    labels = label_grid(SegmentedMesh(tuple(surfaces.segments[number] for number in present)), *grid.axes())
+    return np.array([0, *(number + 1 for number in present)], dtype=np.uint8)[labels]
 
 
 @dataclass

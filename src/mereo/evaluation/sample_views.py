@@ -13,9 +13,9 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.labels import LabelGrid
 from mereo.io.atomic_files import atomic_file
-from mereo.io.config import InputConfig
 from mereo.io.errors import quiet, reason
-from mereo.io.sensor_frame import SensorFrame, read_frame
+from mereo.io.sensor_frame import SensorFrame
+from mereo.io.readers import read_point_cloud
 from mereo.io.size_limits import read_arrays
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
@@ -24,6 +24,12 @@ from mereo.synthesis.examples import sample_view
 
 SHIPPED = Path(__file__).parents[1] / "frames"
 
+
+SHIPPED_SCAN = "bun000"
+"""Name of the shipped range scan of the Stanford bunny: 4,000 of its 40,256 points, evenly spread."""
+
+T_MODEL_SCAN = np.eye(4)
+"""Pose of the shipped scan: its coordinates are those of the scanned model."""
 
 GUESSED_UNIT_M = 0.01
 """Metres per scene unit of shipped frames of objects whose true size is not known."""
@@ -49,6 +55,11 @@ class SampleView:
     depth: DepthImage
     truth: TruthGrid
     unit_m: float | None = None
+
+    @property
+    def metres(self) -> float:
+        """Metres per scene unit; ``GUESSED_UNIT_M`` where the object's true size is not known."""
+        return self.unit_m or GUESSED_UNIT_M
 
 
 def make_view(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> SampleView:
@@ -95,6 +106,11 @@ def shipped_views() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.npz")))
 
 
+def shipped_frames() -> tuple[str, ...]:
+    """Names of the frames that come with the package, which ``shipped_frame`` knows."""
+    return (SHIPPED_SCAN, *shipped_views())
+
+
 def load_view(name: str | Path) -> SampleView:
     """Sample view that is shipped under a name, or read from a file.
 
@@ -114,33 +130,17 @@ def load_view(name: str | Path) -> SampleView:
         raise ValueError(f"{path} is not a sample view of mereo ({reason(error)}); write it with `save_view`") from None
 
 
-def load_frame(name: str | Path, reading: InputConfig | None = None, **options: Any) -> SensorFrame:
-    """Frame of a depth camera or scanner: a shipped one by its name, or a file as `mereo reconstruct` reads it.
+def shipped_frame(name: str) -> SensorFrame:
+    """Frame that is shipped under a name, in metres: a rendered depth image, or ``SHIPPED_SCAN``.
 
-    Args:
-        name: of a shipped frame (``shipped_views``), a rendered depth image in metres; or a depth image, a point cloud
-            or a ROS recording.
-        reading: how a file is read.
-        options: fields of ``InputConfig`` instead of it: ``intrinsics``, ``depth_scale``, ``mask``, ``frame``,
-            ``drop_invalid``, ``unit_m``, ``topic``, ``frame_index``.
-
-    A shipped object whose true size is not known is taken to have scene units of ``GUESSED_UNIT_M``.
-
-    Raises ``FileNotFoundError`` where there is none, ``TypeError`` for options that are none, and ``ValueError`` as
-    ``read_frame`` does, for options with a shipped frame, and for both ``reading`` and options.
+    An object whose true size is not known is taken to have scene units of ``GUESSED_UNIT_M``. Raises
+    ``FileNotFoundError`` for an unknown name.
     """
-    if options and reading is not None:
-        raise ValueError(f"both a reading and {', '.join(options)} are given; one says it all: drop the other")
-    path, shipped = Path(name), str(name) in shipped_views()
-    if path.is_file() or not shipped:
-        if not path.exists() and path.suffix == "":
-            known = ", ".join(shipped_views())
-            raise FileNotFoundError(f"there is no frame {str(name)!r}; give a file or one of the shipped: {known}")
-        return read_frame(path, reading or InputConfig(**options))
-    if options or reading is not None:
-        raise ValueError(f"the shipped frame {str(name)!r} is in metres and needs no options: leave them out")
+    if name == SHIPPED_SCAN:
+        path = SHIPPED / f"{name}.ply"
+        return SensorFrame(path, read_point_cloud(path), 1.0, "scanner", message="shipped scan")
     view = load_view(name)
-    image = DepthImage(view.depth.depth * (view.unit_m or GUESSED_UNIT_M), view.depth.camera)
+    image = DepthImage(view.depth.depth * view.metres, view.depth.camera)
     return SensorFrame(SHIPPED / f"{name}.npz", image.to_points(), 1.0, "camera", image, "shipped frame")
 
 

@@ -53,10 +53,22 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
     return PointCloud(valid_points(points, path, drop_invalid))
 
 
-def valid_points(points: Float[np.ndarray, "n 3"], path: str | Path, drop_invalid: bool) -> Float[np.ndarray, "m 3"]:
-    """Points that are measurements; ``path`` says where they come from. Raises as ``read_point_cloud`` does."""
+def valid_points(
+    points: Float[np.ndarray, "n 3"],
+    path: str | Path,
+    drop_invalid: bool,
+    cure: str = "leave them out with --drop-invalid",
+) -> Float[np.ndarray, "m 3"]:
+    """Points that are measurements, as a copy. Raises as ``read_point_cloud`` does.
+
+    Args:
+        points: any unit.
+        path: where they come from, for the sentences.
+        drop_invalid: leave the others out.
+        cure: what to do where they are not to be left out, for the end of that sentence.
+    """
     if len(points) == 0:
-        raise ValueError(f"{path} holds 0 points; the object must be visible: check the export")
+        raise ValueError(f"{path} holds 0 points; the object must be visible: check where they come from")
     finite = (np.abs(points) <= LARGEST).all(axis=1)
     usable = finite & (points != 0).any(axis=1)
     lost = len(points) - int(usable.sum())
@@ -70,7 +82,7 @@ def valid_points(points: Float[np.ndarray, "n 3"], path: str | Path, drop_invali
         kind = "exactly (0, 0, 0)" if finite.all() else beyond
         raise ValueError(
             f"{path} has {lost} of {len(points)} points without a measurement ({kind}); all must be finite positions: "
-            "leave them out with --drop-invalid"
+            f"{cure}"
         )
     return points[usable]
 

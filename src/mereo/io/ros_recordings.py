@@ -103,7 +103,7 @@ def recorded_frames(
         if not connections:
             known = ", ".join(sorted({c.topic for c in reader.connections if c.msgtype in FRAMES})) or "none"
             raise ValueError(f"{path} has no images or clouds on topic {topic!r}; those it has are on: {known}")
-        decode: Callable[[Any], Content] = _cloud_points
+        decode: Callable[[Any], Content] = cloud_points
         if connections[0].msgtype != CLOUD:
             image = _depth_image if connections[0].msgtype == IMAGE else _compressed_depth
             decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=depth_scale)
@@ -255,18 +255,29 @@ def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -
 
 def _rows(message: Any, step: int, item: int) -> UInt8[np.ndarray, "h s"]:
     """Bytes of each row of an image or cloud; fewer than are stated would come out as fewer pixels or points."""
-    data = np.asarray(message.data, dtype=np.uint8)
+    # rospy hands over bytes, which np.asarray takes for the digits of one number
+    data = np.frombuffer(message.data, np.uint8) if isinstance(message.data, bytes) else np.asarray(message.data, "u1")
     if step < message.width * item:
         raise ValueError(f"its rows have {step} bytes, less than {message.width} of {item}")
     check_count(message.height * step, len(data), "bytes")
     return data[: message.height * step].reshape(message.height, step)
 
 
-def _cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
+def cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
+    """Points of a PointCloud2 message of ROS 1 or 2, row by row, NaN where nothing was measured.
+
+    Args:
+        message: anything with the fields of sensor_msgs/PointCloud2; ``data`` may be bytes, an array or a list.
+
+    Raises ``ValueError``, whose text is a reason only, and for a broken message whatever it makes of the parser.
+    """
     end = ">" if message.is_bigendian else "<"
-    axes = {f.name: (f"{end}{FIELD_TYPES[f.datatype]}", f.offset) for f in message.fields if f.name in ("x", "y", "z")}
-    if len(axes) != 3:
+    fields = {field.name: field for field in message.fields if field.name in ("x", "y", "z")}
+    if len(fields) != 3:
         raise ValueError(f"its fields are {', '.join(f.name for f in message.fields)}, without x, y and z")
+    if strange := [field for field in fields.values() if field.datatype not in FIELD_TYPES]:
+        raise ValueError(f"its field {strange[0].name!r} is of datatype {strange[0].datatype}, not 1 to 8")
+    axes = {name: (f"{end}{FIELD_TYPES[field.datatype]}", field.offset) for name, field in fields.items()}
     point = np.dtype(
         {
             "names": list(axes),

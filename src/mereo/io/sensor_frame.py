@@ -37,34 +37,38 @@ class SensorFrame:
     Attributes:
         path: the file, as it was named.
         cloud: the measured points, in the file's axes and unit.
-        unit_m: metres per unit.
+        unit_m: metres per unit; None where neither the file nor an option says it.
         axes: the cloud's.
         depth: the depth image in metres that the points come from, without what a mask leaves out; None for clouds.
         message: the recording's message, by topic and time; empty for other files.
-        unit_stated: whether the file or an option says the unit; metres are assumed where neither does.
     """
 
     path: Path
     cloud: PointCloud
-    unit_m: float
+    unit_m: float | None
     axes: CloudAxes
     depth: DepthImage | None = None
     message: str = ""
-    unit_stated: bool = True
 
     def __repr__(self) -> str:
-        size = " x ".join(f"{side:.3g}" for side in np.ptp(self.cloud.points, axis=0) * self.unit_m)
-        return f"SensorFrame({self.source!r}, {counted(len(self.cloud), 'point')}, {size} m, {self.axes} axes)"
+        size = " x ".join(f"{side:.3g}" for side in np.ptp(self.cloud.points, axis=0) * self.metres)
+        points = counted(len(self.cloud), "point")
+        return f"SensorFrame({self.source!r}, {points}, {size} {self.length_name}, {self.axes} axes)"
+
+    @property
+    def metres(self) -> float:
+        """Metres per unit; 1 where that is not known, so that lengths are taken for metres."""
+        return 1.0 if self.unit_m is None else self.unit_m
+
+    @property
+    def length_name(self) -> str:
+        """Name of the unit of lengths times ``metres``: "m", or "units" where it is not known."""
+        return "units" if self.unit_m is None else "m"
 
     @property
     def source(self) -> str:
         """Name of the file, and which of its messages."""
         return f"{self.path.name}, {self.message}" if self.message else self.path.name
-
-    @property
-    def depth_m(self) -> tuple[float, float, float]:
-        """Nearest, middle and farthest z of the points, in metres."""
-        return depths_m(self.cloud, self.unit_m)
 
 
 def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> SensorFrame:  # noqa: B008 (frozen)
@@ -83,21 +87,14 @@ def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> Sensor
         return _recorded(recorded_frame(path, index, *_recording_options(reading)), path, reading)
     if kind == "depth image":
         return _depth_image(path, reading)
-    stated = FORMAT_UNITS_M.get(path.suffix.lower()) if reading.unit_m is None else reading.unit_m
-    cloud, unit_m = read_point_cloud(path, reading.drop_invalid), 1.0 if stated is None else stated
-    return SensorFrame(path, cloud, unit_m, reading.frame, unit_stated=stated is not None)
+    unit_m = FORMAT_UNITS_M.get(path.suffix.lower()) if reading.unit_m is None else reading.unit_m
+    return SensorFrame(path, read_point_cloud(path, reading.drop_invalid), unit_m, reading.frame)
 
 
 def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFrame, Callable[[], SensorFrame]]]:
     """Messages of a ROS recording's topic in their order, each with what decodes it; raises as ``read_frame``."""
     for message in recorded_frames(path, *_recording_options(reading)):
         yield message, partial(_recorded, message, path, reading)
-
-
-def depths_m(cloud: PointCloud, unit_m: float) -> tuple[float, float, float]:
-    """Nearest, middle and farthest z of a cloud in metres; ``unit_m`` is metres per unit."""
-    near, middle, far = (np.quantile(cloud.points[:, 2], [0.0, 0.5, 1.0]) * unit_m).tolist()
-    return near, middle, far
 
 
 # --- kinds of files --------------------------------------------------------------------------------------------------

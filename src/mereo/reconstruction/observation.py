@@ -7,19 +7,25 @@ Frames are read by ``mereo.io.sensor_frame``.
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
-from mereo.io.sensor_frame import SensorFrame, depths_m
+from mereo.geometry.conventions import CloudAxes
+from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import IsolationStep, isolate
 from mereo.reconstruction.strays import Reading
 
 SIZE_FACTOR = 2.0
 """Times that a visible part may be smaller or larger than any in training; beyond, it is another object or unit."""
+
+
+CLOUD = Path("cloud")
+"""Name of a frame that comes from no file."""
 
 
 class SizeWarning(UserWarning):
@@ -45,28 +51,39 @@ class Observation:
         steps = self.steps if reading.step is None else (*self.steps, reading.step)
         return replace(self, cloud=reading.cloud, steps=steps)
 
+    def in_unit(self, unit_m: float | None) -> "Observation":
+        """The object with the frame's unit, where the frame does not know it."""
+        if unit_m is None or self.frame.unit_m is not None:
+            return self
+        return replace(self, frame=replace(self.frame, unit_m=unit_m))
+
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in self.size_m)
-        return f"Observation({self.frame.source!r}, {counted(len(self.cloud), 'point')}, {size} m)"
+        points = counted(len(self.cloud), "point")
+        return f"Observation({self.frame.source!r}, {points}, {size} {self.frame.length_name})"
 
     @property
     def depth_m(self) -> tuple[float, float, float]:
-        """Nearest, middle and farthest depth of the object, in metres."""
-        return depths_m(self.cloud, self.frame.unit_m)
+        """Nearest, middle and farthest depth of the object in metres, or in the frame's unit where it is not known."""
+        return depths(self.cloud, self.frame.metres)
 
     @property
     def size_m(self) -> tuple[float, float, float]:
-        """Sides of the visible part's box, in metres."""
-        x, y, z = (np.ptp(self.cloud.points, axis=0) * self.frame.unit_m).tolist()
+        """Sides of the visible part's box in metres, or in the frame's unit where it is not known."""
+        x, y, z = (np.ptp(self.cloud.points, axis=0) * self.frame.metres).tolist()
         return x, y, z
 
     def facts(self) -> dict[str, Any]:
-        """Source, unit, depth, size and steps, dropped strays among them, for a result's summary."""
+        """Source, unit, depth, size and steps, dropped strays among them, for a result's summary.
+
+        What is in metres is None where the unit is not known.
+        """
+        known = self.frame.unit_m is not None
         return {
             "source": self.frame.source,
             "unit_m": self.frame.unit_m,
-            "depth_m": self.depth_m if self.frame.axes == "camera" else None,
-            "visible_size_m": self.size_m,
+            "depth_m": self.depth_m if known and self.frame.axes == "camera" else None,
+            "visible_size_m": self.size_m if known else None,
             "isolation": [asdict(step) for step in self.steps],
         }
 
@@ -75,12 +92,21 @@ class Observation:
         lines = [self._line("the frame has", self.frame.cloud)] if self.steps else []
         lines += [f"  {step}" for step in self.steps]
         lines.append(self._line("the object has", self.cloud))
-        return "\n".join([*lines, f"its visible part is {' x '.join(f'{side:.3g}' for side in self.size_m)} m"])
+        size = " x ".join(f"{side:.3g}" for side in self.size_m)
+        return "\n".join([*lines, f"its visible part is {size} {self.frame.length_name}"])
 
     def _line(self, start: str, cloud: PointCloud) -> str:
-        near, middle, far = depths_m(cloud, self.frame.unit_m)
-        depth = f", depth {near:.3g} to {far:.3g} m (middle {middle:.3g} m)" if self.frame.axes == "camera" else ""
-        return f"{start} {len(cloud)} points{depth}"
+        near, middle, far = depths(cloud, self.frame.metres)
+        unit, points = self.frame.length_name, f"{start} {len(cloud)} points"
+        if self.frame.axes == "scanner":
+            return points
+        return f"{points}, depth {near:.3g} to {far:.3g} {unit} (middle {middle:.3g} {unit})"
+
+
+def depths(cloud: PointCloud, factor: float) -> tuple[float, float, float]:
+    """Nearest, middle and farthest z of a cloud, times a factor."""
+    near, middle, far = (np.quantile(cloud.points[:, 2], [0.0, 0.5, 1.0]) * factor).tolist()
+    return near, middle, far
 
 
 def find_object(
@@ -89,6 +115,8 @@ def find_object(
 ) -> Observation:
     """Object in a frame: everything that the steps of ``isolation`` keep, whose lengths are all in metres.
 
+    A frame whose unit is not known is taken to be in metres.
+
     Raises ``ValueError`` where too little is left, and for a range of depths in a scanner's axes.
     """
     if isolation.depth_range is not None and frame.axes == "scanner":
@@ -96,18 +124,25 @@ def find_object(
             f"{frame.path} is in a scanner's frame, in which depth is not known: leave out --depth-range and crop with "
             "--box"
         )
-    cloud, steps = isolate(frame.cloud, isolation, frame.unit_m, frame.axes)
+    cloud, steps = isolate(frame.cloud, isolation, frame.metres, frame.axes)
     return Observation(frame, cloud, steps)
+
+
+def observe(cloud: PointCloud, axes: CloudAxes = "camera", unit_m: float | None = None) -> Observation:
+    """Observation of points that are all the object's, in ``unit_m`` metres or an unknown unit."""
+    return Observation(SensorFrame(CLOUD, cloud, unit_m, axes), cloud)
 
 
 def size_warning(observation: Observation, provenance: Mapping[str, object]) -> str | None:
     """Sentence where the visible part cannot be the object that a model was trained on; None where it can.
 
+    None also for a frame whose unit is not known, which may be of any size.
+
     ``provenance["visible_m"]`` is the least and greatest longest side of the visible part in training, in metres;
     models of objects whose true size is not known have none.
     """
     seen = provenance.get("visible_m")
-    if not isinstance(seen, list | tuple):
+    if not isinstance(seen, list | tuple) or observation.frame.unit_m is None:
         return None
     least, greatest = (float(value) for value in seen)
     longest = max(observation.size_m)

@@ -1,14 +1,14 @@
 """The inverse path: from what a camera saw of an object to all its segments, hidden side included.
 
-    PointCloud -drop strays-> -normalize-> -encode-> EncodedCloud -query-> Field -locate, extract-> SegmentedMesh
-                                                         '---------------- ask for more ----------------> Answer
+    Reading -normalize, encode_frame-> EncodedFrame -query-> Field -locate, extract-> SegmentedMesh
+                                            '---------------- ask for more ----------------> Answer
 
-``reconstruct`` undoes what ``mereo.synthesis.examples.synthesize`` does. Everything that comes out is in the input's
+This undoes what ``mereo.synthesis.examples.synthesize`` does. Everything that comes out is in the input's
 frame and units.
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -23,12 +23,11 @@ from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.models.joint_encoding import encode_all
 from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import Field
 from mereo.reconstruction.isosurfaces import extract_whole, locate
 from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
-from mereo.reconstruction.strays import Reading, as_cloud, readings
+from mereo.reconstruction.strays import Reading, as_cloud
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
@@ -109,7 +108,7 @@ class EncodedFrame:
 def encode_frame(
     cloud: PointCloud | Float[np.ndarray, "n 3"] | Reading, model: Model, axes: CloudAxes = "camera"
 ) -> EncodedFrame:
-    """The first step of ``reconstruct``: a cloud, or a reading of it, as a model understands it.
+    """Encode a cloud, or a reading of it.
 
     Raises ``ValueError`` for unusable clouds.
     """
@@ -122,55 +121,17 @@ def encode_frame(
     return EncodedFrame(reading, axes, T_camera_input, code, seconds)
 
 
-def encode_frames(found: Sequence[tuple[Reading, CloudAxes]], model: Model) -> list[EncodedFrame]:
-    """``encode_frame`` of several readings, each with its axes, in one call of the network (``encode_all``).
-
-    Each takes an equal share of the seconds. Raises ``ValueError`` where any is unusable.
-    """
-    seconds: dict[str, float] = {}
-    placed = [into_camera(reading.cloud.points, axes) for reading, axes in found]
-    with timed(seconds, "encode"):
-        codes = encode_all(
-            model,
-            [
-                PointCloud(transform_points(T_camera_input, reading.cloud.points))
-                for (reading, _), T_camera_input in zip(found, placed, strict=True)
-            ],
-        )
-    share = {stage: spent / len(found) for stage, spent in seconds.items() if found}
-    return [
-        EncodedFrame(reading, axes, T_camera_input, code, dict(share))
-        for (reading, axes), T_camera_input, code in zip(found, placed, codes, strict=True)
-    ]
-
-
-def reconstruct(
-    cloud: PointCloud | Float[np.ndarray, "n 3"],
-    model: Model,
-    resolution: int = 128,
-    frame: CloudAxes = "camera",
-    label_points: bool = False,
-    keep_all: bool = False,
-) -> Reconstruction:
-    """All segments of the object that a cloud shows, hidden side included, as the network alone finds them.
+def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_points: bool = False) -> Reconstruction:
+    """All segments of the object in an encoded cloud, hidden side included, as the network alone finds them.
 
     Args:
-        cloud: points on the object, any unit and density.
-        model: trained on this object, see ``mereo.load_model``.
+        seen: the cloud.
+        model: the weights, as for ``seen``.
         resolution: cells along the longest side of the object's box.
-        frame: the cloud's axes: "camera" is x right, y down, z forward from the camera at the origin; "scanner" is y
-            up, z toward the scanner.
         label_points: also say on which segment each point of the cloud lies (``Reconstruction.observed``).
-        keep_all: drop no strays, see ``readings``; else ``Reconstruction.reading`` says which.
 
-    Raises ``ValueError`` for unusable clouds, and where the model finds no segment at all.
+    Raises ``ValueError`` where the model finds no segment at all.
     """
-    seen = encode_frame(readings(cloud, frame, keep_all)[0], model, frame)
-    return extract(seen, model, resolution, label_points)
-
-
-def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_points: bool = False) -> Reconstruction:
-    """The other steps of ``reconstruct``, with its arguments; raises ``ValueError`` where no segment is found."""
     names, colors = segment_names(model)
     seconds, code = dict(seen.timings_s), seen.code
     field: Field = partial(model.logits, code)

@@ -15,7 +15,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from mereo.fitting.registration.register import Registrar, registrar_for
+from mereo.api.objects import Method, Object, load_object
+from mereo.api.reconstruct import reconstruct
+from mereo.api.result import Result
+from mereo.fitting.registration.register import Registrar
 from mereo.io.atomic_files import to_json
 from mereo.io.foreseen import is_foreseen, words_of
 from mereo.io.sensor_frame import read_frame
@@ -25,13 +28,9 @@ from mereo.models.config import Precision
 from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.reconstruction.observation import Observation, find_object
-from mereo.reconstruction.pipeline import EncodedFrame, encode_frames
-from mereo.reconstruction.strays import readings
 from mereo.serving.messages import JSON, Begin, Finish, FrameRequest, Ready, Reply, Served, Setup
 from mereo.serving.refusals import FAULT, failed
-from mereo.visualization.answering import answer
-from mereo.visualization.result import Result
-from mereo.visualization.result_files import radii_of, summarize
+from mereo.visualization.result_files import radii_of, summary_of
 
 LOG = logging.getLogger("mereo.serving")
 
@@ -49,23 +48,34 @@ class Loaded:
 
     Attributes:
         served: as they are served.
-        model: on its device, known by the name that clients use.
-        registrar: of the object's own model; None where the network alone answers.
+        object: its network on its device, known by the name that clients use.
+        method: who answers.
     """
 
     served: Served
-    model: Model
-    registrar: Registrar | None
+    object: Object
+    method: Method
 
     @classmethod
     def of(cls, served: Served, setup: Setup) -> "Loaded":
         """Load weights, and make what every frame needs; raises as ``load_for`` and ``registrar_for`` do."""
         model = replace(load_for(served.weights, setup.inference), name=served.name)
-        registrar = registrar_for(model, setup.fit, served.scene)
+        loaded = cls(served, load_object(model, served.scene), "network" if setup.fit == "off" else setup.fit)
+        registrar = loaded.registrar
         if registrar is not None and registrar.choice != "modes":
             _ = registrar.at_hand  # takes seconds, once
         _ = model.inference
-        return cls(served, model, registrar)
+        return loaded
+
+    @property
+    def model(self) -> Model:
+        """The network."""
+        return self.object.model
+
+    @property
+    def registrar(self) -> Registrar | None:
+        """Registrar of the object's own model; None where the network alone answers."""
+        return self.object.registrar(self.method)
 
     def facts(self) -> dict[str, Any]:
         """What clients may know of the weights."""
@@ -97,14 +107,12 @@ class Begun:
         observation: the object in the frame.
         told: warnings so far, for the client.
         read_s: seconds of reading.
-        encoded: what the network made of the likelier reading, where frames were encoded together.
     """
 
     request: FrameRequest
     observation: Observation
     told: list[str]
     read_s: float
-    encoded: EncodedFrame | None = None
 
 
 @dataclass(eq=False)
@@ -146,7 +154,6 @@ class Answerer:
             except Exception as error:
                 self._begun.append(None)
                 replies.append(refusal(error, frame))
-        self._encode([one for one in self._begun if one is not None])
         return replies
 
     def finish(self, number: int) -> Reply:
@@ -170,33 +177,15 @@ class Answerer:
             seen = find_object(read, frame.isolation)
         return Begun(frame, seen, told, time.perf_counter() - started)
 
-    def _encode(self, begun: list[Begun]) -> None:
-        """Encode frames together, where there are several; one alone is encoded as it is answered."""
-        if len(begun) < 2:
-            return
-        model = self.loaded[begun[0].request.weights].model
-        likelier = [
-            (readings(one.observation.cloud, one.observation.frame.axes, one.request.isolation.keep_all)[0], axes)
-            for one in begun
-            for axes in [one.observation.frame.axes]
-        ]
-        try:
-            encoded = encode_frames(likelier, model)
-        except ValueError:  # an unusable cloud among them, which says so when it is encoded alone
-            return
-        for one, code in zip(begun, encoded, strict=True):
-            one.encoded = code
-
     def _answer(self, begun: Begun) -> Reply:
         request, loaded = begun.request, self.loaded[begun.request.weights]
         with taken_warnings(begun.told, request):
-            found = answer(
+            found = reconstruct(
                 begun.observation,
-                loaded.model,
-                loaded.registrar,
-                request.resolution,
+                loaded.object,
+                loaded.method,
+                resolution=request.resolution,
                 isolation=request.isolation,
-                encoded=begun.encoded,
             )
         started = time.perf_counter()
         body = json_of(found, begun.told) if request.media == JSON else glb_of(found, request)
@@ -210,11 +199,7 @@ class Answerer:
 
 def json_of(found: Result, told: list[str]) -> bytes:
     """Content of summary.json, and what was warned of."""
-    frame, registered = found.seen.frame, found.registered
-    sure = None if registered is None else registered.uncertainty
-    facts = {"frame": frame.axes, "unit_m": frame.unit_m, **found.facts()}
-    summary = summarize(found.reconstruction, sure, **facts)
-    return encoded_json({**summary, "warnings": told})
+    return encoded_json({**summary_of(found), "warnings": told})
 
 
 def encoded_json(value: Mapping[str, Any]) -> bytes:
@@ -226,7 +211,7 @@ def glb_of(found: Result, request: FrameRequest) -> bytes:
     """Content of segments.glb."""
     frame, path = found.seen.frame, request.folder / "segments.glb"
     to_viewer, radii = viewer_rotation(frame.axes), radii_of(found.registered)
-    write_segments_glb(path, found.reconstruction.surfaces, to_viewer, frame.unit_m, radii)
+    write_segments_glb(path, found.reconstruction.surfaces, to_viewer, frame.metres, radii)
     return path.read_bytes()
 
 

@@ -11,9 +11,11 @@ from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.evaluation.scoring import CELLS, evaluate, trained_scene
 from mereo.evaluation.tables import markdown_table, metrics
 from mereo.fitting.config import FitChoice
+from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried
+from mereo.fitting.registration.register import describe
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.uncertainty.uncertainty import Uncertainty
+from mereo.fitting.registration.state import write_state
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
@@ -30,7 +32,6 @@ from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.elsewhere import for_tasks
 from mereo.models.model import Model
 from mereo.models.weights import load_for
-from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import files_of, load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
@@ -40,7 +41,8 @@ from mereo.visualization.evaluation_report import write_evaluation_report
 from mereo.visualization.pictured import pictured, with_carried
 from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.reconstruction_report import write_report
-from mereo.visualization.units import UNKNOWN, Unit
+from mereo.visualization.result_scene import scene_facts
+from mereo.visualization.units import Unit
 from mereo.workers.config import Cluster
 
 
@@ -142,8 +144,14 @@ def write_evaluation(
     write_evaluation_report(directory / "report.html", found, evaluation.views[0].colors, directory / "errors.png")
 
 
-def summarize(result: Reconstruction, sure: Uncertainty | None = None, **facts: object) -> dict[str, Any]:
-    """Content of ``summary.json``: ``facts``, then how sure it is, each segment and the stages' seconds."""
+# --- answers ----------------------------------------------------------------------------------------------------------
+
+
+def summary_of(
+    answer: Answer, carried: Sequence[Carried] = (), timings_s: Mapping[str, float] | None = None
+) -> dict[str, Any]:
+    """Content of ``summary.json``: facts of the frame, how sure the answer is, each segment, the stages' seconds."""
+    result, frame = answer.reconstruction, answer.seen.frame
     segments: list[dict[str, Any]] = [
         {
             "name": found.name,
@@ -158,117 +166,108 @@ def summarize(result: Reconstruction, sure: Uncertainty | None = None, **facts: 
         }
         for found, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]
-    told: dict[str, Any] = {}
+    radii: dict[str, Any] = {}
+    sure = None if answer.registered is None else answer.registered.uncertainty
     if sure is not None:
-        told["radius95"] = {**sure.summary(), "unit_m": facts.get("unit_m")}
+        radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
         for row, one in zip(segments, sure.segments, strict=True):
             row |= {"centroid_radius95": one.centroid_radius95, "volume95": list(one.volume95)}
     return {
-        **facts,
-        **told,
+        "frame": frame.axes,
+        "unit_m": frame.unit_m,
+        **frame_facts(answer, carried),
+        **radii,
         "nested": [list(pair) for pair in result.surfaces.nested],
         "spacing": float(result.labels.spacing[0]),
         "evaluated_points": result.evaluated,
         "clipped": result.clipped,
         "calibrated": result.calibrated,
         "segments": segments,
-        "timings_s": result.timings_s,
+        "timings_s": dict(result.timings_s if timings_s is None else timings_s),
     }
 
 
-def write_reconstruction(
-    result: Reconstruction,
-    cloud: PointCloud,
-    output_dir: str | Path,
-    *,
-    frame: CloudAxes = "camera",
-    files: FilesConfig = DEFAULT_FILES,
-    unit_m: float | None = None,
-    force: bool = False,
-    **facts: object,
+def frame_facts(answer: Answer, carried: Sequence[Carried] = ()) -> dict[str, object]:
+    """Facts of a summary about the frame, what answered it, and whether it shows the object."""
+    seen, model, registrar = answer.seen, answer.model, answer.registrar
+    facts: dict[str, object] = {
+        "title": seen.frame.source,
+        "weights": model.name,
+        "resolution": answer.resolution,
+        "points": len(seen.cloud),
+    }
+    if registrar is not None:
+        facts["registration"] = registration_facts(answer)
+    facts["recognition"] = answer.recognition.facts()
+    facts |= {"device": model.device.type, "precision": model.working_precision}
+    if carried:
+        facts["carried"] = [one.facts() for one in carried]
+    return {**facts, **seen.facts(), **scene_facts(None if registrar is None else registrar.given)}
+
+
+def registration_facts(answer: Answer) -> dict[str, object]:
+    """Facts of a summary about where an answer comes from."""
+    source = "registration" if answer.taken else "network"
+    if answer.registration is None:
+        return {"answer": source, "refusal": answer.refusal}
+    return {"answer": source, **describe(answer.registration)}
+
+
+def write_answer(
+    directory: Path, answer: Answer, files: FilesConfig = DEFAULT_FILES, carried: Sequence[Carried] = ()
 ) -> None:
-    """Write preview.png, report.html and ``files`` into a new directory, all or nothing.
+    """Write preview.png, report.html, the state and ``files`` of an answer into a directory that is there.
 
     By default these are segments.glb, labels.npz and summary.json; ``mereo.io.writers.formats.WRITERS`` names all. The
-    format "points" needs ``reconstruct(..., label_points=True)``. ``unit_m`` is metres per unit of the cloud; without
-    it files that need one take metres, and the report has plain units. ``facts`` (``title``, ...) are added to the
-    summary and shown in the report. Raises ``FileExistsError`` for a directory with content unless ``force``, and
-    ``ImportError`` where a format's extra is missing.
-    """
-    with new_directory(output_dir, force) as directory:
-        metres = 1.0 if unit_m is None else unit_m
-        write_files(directory, result, cloud, frame, files, metres, facts, unit=Unit(unit_m))
-
-
-def write_files(
-    directory: Path,
-    result: Reconstruction,
-    cloud: PointCloud,
-    frame: CloudAxes,
-    files: FilesConfig,
-    unit_m: float,
-    facts: dict[str, object],
-    carried: Sequence[Carried] = (),
-    unit: Unit = UNKNOWN,
-    registered: Registration | None = None,
-) -> None:
-    """Write what ``write_reconstruction`` does into a directory that is there; ``facts`` go into the summary.
-
-    ``unit`` is that of the report, which tells no metres where they were only assumed. ``registered`` is the model that
-    the result is, in the input's frame (``Answer.registered``): then files, summary and report say how sure it is.
+    format "points" needs an answer with ``label_points``. Files that need metres take the frame's unit for them where
+    it is not known.
 
     What is carried goes into ``carried/`` under its files' own names; its surfaces also into pictures and report, and
     together with the segments into ``carried.glb``, where GLB is asked for.
+
+    Raises ``ValueError`` where the network answers and finds no segment, ``ImportError`` where a format's extra is
+    missing.
     """
+    result, frame, cloud = answer.reconstruction, answer.seen.frame, answer.seen.cloud
     started = time.perf_counter()
     formats = chosen_formats(files.formats)
-    to_viewer = viewer_rotation(frame)
-    radii, sure = radii_of(registered), None if registered is None else registered.uncertainty
-    results = Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, unit_m, radii)
+    results, to_viewer = _results(answer, files), viewer_rotation(frame.axes)
     write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
     for one in carried:
-        write_attachment(directory / "carried" / one.name, one.content, results.factor, to_viewer, unit_m)
+        write_attachment(directory / "carried" / one.name, one.content, results.factor, to_viewer, frame.metres)
     shown = with_carried(result.surfaces, carried)
     if "glb" in formats and len(shown.segments) > len(result.surfaces.segments):
-        write_segments_glb(directory / "carried.glb", shown, to_viewer, unit_m)
+        write_segments_glb(directory / "carried.glb", shown, to_viewer, frame.metres)
     drawn = pictured(shown)
-    write_preview(directory / "preview.png", drawn, cloud, frame, facts)
-    timings_s = {**result.timings_s, "write": time.perf_counter() - started}
-    summary = summarize(replace(result, timings_s=timings_s), sure, **{"frame": frame, "unit_m": unit_m, **facts})
+    write_preview(directory / "preview.png", drawn, cloud, frame.axes, frame.source)
+    summary = summary_of(answer, carried, {**result.timings_s, "write": time.perf_counter() - started})
     extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
-    told = [*({"name": part.name} for part in extra), *summary["segments"]]
-    write_report(directory / "report.html", cloud, drawn, {**summary, "segments": told}, to_viewer, unit, registered)
+    rows = [*({"name": part.name} for part in extra), *summary["segments"]]
+    page, unit = {**summary, "segments": rows}, Unit(frame.unit_m)
+    write_report(directory / "report.html", cloud, drawn, page, to_viewer, unit, answer.registered)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
+    write_state(directory, answer)
 
 
-def write_one(
-    path: Path,
-    suffix: str,
-    result: Reconstruction,
-    cloud: PointCloud,
-    frame: CloudAxes,
-    files: FilesConfig,
-    unit_m: float,
-    facts: dict[str, object],
-    unit: Unit = UNKNOWN,
-    registered: Registration | None = None,
-) -> None:
+def write_answer_file(path: Path, suffix: str, answer: Answer, files: FilesConfig) -> None:
     """Write the one file of a folder of results that has this suffix (".glb", ".html", ...) to a path."""
-    if suffix in (".png", ".html"):
-        drawn = pictured(result.surfaces)
-        if suffix == ".png":
-            write_preview(path, drawn, cloud, frame, facts)
-            return
-    sure = None if registered is None else registered.uncertainty
-    summary = summarize(result, sure, **{"frame": frame, "unit_m": unit_m, **facts})
-    if suffix == ".html":
-        write_report(path, cloud, drawn, summary, viewer_rotation(frame), unit, registered)
-        return
-    (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
-    chosen_formats([name])
-    surfaces, labels, turn = result.surfaces, result.labels, viewer_rotation(frame)
-    results = Results.of(surfaces, labels, result.observed, turn, files, unit_m, radii_of(registered))
-    WRITERS[name].write(path, replace(results, summary=summary))
+    result, frame, cloud = answer.reconstruction, answer.seen.frame, answer.seen.cloud
+    if suffix == ".png":
+        write_preview(path, pictured(result.surfaces), cloud, frame.axes, frame.source)
+    elif suffix == ".html":
+        drawn, summary, unit = pictured(result.surfaces), summary_of(answer), Unit(frame.unit_m)
+        write_report(path, cloud, drawn, summary, viewer_rotation(frame.axes), unit, answer.registered)
+    else:
+        (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
+        chosen_formats([name])
+        WRITERS[name].write(path, replace(_results(answer, files), summary=summary_of(answer)))
+
+
+def _results(answer: Answer, files: FilesConfig) -> Results:
+    """What the writers of all formats are given."""
+    result, frame = answer.reconstruction, answer.seen.frame
+    radii, to_viewer = radii_of(answer.registered), viewer_rotation(frame.axes)
+    return Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, frame.metres, radii)
 
 
 def radii_of(registered: Registration | None) -> Radii | None:
@@ -278,11 +277,8 @@ def radii_of(registered: Registration | None) -> Radii | None:
     return registered.uncertainty.radii(registered.material)
 
 
-def write_preview(
-    path: Path, surfaces: SegmentedMesh, cloud: PointCloud, frame: CloudAxes, facts: dict[str, object]
-) -> None:
+def write_preview(path: Path, surfaces: SegmentedMesh, cloud: PointCloud, frame: CloudAxes, title: str) -> None:
     """Write the picture of cloud and segments, both turned as a camera sees them."""
     to_camera = camera_axes(frame)
     seen = PointCloud(transform_points(to_camera, cloud.points))
-    title = str(facts.get("title", "mereo reconstruction"))
     render_cloud_and_segments(path, seen, surfaces.transformed(to_camera), title)

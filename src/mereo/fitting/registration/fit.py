@@ -226,7 +226,7 @@ def fit_frame(
     scene_unit: float | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
     code: EncodedCloud | None = None,
-    stated_unit: float | None = None,
+    is_certain: bool = True,
     doubtful: Float[np.ndarray, "d 3"] | None = None,
 ) -> ModesFit:
     """Fit of the modes to a cloud, from the network's correspondences.
@@ -238,7 +238,7 @@ def fit_frame(
         scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
         config: constants.
         code: of the cloud, where it is known already.
-        stated_unit: what the input says that ``scene_unit`` is, which is believed where the correspondences agree.
+        is_certain: whether ``scene_unit`` is that for certain; else it is believed where the correspondences agree.
         doubtful: points that were left out of the cloud as strays.
 
     Raises ``ValueError`` for a network without rest coordinates or of other segments, and where it finds too little.
@@ -251,8 +251,8 @@ def fit_frame(
         )
     code = network.encode(cloud) if code is None else code
     found = _asked(network, model, code)
-    if scene_unit is None and stated_unit is not None and agree(estimate_unit(found), stated_unit):
-        scene_unit = stated_unit
+    if scene_unit is not None and not is_certain and not agree(estimate_unit(found), scene_unit):
+        scene_unit = None
     asked = time.perf_counter() - started
 
     def ask(points: Float[np.ndarray, "s 3"]) -> Correspondences:

@@ -1,6 +1,6 @@
 """Is it my object, in a state that I know? One answer from what a fit and the network leave unexplained.
 
-    Registration, correspondences, stated unit -Signs.of-> Signs -recognize-> Recognition (known or not, and why)
+    Registration, correspondences, stated scene unit -Signs.of-> Signs -recognize-> Recognition (known or not, and why)
 
 A sign is a number that is small for the object in states that were learned, and grows with what is wrong. Views of the
 object say how large it usually is, clean and under a camera's noise (``Calibration.recognizing``; conservative values
@@ -15,11 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mereo.fitting.registration.fit import ModesFit
-from mereo.fitting.registration.readings import FittedFrame
 from mereo.fitting.registration.registration import BELIEVED, Registration
 from mereo.models.calibration import Calibration, Recognizing, SignName, Usual
-from mereo.models.model import Model
 
 Known = bool | Literal["unsure"]
 
@@ -94,12 +91,12 @@ class Signs:
 
     @classmethod
     def of(
-        cls, registration: Registration, displaced: float | None = None, stated_unit: float | None = None
+        cls, registration: Registration, displaced: float | None = None, stated_scene_unit: float | None = None
     ) -> "Signs":
-        """Signs of a registration; ``stated_unit`` is the length of a scene unit in its unit as the input says it."""
+        """Signs of a registration; ``stated_scene_unit`` is the length of a scene unit in its unit as the input says it."""
         at_rest, z = registration.method == "rest", registration.modes_z  # at rest it is known, whatever was learned
         return cls(
-            size=None if stated_unit is None else abs(float(np.log(registration.scene_unit / stated_unit))),
+            size=None if stated_scene_unit is None else abs(float(np.log(registration.scene_unit / stated_scene_unit))),
             unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, LEAST_LEFT),
             ruled_out=registration.ruled_out,
             beyond=None if at_rest else registration.beyond_states,
@@ -180,7 +177,7 @@ def recognize(
     registration: Registration | None,
     calibration: Calibration | None = None,
     displaced: float | None = None,
-    stated_unit: float | None = None,
+    stated_scene_unit: float | None = None,
     refusal: str | None = None,
 ) -> Recognition:
     """Whether a frame shows the object, in a state that was learned.
@@ -189,14 +186,14 @@ def recognize(
         registration: of the object's model to the frame; None where none was found or none was asked for.
         calibration: of the weights, with what is usual.
         displaced: as in ``Signs``.
-        stated_unit: length of a scene unit in the frame's unit, where the input states that.
+        stated_scene_unit: length of a scene unit in the frame's unit, where the input states that.
         refusal: why no registration was found; None where none was asked for, and then it cannot be told.
     """
     if registration is None:
         return NOT_ASKED if refusal is None else Recognition(False, refusal, MOST)
     own = None if calibration is None else calibration.recognizing
     limits = CONSERVATIVE if own is None else own
-    signs = Signs.of(registration, displaced, stated_unit)
+    signs = Signs.of(registration, displaced, stated_scene_unit)
     each = signs.strange(limits.noisy if is_noisy(registration) else limits.clean)
     total = strangeness(each)
     is_unit_wrong = signs.size is not None and signs.size > WRONG_UNIT
@@ -205,20 +202,6 @@ def recognize(
     known: Known = False if total >= limits.refused or is_unit_wrong else "unsure"
     reason = REASONS["size" if is_unit_wrong else max(each, key=lambda name: each[name])](registration, signs)
     return Recognition(known, reason, total, signs, own is not None)
-
-
-def displaced_of(modes: ModesFit, registration: Registration) -> float | None:
-    """``Signs.displaced`` of a registration made of a fit of the modes."""
-    return modes.found.displaced(registration.model, registration.material / modes.unit)
-
-
-def recognized(
-    found: FittedFrame, registration: Registration | None, model: Model, stated_unit: float | None = None
-) -> Recognition:
-    """Whether a frame shows the object that ``registration``, made of it, is of."""
-    displaced = None if registration is None or found.modes is None else displaced_of(found.modes, registration)
-    refusal = None if found.error is None else str(found.error)
-    return recognize(registration, model.calibration, displaced, stated_unit, refusal)
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------

@@ -115,30 +115,33 @@ class Registrar:
         object.__setattr__(moved, "network", network)  # `replace` would forget what is cached
         return moved
 
-    def stated_unit(self, unit_m: float) -> float | None:
-        """Length of a scene unit in a cloud's unit of ``unit_m`` metres; None where the object's size is not known."""
+    def stated_scene_unit(self, unit_m: float | None) -> float | None:
+        """Length of a scene unit in a frame's unit of ``unit_m`` metres; None where that or the object's is unknown."""
         frame = self.model.source_frame
-        return None if frame is None or frame.unit_m is None else frame.unit_m / unit_m
+        return None if unit_m is None or frame is None or frame.unit_m is None else frame.unit_m / unit_m
+
+    def unit_of(self, registration: Registration) -> float | None:
+        """Metres per unit of a registered frame, by the object's true size; None where that is not known."""
+        frame = self.model.source_frame
+        return None if frame is None or frame.unit_m is None else frame.unit_m / registration.scene_unit
 
     def fit_modes(
         self,
         seen: PointCloud,
         code: EncodedCloud | None = None,
         scene_unit: float | None = None,
-        stated_unit: float | None = None,
+        is_certain: bool = True,
         doubtful: Float[np.ndarray, "d 3"] | None = None,
     ) -> ModesFit:
         """Fit of the modes, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
-        return fit_frame(
-            seen, self.network, self.model, scene_unit, self.config, code, stated_unit=stated_unit, doubtful=doubtful
-        )
+        return fit_frame(seen, self.network, self.model, scene_unit, self.config, code, is_certain, doubtful)
 
     def register(
         self,
         seen: PointCloud,
         code: EncodedCloud | None = None,
         scene_unit: float | None = None,
-        stated_unit: float | None = None,
+        is_certain: bool = True,
     ) -> Registration:
         """Registration of the model to a cloud, as ``choice`` says.
 
@@ -146,11 +149,11 @@ class Registrar:
             seen: observed points, camera frame, any unit.
             code: what ``network`` made of them, where it is known already.
             scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
-            stated_unit: the same as the input states it, believed only where the network's own estimate agrees.
+            is_certain: whether it is that for certain; else only where the network's own estimate agrees.
 
         Raises ``ValueError`` as ``fit_frame`` does.
         """
-        return self.finish(self.fit_modes(seen, code, scene_unit, stated_unit))
+        return self.finish(self.fit_modes(seen, code, scene_unit, is_certain))
 
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer from a fit of the modes: the draws too where ``choice`` asks for them."""

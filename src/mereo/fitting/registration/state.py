@@ -59,7 +59,7 @@ def state_of(
     *,
     weights: str = "",
     frame: CloudAxes = "camera",
-    unit_m: float = 1.0,
+    unit_m: float | None = None,
     T_camera_input: Float[np.ndarray, "4 4"] | None = None,
 ) -> RegistrationState:
     """State of a registration.
@@ -69,7 +69,7 @@ def state_of(
         scene: of the object; for modes its name is enough.
         weights: how they were named, so that the viewer finds them.
         frame: axes of the input.
-        unit_m: metres in the input's unit.
+        unit_m: metres in the input's unit; None where that is not known.
         T_camera_input: from the input's frame to the camera frame; by default they are the same.
 
     Raises ``ValueError`` for draws without their scene.
@@ -108,21 +108,20 @@ def state_of(
     )
 
 
-def write_state(
-    directory: Path, found: Answer, registrar: Registrar | None, weights: str, frame: CloudAxes, unit_m: float
-) -> None:
+def write_state(directory: Path, answer: Answer) -> None:
     """Write the state of an answer into a folder of results, where the answer is a registered model."""
-    if registrar is None or found.registration is None or not found.taken:
+    registrar = answer.registrar
+    if registrar is None or answer.registration is None or not answer.taken:
         return
     known = registrar.given.name if registrar.given is not None else str(registrar.network.provenance.get("scene"))
-    scene = registrar.scene if found.registration.method == "draws" else None
+    scene = registrar.scene if answer.registration.method == "draws" else None
     state = state_of(
-        found.registration,
+        answer.registration,
         known if scene is None else scene,
-        weights=weights,
-        frame=frame,
-        unit_m=unit_m,
-        T_camera_input=found.reconstruction.T_camera_input,
+        weights=answer.model.name,
+        frame=answer.seen.frame.axes,
+        unit_m=answer.seen.frame.unit_m,
+        T_camera_input=answer.T_camera_input,
     )
     save_state(directory / STATE, state)
 

@@ -87,7 +87,7 @@ class RegistrationState(Block):
         draws: what plays the draws; None for modes.
         T_camera_model: rigid pose of the model in the camera frame, its translation in the input's unit.
         scene_unit: length of a scene unit in the input's unit.
-        unit_m: metres in the input's unit.
+        unit_m: metres in the input's unit; None where that is not known.
         frame: axes of the input.
         T_camera_input: from the input's frame to the camera frame.
         unit_known, explained, accepted, seconds: as in ``Registration``.
@@ -105,7 +105,7 @@ class RegistrationState(Block):
     draws: StateDraws | None
     T_camera_model: Pose
     scene_unit: Scale
-    unit_m: Scale
+    unit_m: Scale | None
     frame: CloudAxes
     T_camera_input: Pose
     explained: Annotated[FiniteFloat, Field(ge=0, le=1)]

@@ -17,6 +17,8 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scoring import check_names, predict_grid
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.register import Registrar, registrar_for
 from mereo.fitting.registration.registration import Registration
@@ -25,11 +27,10 @@ from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.transforms import inverse_rigid
 from mereo.models.model import Model
+from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction, segment_names
 from mereo.scenes.scene import Scene
 from mereo.synthesis.examples import View
-from mereo.visualization.answering import answer
-from mereo.visualization.result import Result
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom
 from mereo.visualization.viewer.probe import source_of
 from mereo.visualization.viewer.sight import Sensing, Sight, see
@@ -62,14 +63,14 @@ class Trial:
     """Answer to a view, and how good it is.
 
     Attributes:
-        result: in the camera frame, as `mereo reconstruct` gives it.
+        answer: in the camera frame, as `mereo reconstruct` gives it.
         source: where it comes from, in a phrase.
         scores: against the truth, on ``cells`` ** 3 cells.
         cells: the paper takes 100; fewer are faster and a little off.
         seconds: of the reconstruction.
     """
 
-    result: Result
+    answer: Answer
     source: str
     scores: Scores
     cells: int
@@ -78,7 +79,7 @@ class Trial:
     @property
     def reconstruction(self) -> Reconstruction:
         """Segments that were found."""
-        return self.result.reconstruction
+        return self.answer.reconstruction
 
 
 class QuickRegistrar(Registrar):
@@ -161,7 +162,7 @@ class Laboratory:
             )
         return Sight(mesh, seen.image, T_world_camera, state.deformations, hidden)
 
-    def answer(self, view: View, resolution: int = 128, quick: bool = False) -> Result:
+    def answer(self, view: View, resolution: int = 128, quick: bool = False) -> Answer:
         """Answer to what is seen, as `mereo reconstruct` gives it.
 
         ``quick`` never fits the scene's own draws, which takes seconds. Raises ``ValueError`` without a model, and
@@ -170,22 +171,24 @@ class Laboratory:
         if self.model is None:
             raise ValueError("there are no weights; a reconstruction needs them: name them with --weights")
         registrar = self.quick_registrar if quick else self.registrar
-        return answer(view.depth, self.model, registrar or "off", resolution, unit_m=self.scene.unit_m)
+        seen = observe(view.depth.to_points(), unit_m=self.scene.unit_m)
+        return answer_frame(seen, self.model, registrar, resolution=resolution)
 
     def rebuild(self, view: View, resolution: int, cells: int, quick: bool = False) -> Trial:
         """Answer to what is seen, scored on a grid of ``cells`` cells a side; raises as ``answer`` does."""
         start = time.perf_counter()
-        result = self.answer(view, resolution, quick)
+        answer = self.answer(view, resolution, quick)
+        reconstruction = answer.reconstruction
         seconds = time.perf_counter() - start
         assert self.model is not None
         truth = truth_grid(view.mesh, cells)
-        if result.taken:
-            predicted = label_grid(result.reconstruction.surfaces, *truth.grid.axes())
+        if answer.taken:
+            predicted = label_grid(reconstruction.surfaces, *truth.grid.axes())
         else:
-            predicted = predict_grid(self.model, result.reconstruction.code, truth)
+            predicted = predict_grid(self.model, reconstruction.code, truth)
         confusion = grid_confusion(truth, predicted, len(segment_names(self.model)[0]))
         scores = intersection_over_union(confusion, self.model.segmented)
-        return Trial(result, source_of(result, result.registrar), scores, cells, seconds)
+        return Trial(answer, source_of(answer), scores, cells, seconds)
 
 
 def depth_picture(depth: DepthImage, factor: int = 1) -> UInt8[np.ndarray, "h w 3"]:

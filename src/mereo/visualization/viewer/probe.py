@@ -65,14 +65,14 @@ class Inspection:
     registration: Registration | None = None
 
     @classmethod
-    def of_answer(cls, found: FrameAnswer, model: Model, registrar: Registrar | None) -> "Inspection":
+    def of_answer(cls, found: FrameAnswer) -> "Inspection":
         """Answer that is there already, with what it was asked from."""
         result = found.reconstruction
         return cls(
             surfaces=result.surfaces,
             T_camera_input=result.T_camera_input,
-            model=model,
-            source=source_of(found, registrar),
+            model=found.model,
+            source=source_of(found),
             cloud=result.reading.cloud,
             code=result.code,
             registration=found.registration if found.taken else None,
@@ -142,9 +142,9 @@ class Inspection:
         return direction @ self.T_camera_input[:3, :3]
 
 
-def source_of(found: FrameAnswer, registrar: Registrar | None) -> str:
+def source_of(found: FrameAnswer) -> str:
     """Where an answer comes from, in a phrase for people."""
-    if registrar is None:
+    if found.registrar is None:
         return "network alone: the weights carry no statistical model"
     if found.registration is not None and found.taken:
         return explained(found.registration, found.recognition)

@@ -1,9 +1,6 @@
 """Page of an answer that is there already: what ``Result.show`` opens."""
 
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.register import Registrar
-from mereo.models.model import Model
-from mereo.reconstruction.observation import Observation
 from mereo.visualization.units import Unit
 from mereo.visualization.viewer.display import import_viser, start_server
 from mereo.visualization.viewer.frame_page import FramePage
@@ -12,17 +9,16 @@ from mereo.visualization.viewer.open_page import OpenPage
 from mereo.visualization.viewer.probe import Inspection
 
 
-def open_answer(
-    found: Answer, seen: Observation, model: Model, registrar: Registrar | None, unit: Unit, *, port: int, host: str
-) -> OpenPage:
-    """Page of an answer, on the frame that it was given to; ``unit`` is that of its lengths.
+def open_answer(answer: Answer, *, port: int, host: str) -> OpenPage:
+    """Page of an answer, on the frame that it was given to.
 
     Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
     """
     import_viser()
-    inspection = Inspection.of_answer(found, model, registrar)
+    seen = answer.seen
+    inspection = Inspection.of_answer(answer)
     entry = Entry.of(host)
     server = start_server(port, "mereo", entry)
-    facts = f"{len(seen.cloud):,} points · weights {model.name or 'of this program'}"
-    FramePage(server, inspection, seen.frame.source, facts, unit)
+    facts = f"{len(seen.cloud):,} points · weights {answer.model.name or 'of this program'}"
+    FramePage(server, inspection, seen.frame.source, facts, Unit(seen.frame.unit_m))
     return OpenPage(server, entry)

@@ -14,11 +14,13 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mereo.evaluation.sample_views import GUESSED_UNIT_M
+from mereo.fitting.registration.answer import Answer
 from mereo.io.intrinsics import written_intrinsics
+from mereo.io.output_folders import new_directory
 from mereo.io.writers.ply import write_positions_ply
 from mereo.scenes.scene import Scene
 from mereo.synthesis.examples import View
-from mereo.visualization.result import Result
+from mereo.visualization.result_files import write_answer
 
 
 def file_name(scene: Scene, what: str) -> str:
@@ -45,12 +47,15 @@ def frame_archive(scene: Scene, view: View) -> bytes:
         return zipped(folder)
 
 
-def result_archive(scene: Scene, result: Result) -> bytes:
+def result_archive(scene: Scene, answer: Answer) -> bytes:
     """Folder of results as `mereo reconstruct` writes it."""
-    frame = replace(result.seen.frame, path=Path(scene.name), message="laboratory")
-    named = replace(result, seen=replace(result.seen, frame=frame))
+    frame = replace(answer.seen.frame, path=Path(scene.name), message="laboratory")
+    named = replace(answer, seen=replace(answer.seen, frame=frame))
     with TemporaryDirectory() as place:
-        return zipped(named.save(Path(place) / file_name(scene, "result")))
+        folder = Path(place) / file_name(scene, "result")
+        with new_directory(folder) as directory:
+            write_answer(directory, named)
+        return zipped(folder)
 
 
 def zipped(folder: Path) -> bytes:

@@ -17,6 +17,7 @@ from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.config import InferenceConfig
 from mereo.models.weights import load_for, shipped_names
+from mereo.reconstruction.observation import observe
 from mereo.synthesis.recording import Recording
 from mereo.visualization.viewer import html
 from mereo.visualization.viewer.display import (
@@ -71,7 +72,7 @@ def following(recording: Recording, weights: str, inference: InferenceConfig) ->
 
     def answer(number: int) -> SegmentedMesh | None:
         try:
-            found = tracker.follow(recording.cloud(number), recording.times_s[number], scene_unit=unit)
+            found = tracker.follow(observe(recording.cloud(number)), recording.times_s[number], scene_unit=unit)
         except (ValueError, OSError):  # a frame that shows nothing; the object may come again
             return None
         return found.surfaces if found.taken else None

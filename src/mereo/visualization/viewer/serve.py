@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from mereo.evaluation.sample_views import load_frame, shipped_views
-from mereo.fitting.registration.register import statistical_model_of
+from mereo.evaluation.sample_views import shipped_frame, shipped_views
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.register import registrar_for, statistical_model_of
 from mereo.fitting.registration.state import played_state, restored
 from mereo.fitting.registration.state_file import RegistrationState, is_state, read_state
 from mereo.io.config import InputConfig
@@ -20,10 +22,8 @@ from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.synthesis.recording import is_recording_folder, read_recording
-from mereo.visualization.answering import answer
-from mereo.visualization.result import Result
 from mereo.visualization.result_scene import scene_of_result
-from mereo.visualization.units import UNKNOWN, Unit
+from mereo.visualization.units import Unit
 from mereo.visualization.viewer.display import import_viser, start_server
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom, ModeShapes
@@ -40,7 +40,7 @@ PORT = 8080
 
 
 def view(
-    input: str | Path | Result | None = None,
+    input: str | Path | Answer | None = None,
     weights: str | Path | None = None,
     *,
     scene: str | None = None,
@@ -75,8 +75,8 @@ def view(
     """
     block = not is_interactive() if block is None else block
     place = (PORT if block else 0) if port is None else port
-    if isinstance(input, Result):
-        return input.show(port=place, host=host, block=block)
+    if isinstance(input, Answer):
+        return open_answer(input, port=place, host=host).stay(block)
     path, known = (None if value is None else Path(value) for value in (input, state))
     if known is None and is_state(path):
         path, known = None, path
@@ -112,7 +112,7 @@ def view_frame(
                 f"there is no frame to show and none is shipped for {name!r}; name a depth image or a point cloud, or "
                 f"take the weights of a shipped frame: {', '.join(shipped_views())}"
             )
-        frame, weights = load_frame(name), name
+        frame, weights = shipped_frame(name), name
     elif weights is None:
         raise ValueError(
             f"{input} is given without weights; the model of its object is needed: give --weights, a file or one of "
@@ -121,8 +121,11 @@ def view_frame(
     else:
         frame = read_frame(input, reading or InputConfig())
     model = load_for(weights, inference or InferenceConfig())
-    result = answer(frame, model, "auto", resolution, isolation=isolation)
-    return open_answer(result, result.seen, model, result.registrar, result.unit, port=port, host=host)
+    isolation = isolation or IsolationConfig()
+    seen = find_object(frame, isolation)
+    registrar = registrar_for(model, "auto")
+    answer = answer_frame(seen, model, registrar, keep_all=isolation.keep_all, resolution=resolution)
+    return open_answer(answer, port=port, host=host)
 
 
 def view_state(
@@ -141,10 +144,11 @@ def view_state(
     state = read_state(path)
     seen = None if input is None else _seen(input, reading, isolation)
     frame = None if seen is None else seen.frame
-    if frame is not None and (frame.axes, frame.unit_m) != (state.frame, state.unit_m):
+    if frame is not None and (frame.axes != state.frame or frame.unit_m not in (None, state.unit_m)):
         raise ValueError(
-            f"{input} is read with {frame.axes} axes and {frame.unit_m:g} m per unit, but the state has {state.frame} "
-            f"axes and {state.unit_m:g} m; they must be of one frame: give the same --frame and --unit-m as before"
+            f"{input} is read with {frame.axes} axes and {frame.metres:g} m per unit, but the state has {state.frame} "
+            f"axes and {state.unit_m or 1.0:g} m; they must be of one frame: give the same --frame and --unit-m as "
+            "before"
         )
     weights = weights_of(state, weights)
     model = load_for(weights, inference or InferenceConfig())
@@ -155,24 +159,13 @@ def view_state(
     entry = Entry.of(host)
     server = start_server(port, "mereo", entry)
     title = str(path) if frame is None else frame.source
-    FramePage(server, inspection, title, f"{state.scene} · weights {weights}", unit_of(state, frame))
+    FramePage(server, inspection, title, f"{state.scene} · weights {weights}", Unit(state.unit_m))
     return OpenPage(server, entry)
 
 
 def _seen(path: Path, reading: InputConfig | None, isolation: IsolationConfig | None) -> Observation:
     """The object in a file's frame."""
     return find_object(read_frame(path, reading or InputConfig()), isolation or IsolationConfig())
-
-
-def unit_of(state: RegistrationState, frame: SensorFrame | None) -> Unit:
-    """Unit of a state's lengths, where it is known: its frame's, else its own.
-
-    A state does not say whether its metres were stated or assumed; those of a true size, or of another unit than 1 m,
-    were not assumed.
-    """
-    if frame is not None:
-        return Unit(frame.unit_m) if frame.unit_stated else UNKNOWN
-    return Unit(state.unit_m) if state.unit_known or state.unit_m != 1.0 else UNKNOWN
 
 
 def view_scene(

@@ -1,0 +1,122 @@
+"""Find an object in frames: what ``mereo reconstruct`` does with files.
+
+frame -load_frame-> SensorFrame -find_object-> Observation -answer_frame-> Answer -> Result
+"""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, overload
+
+from mereo.api.frames import load_frame
+from mereo.api.objects import Method, Object, object_of
+from mereo.api.result import Result
+from mereo.api.words import SPEAKS_OPTIONS, in_python, python_words
+from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.io.point_arrays import is_frame_list
+from mereo.io.sensor_frame import SensorFrame
+from mereo.models.model import Model
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import Observation, SizeWarning, find_object, size_warning
+
+
+@overload
+def reconstruct(
+    frame: Sequence[Any],
+    object: Object | Model | str | Path,
+    method: Method = ...,
+    *,
+    resolution: int = ...,
+    isolation: IsolationConfig | None = ...,
+    label_points: bool = ...,
+    **reading: Any,
+) -> list[Result]: ...
+
+
+@overload
+def reconstruct(
+    frame: Any,
+    object: Object | Model | str | Path,
+    method: Method = ...,
+    *,
+    resolution: int = ...,
+    isolation: IsolationConfig | None = ...,
+    label_points: bool = ...,
+    **reading: Any,
+) -> Result: ...
+
+
+def reconstruct(
+    frame: Any,
+    object: Object | Model | str | Path,
+    method: Method = "auto",
+    *,
+    resolution: int = 128,
+    isolation: IsolationConfig | None = None,
+    label_points: bool = False,
+    **reading: Any,
+) -> Result | list[Result]:
+    """Find all segments of an object in a frame, hidden side included: what ``mereo reconstruct`` does.
+
+    Args:
+        frame: whatever ``load_frame`` takes, or what it has returned; a list of frames is answered as a list.
+        object: from ``load_object``; or weights, their shipped name or file.
+        method: "auto" takes the registered model where it explains the frame, else the network's surfaces; "network"
+            leaves the network alone; "modes" and "full" take the registered model in any case, "full" by fitting the
+            parameters of its scene as well.
+        resolution: cells along the longest side of the object's box.
+        isolation: what of the frame is left out; lengths in metres, or in the frame's unit where that is not known.
+        label_points: also say on which segment each observed point lies (``Result.reconstruction.observed``).
+        reading: arguments of ``load_frame``: ``axes``, ``unit_m``, ``intrinsics``, ``drop_invalid`` and others.
+
+    Warns with ``SizeWarning`` where the visible part cannot be the object. Raises ``ValueError`` for unusable frames,
+    where nothing is found, and for methods other than "auto" where the model cannot be registered.
+    """
+    with python_words():
+        known = object_of(object)
+        if is_frame_list(frame):
+            return [
+                _reconstruct(one, known, method, resolution, isolation, label_points, reading) for one in frame
+            ]
+        return _reconstruct(frame, known, method, resolution, isolation, label_points, reading)
+
+
+def _reconstruct(
+    frame: Any,
+    object: Object,
+    method: Method,
+    resolution: int,
+    isolation: IsolationConfig | None,
+    label_points: bool,
+    reading: dict[str, Any],
+) -> Result:
+    registrar, isolation = object.registrar(method), isolation or IsolationConfig()
+    seen = observation_of(frame, isolation, reading)
+    answer = answer_frame(
+        seen,
+        object.model,
+        registrar,
+        keep_all=isolation.keep_all,
+        resolution=resolution,
+        label_points=label_points,
+    )
+    if answer.error is not None and method != "auto":
+        raise answer.error
+    result = Result.of(answer)
+    _ = result.reconstruction  # raises where nothing is found
+    warning = size_warning(seen.read_as(answer.hypothesis), object.model.provenance)
+    if warning is not None:
+        warnings.warn(warning if SPEAKS_OPTIONS.get() else in_python(warning), SizeWarning, stacklevel=4)
+    return result
+
+
+def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, Any]) -> Observation:
+    """Object in a frame, whatever holds it."""
+    if isinstance(frame, SensorFrame | Observation):
+        if reading:
+            raise ValueError(
+                f"{', '.join(reading)} is given for a frame that is read already: give it where the frame is read, "
+                "load_frame(..., axes='scanner', unit_m=0.001)"
+            )
+        return frame if isinstance(frame, Observation) else find_object(frame, isolation)
+    return find_object(load_frame(frame, **reading), isolation)

@@ -1,0 +1,252 @@
+"""The result of one frame: every segment with its figures, to be looked at, carried along, saved and shown.
+
+Result[name] -> SegmentResult
+-save-> a folder as of ``mereo reconstruct``, or one file
+-show-> a page in the browser
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.fitting.registration.answer import Answer
+from mereo.geometry.mesh import Segment
+from mereo.geometry.scanner_axes import camera_axes
+from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.io.atomic_files import atomic_file
+from mereo.io.config import DEFAULT_FILES, FilesConfig, Format
+from mereo.io.output_folders import new_directory
+from mereo.io.ros_recordings import is_recording
+from mereo.io.writers.formats import chosen_formats
+from mereo.visualization.result_files import write_answer, write_answer_file
+from mereo.visualization.result_html import result_html
+from mereo.visualization.units import Unit
+
+if TYPE_CHECKING:
+    from mereo.visualization.viewer.open_page import OpenPage
+
+SINGLE = (".glb", ".ply", ".npz", ".vti", ".nii.gz", ".seg.nrrd", ".json", ".html", ".png")
+"""Suffixes of the files that ``Result.save`` writes alone."""
+
+
+Pose = Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentResult:
+    """One segment of a result, in the frame's axes and unit.
+
+    Attributes:
+        name: of the segment.
+        label: its number in label grids, 1 or more.
+        mesh: its closed surface; without faces where it was not found.
+        centroid: of its volume, NaN where it was not found.
+        volume: inside its surface, less what is nested in it; 0 where it was not found.
+        confidence: mean probability that the network gives it over its volume, NaN where it was not found.
+        error_radius: radius around the centroid that holds the true one with probability 0.95; None where the answer
+            is the network's.
+        pose: best rigid motion from the object's own files to the frame, as ``Result.pose``; None likewise.
+    """
+
+    name: str
+    label: int
+    mesh: Segment
+    centroid: Float[np.ndarray, "3"]
+    volume: float
+    confidence: float
+    error_radius: float | None
+    pose: Pose | None
+
+    @property
+    def is_found(self) -> bool:
+        """Whether the frame shows it, or the registered model has it."""
+        return len(self.mesh.faces) > 0
+
+    def __repr__(self) -> str:
+        found = f"volume {self.volume:.3g}, confidence {self.confidence:.2f}" if self.is_found else "not found"
+        return f"SegmentResult({self.name!r}, {found})"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(Answer):
+    """Answer to one frame, its segments by their names; all lengths in the frame's axes and unit.
+
+    What it was made from and who answers is as in ``Answer``.
+    """
+
+    @classmethod
+    def of(cls, answer: Answer) -> "Result":
+        """Result of an answer."""
+        return cls(**{item.name: getattr(answer, item.name) for item in fields(Answer)})
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the segments, in the order of their labels."""
+        return self.surfaces.names
+
+    @property
+    def unit_m(self) -> float | None:
+        """Metres per unit: as the frame states it, or by the true size of the registered object; None if unknown."""
+        return self.seen.frame.unit_m
+
+    @property
+    def known(self) -> bool | str:
+        """Whether the frame shows the object in a state that was learned: True, False or "unsure"."""
+        return self.recognition.known
+
+    def __getitem__(self, name: str) -> SegmentResult:
+        """Segment of a name; raises ``KeyError`` for a name of no segment."""
+        if name not in self._segments:
+            raise KeyError(f"there is no segment {name!r}; the segments are {', '.join(self.names)}")
+        return self._segments[name]
+
+    def __iter__(self) -> Iterator[SegmentResult]:
+        """All segments, in the order of their labels."""
+        return iter(self._segments.values())
+
+    def __len__(self) -> int:
+        """Number of segments."""
+        return len(self.names)
+
+    @cached_property
+    def pose(self) -> Pose | None:
+        """``T_camera_model``: best rigid motion of the whole object from rest to the frame; None without a fit.
+
+        It moves points of the object's own files, once these are in the frame's unit (``model_scale`` times their
+        coordinates), to the frame's axes: those of the camera, but for frames in a scanner's. Points of the scene where
+        the weights do not know the files.
+        """
+        return self._pose(slice(None))
+
+    @property
+    def model_scale(self) -> float | None:
+        """Length of a unit of the object's own files, or of its scene, in the frame's unit; None without a fit."""
+        if self.registered is None:
+            return None
+        source = self.registered.model.source_frame
+        return self.registered.scene_unit * (1.0 if source is None else source.scale)
+
+    @cached_property
+    def _segments(self) -> dict[str, SegmentResult]:
+        sure = None if self.registered is None else self.registered.uncertainty
+        radii = {} if sure is None else {one.name: one.centroid_radius95 for one in sure.segments}
+        return {
+            found.name: SegmentResult(
+                name=found.name,
+                label=found.label,
+                mesh=mesh,
+                centroid=found.centroid,
+                volume=found.volume,
+                confidence=found.confidence,
+                error_radius=radii.get(found.name),
+                pose=self._pose(None if self.registered is None else self.registered.model.labels == found.label),
+            )
+            for found, mesh in zip(self.reconstruction.segments, self.surfaces.segments, strict=True)
+        }
+
+    def _pose(self, rows: Any) -> Pose | None:
+        """Best rigid motion of some material points from the object's own files to the frame."""
+        registered, scale = self.registered, self.model_scale
+        if registered is None or scale is None:
+            return None
+        model, rest = registered.model, registered.model.rest_points
+        if model.source_frame is not None:
+            rest = transform_points(np.linalg.inv(model.source_frame.T_scene_source), rest)
+        return fit_rigid(scale * rest[rows], registered.material[rows])
+
+    def save(
+        self,
+        path: str | Path | None = None,
+        *,
+        formats: Sequence[Format] | None = None,
+        millimetres: bool = False,
+        overwrite: bool = False,
+    ) -> Path:
+        """Write a folder of results as ``mereo reconstruct`` does, or one file; returns its path.
+
+        Args:
+            path: a folder to create, by default result, result2, ...; or a file whose suffix says what it is: .glb,
+                .ply (surfaces), .npz, .vti, .nii.gz, .seg.nrrd (labels), .json (the figures), .html (the report), .png
+                (the preview).
+            formats: files of a folder beside report and preview, as ``--formats``; "points" needs
+                ``reconstruct(..., label_points=True)``.
+            millimetres: write .ply, .vti and other files that have no unit in millimetres, not in the frame's unit.
+            overwrite: replace a folder that mereo wrote, and nothing else is in, or a file that no input is.
+
+        Raises ``FileExistsError`` for what exists, unless ``overwrite`` may replace it; ``ValueError`` for a suffix or
+        a format that there is none of, and ``ImportError`` where a format's extra is missing.
+        """
+        path = free_folder() if path is None else Path(path)
+        suffix = file_suffix(path)
+        if suffix == "":
+            wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
+            with new_directory(path, overwrite, self._read()) as directory:
+                write_answer(directory, self, FilesConfig(wanted, millimetres))
+        elif formats is not None:
+            raise ValueError(f"{path} is one file, whose suffix says its format: leave out formats, or name a folder")
+        else:
+            with atomic_file(path, force=overwrite, inputs=self._read()) as partial:
+                write_answer_file(partial, suffix, self, FilesConfig((), millimetres))
+        return path
+
+    def show(self, *, port: int | None = None, host: str = "127.0.0.1", block: bool | None = None) -> "OpenPage":
+        """Open the viewer on this result, as `mereo view` does, and print its address.
+
+        Args:
+            port: where the page is; by default any that is free.
+            host: address of this machine that the page is at; only this machine reaches the default.
+            block: wait until Ctrl-C; by default everywhere but in a notebook or an interactive session, where the page
+                stays open until ``close()`` of what is returned, which a notebook shows as a frame.
+
+        Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
+        """
+        from mereo.visualization.viewer.result_page import open_answer
+
+        return open_answer(self, port=port or 0, host=host).stay(block)
+
+    def _read(self) -> list[Path]:
+        """Files that this was made from."""
+        paths = [self.seen.frame.path, Path(self.model.name)]
+        return [path for path in paths if path.is_file() or is_recording(path)]
+
+    def __repr__(self) -> str:
+        found = f"{sum(len(one.faces) > 0 for one in self.surfaces.segments)} of {len(self)} segments"
+        return f"Result({self.seen.frame.source!r}: {found}; {self.source}; {self.seconds:.1f} s)"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the points seen on what was found, from two sides, and the segments in figures."""
+        to_camera = camera_axes(self.seen.frame.axes)
+        points = transform_points(to_camera, self.seen.cloud.points)
+        surfaces = self.reconstruction.surfaces.transformed(to_camera)
+        told = self.recognition.told
+        lines = [self.source, *([] if told is None or self.registrar is None else [told])]
+        found, title = self.reconstruction, self.seen.frame.source
+        return result_html(title, lines, points, surfaces, found.segments, Unit(self.unit_m), found.calibrated)
+
+
+def free_folder(name: str = "result") -> Path:
+    """Path of the first of NAME, NAME2, NAME3, ... that is not there."""
+    numbers = count(2)
+    path = Path(name)
+    while path.exists() or path.is_symlink():
+        path = Path(f"{name}{next(numbers)}")
+    return path
+
+
+def file_suffix(path: Path) -> str:
+    """Suffix of ``SINGLE`` that a path has, "" for a folder; raises ``ValueError`` for what looks like another file."""
+    for suffix in SINGLE:
+        if path.name.lower().endswith(suffix):
+            return suffix
+    if path.suffix[1:2].isalpha() and not path.is_dir():
+        raise ValueError(
+            f"{path} has the suffix {path.suffix!r}; one file is {', '.join(SINGLE)}: choose one of these, or name a "
+            "folder without a suffix, which takes all formats"
+        )
+    return ""

@@ -1,0 +1,64 @@
+"""Follow an object through a sequence of frames: what ``mereo stream`` does.
+
+frame, time -Tracker.follow-> Result
+"""
+
+from pathlib import Path
+from typing import Any
+
+from mereo.api.objects import Method, Object, object_of
+from mereo.api.reconstruct import observation_of
+from mereo.api.result import Result
+from mereo.api.words import python_words
+from mereo.fitting.tracking import tracker
+from mereo.models.model import Model
+from mereo.reconstruction.config import IsolationConfig
+
+
+class Tracker:
+    """Follow one object through a sequence of frames; not safe for use by several threads at once.
+
+    Each frame is fitted from the last one's state, in milliseconds; the network is asked first, and when the object is
+    lost.
+    """
+
+    def __init__(self, object: Object | Model | str | Path, method: Method = "auto") -> None:
+        """Follow an object.
+
+        Args:
+            object: from ``load_object``; or weights, their shipped name or file.
+            method: "auto", or "modes" to take the registered model even where it does not explain the frame.
+
+        Raises ``ValueError`` for other methods, and for weights without a deformation model.
+        """
+        with python_words():
+            registrar = None if method == "network" else object_of(object).registrar(method)
+        if registrar is None or method == "full":
+            raise ValueError(
+                f"the method is {method!r}, and only the modes of a deformation model can be followed: take \"auto\" "
+                "with weights that carry one"
+            )
+        self._tracker = tracker.Tracker(registrar)
+
+    def follow(
+        self, frame: Any, time_s: float, *, isolation: IsolationConfig | None = None, **reading: Any
+    ) -> Result:
+        """Find the object in the next frame.
+
+        Args:
+            frame: whatever ``load_frame`` takes, or what it has returned; in one unit throughout the sequence.
+            time_s: of the frame, seconds from any zero, later than the last one's.
+            isolation: what of the frame is left out.
+            reading: arguments of ``load_frame``.
+
+        Raises ``ValueError`` for unusable frames, after which the sequence may go on. Surfaces, labels and figures are
+        made when they are asked for.
+        """
+        isolation = isolation or IsolationConfig()
+        with python_words():
+            seen = observation_of(frame, isolation, reading)
+            return Result.of(self._tracker.follow(seen, time_s, keep_all=isolation.keep_all))
+
+    def forget(self) -> None:
+        """Start again: the next frame is fitted by itself."""
+        self._tracker.forget()

@@ -1,0 +1,232 @@
+"""Frames that are already in memory: what other libraries call a point cloud, as mereo's own types.
+
+    anything -points_of-> PointCloud (or the DepthImage that it was), number of points left out
+
+Libraries are recognized by what their objects have, so that none of them is imported. What could be meant in two ways
+is refused: an image of depths has no positions without its camera, and the columns of a table name no axes. Which
+points are measurements is decided in ``mereo.io.readers.valid_points``, as for files.
+"""
+
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mereo.geometry.brief import counted, listed
+from mereo.geometry.camera import DepthImage, PointCloud
+from mereo.io.errors import reason
+from mereo.io.readers import valid_points
+from mereo.io.ros_recordings import cloud_points
+
+ACCEPTED = (
+    "an array, tensor or nested list of n x 3 numbers, an organized array of h x w x 3, a structured array with fields "
+    "x, y and z, an object with points or vertices (Open3D, trimesh, PyVista), a PointCloud2 message, or a "
+    "mereo.PointCloud or mereo.DepthImage"
+)
+"""Forms that ``points_of`` takes, for sentences."""
+
+CLOUD_FIELDS = ("fields", "point_step", "row_step", "data", "is_bigendian", "width", "height")
+"""Fields by which a sensor_msgs/PointCloud2 is recognized."""
+
+MOST_COLUMNS = 16
+"""Columns that a row of a point may have (position, normal, colour, labels); with more it is a row of pixels."""
+
+DROP = "leave them out with drop_invalid=True"
+DROP_ORGANIZED = "organized clouds mark pixels without a measurement so, and drop_invalid=True leaves them out"
+"""Cure of points without a measurement, in a list of points and in a grid of them."""
+
+
+def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | DepthImage, int]:
+    """Observed points of whatever holds a frame in memory, and how many points were left out.
+
+    A ``PointCloud`` and a ``DepthImage`` are returned as they are. Everything else becomes a new ``PointCloud`` of
+    64-bit floats in the source's order, axes and unit; grids are flattened row by row:
+
+    - arrays n x 3 or h x w x 3 of integers or floats: numpy's, torch's of any device, and whatever else converts
+      itself into a numpy array; masked values are points without a measurement;
+    - lists or tuples of rows of three numbers;
+    - structured arrays with fields x, y and z in any order among others, in one or two dimensions;
+    - objects with ``points`` or ``vertices`` (Open3D, trimesh, PyVista), or with ``point["positions"]`` or
+      ``vertex["positions"]`` (Open3D's tensors);
+    - messages of the type sensor_msgs/PointCloud2, of ROS 1, ROS 2 or rosbags.
+
+    Args:
+        source: one frame; a list of frames is recognized by ``is_frame_list`` and refused here.
+        drop_invalid: leave out points that are NaN, infinite or beyond 1e12, and points at exactly (0, 0, 0): sensors
+            mark missing measurements so.
+
+    Raises:
+        ValueError: the source is none of these, empty, of another shape or not of real numbers; or it has points
+            without a measurement and ``drop_invalid`` is false; or all of its points are such.
+    """
+    if isinstance(source, PointCloud | DepthImage):
+        return source, 0
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite values are counted below, whoever made them
+        points, name, organized = _positions(source)
+        kept = valid_points(points, name, drop_invalid, DROP_ORGANIZED if organized else DROP)
+    return PointCloud(kept), len(points) - len(kept)
+
+
+def is_frame_list(source: object) -> bool:
+    """Whether a list or tuple holds frames, and not the rows of one cloud.
+
+    It does where at least one element cannot be a row of numbers, but is a frame: a path or string, a ``PointCloud``
+    or ``DepthImage``, an array of two or more dimensions (of one, where it is structured), a list or tuple whose first
+    element is itself a list, tuple or array, an object with points or vertices, or a PointCloud2 message. So
+    ``[a, b]`` of two arrays n x 3 are two frames, even of equal length, ``[[x, y, z], [x, y, z]]`` is one cloud of two
+    points, and ``[[[x, y, z]]]`` is one frame of one point. What is no list or tuple, a generator or an array among
+    them, and what is empty is no list of frames.
+    """
+    return isinstance(source, list | tuple) and any(map(_is_frame, source))
+
+
+def _is_frame(item: object) -> bool:
+    """Whether an element of a list is a frame; else it is a row, or neither."""
+    if isinstance(item, list | tuple):
+        return bool(item) and (isinstance(item[0], list | tuple) or getattr(item[0], "ndim", 0) > 0)
+    if isinstance(item, str | PathLike | PointCloud | DepthImage):
+        return True
+    dimensions = getattr(item, "ndim", None)
+    if isinstance(dimensions, int):
+        return dimensions >= (1 if getattr(getattr(item, "dtype", None), "names", None) else 2)
+    return _is_cloud_message(item) or _carried(item) is not None
+
+
+# --- kinds of sources ------------------------------------------------------------------------------------------------
+
+
+def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
+    """All points of a source, what to call it in sentences, and whether it is a grid of pixels."""
+    kind = f"the {type(source).__name__}"
+    if isinstance(source, str | PathLike):
+        raise ValueError(
+            f"{str(source)!r} is a path; a frame in memory is needed: read it first, with mereo.read_point_cloud"
+        )
+    if is_frame_list(source):
+        raise ValueError(f"{kind} holds {counted(len(source), 'frame')}; one is needed: give its elements one by one")
+    if _is_cloud_message(source):
+        return _message_points(source), "the PointCloud2 message", source.height > 1
+    if not isinstance(source, np.ndarray | list | tuple):
+        if hasattr(source, "columns"):
+            raise ValueError(
+                f"{kind} is a table, whose columns may come in any order; x, y and z are needed in this one: give "
+                "table[['x', 'y', 'z']].to_numpy()"
+            )
+        carried = _carried(source)
+        if carried is None and not any(hasattr(source, name) for name in ("__array__", "numpy")):
+            raise ValueError(f"{kind} cannot be read as a frame; one of these is needed: {ACCEPTED}")
+        source = source if carried is None else carried
+    values = _array(source, kind)
+    name = f"{kind} of shape {values.shape}"
+    if values.dtype.names is not None:
+        return _structured_points(values, name), name, values.ndim > 1
+    _check_numbers(values, name)
+    if values.size == 0:
+        return np.empty((0, 3)), name, False
+    if values.ndim not in (2, 3) or values.shape[-1] != 3 or _is_color_image(values):
+        raise ValueError(f"{name} {_what_it_is(values)}")
+    return _floats(values).reshape(-1, 3), name, values.ndim == 3
+
+
+def _is_cloud_message(source: object) -> bool:
+    return all(hasattr(source, name) for name in CLOUD_FIELDS)
+
+
+def _message_points(message: Any) -> Float[np.ndarray, "n 3"]:
+    try:
+        return cloud_points(message)
+    except Exception as error:  # whatever a broken message makes of the parser
+        raise ValueError(f"the PointCloud2 message cannot be read ({reason(error)}): take another message") from error
+
+
+def _carried(source: Any) -> Any:
+    """Positions that an object carries, as Open3D, trimesh and PyVista call them; None where it has none."""
+    if isinstance(source, type):  # the class, not one of its objects
+        return None
+    for name in ("point", "vertex"):  # Open3D's tensor geometries: a map from names to tensors
+        try:
+            return getattr(source, name)["positions"]
+        except (AttributeError, LookupError, TypeError, RuntimeError):
+            continue
+    found = (getattr(source, name, None) for name in ("points", "vertices"))
+    return next((values for values in found if values is not None and not callable(values)), None)
+
+
+def _structured_points(records: np.ndarray, name: str) -> Float[np.ndarray, "n 3"]:
+    fields = records.dtype.names or ()
+    if not {"x", "y", "z"} <= set(fields):
+        raise ValueError(f"{name} has the fields {listed(fields)}; x, y and z are needed: rename the fields")
+    for axis in "xyz":
+        what = f"the field {axis!r} of {name}"
+        _check_numbers(records[axis], what)
+        if records[axis].shape != records.shape:
+            raise ValueError(f"{what} holds several numbers; x, y and z are one each: name the fields of the positions")
+    return np.stack([_floats(records[axis]).reshape(-1) for axis in "xyz"], axis=1)
+
+
+# --- arrays ----------------------------------------------------------------------------------------------------------
+
+
+def _array(source: Any, kind: str) -> np.ndarray:
+    """Values as numpy's, in the memory of the processor; ``kind`` is what to call them."""
+    if isinstance(source, np.ma.MaskedArray):
+        return source
+    try:
+        for step in ("detach", "cpu"):  # torch's tensors need both before numpy takes them, Open3D's the second
+            source = getattr(source, step)() if hasattr(source, step) else source
+        if not hasattr(source, "numpy"):
+            return np.asarray(source)
+        try:
+            return np.asarray(source.numpy())
+        except TypeError:  # bfloat16 and 8-bit floats, which numpy does not have
+            return np.asarray(source.double().numpy())
+    except Exception as error:  # whatever the library says of values that it does not hand over
+        ragged = isinstance(source, list | tuple) and isinstance(error, ValueError)
+        why = "its rows differ in length" if ragged else reason(error)
+        raise ValueError(
+            f"{kind} is no array ({why}); n x 3 numbers are needed: make it a numpy array of rows of x, y and z"
+        ) from error
+
+
+def _floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
+    """Values as 64-bit floats, NaN where they are masked."""
+    return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
+
+
+def _check_numbers(values: np.ndarray, name: str) -> None:
+    if values.dtype.kind not in "fiu":
+        raise ValueError(
+            f"{name} has values of type {values.dtype}; positions are real numbers: give an array of floats or integers"
+        )
+
+
+def _is_color_image(values: np.ndarray) -> bool:
+    return values.ndim == 3 and values.shape[-1] in (3, 4) and values.dtype == np.uint8
+
+
+def _what_it_is(values: np.ndarray) -> str:
+    """What numbers of a wrong shape are instead, and what to do: the end of a sentence about them."""
+    if values.ndim not in (2, 3):
+        return "is not a point cloud; that is n x 3, or h x w x 3 where it is organized: reshape or select its values"
+    if _is_color_image(values):
+        return "is a color image, which shows no positions; a depth image or point cloud is needed: give one of these"
+    flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]
+    wide = columns > MOST_COLUMNS
+    if (wide and rows != 3) if flat else (columns == 1 or (wide and rows == 1)):
+        return (
+            "is an image of depths, which needs the camera's intrinsics: give mereo.DepthImage(depth, camera), with "
+            "h x w floats and a mereo.Camera or mereo.read_camera(file)"
+        )
+    if columns < 3:
+        return f"has {counted(columns, 'column')}; points have three, x, y and z: give all three"
+    if rows == 3 and flat:
+        return "has points as columns; they must be rows: give points.T"
+    if rows == 3:
+        return "has x, y and z on its first axis; they must be on the last: give np.moveaxis(points, 0, -1)"
+    if flat:
+        return (
+            f"has {columns} columns; points have three, x, y and z: take them out, as points[:, :3] (if these are "
+            "depths of pixels, give mereo.DepthImage(depth, camera))"
+        )
+    return f"has {columns} values in each pixel; points have three, x, y and z: take them out, as points[..., :3]"
