@@ -1,7 +1,7 @@
 """Is it my object, in a state that I know: how well the answer tells, and how reliable probabilities are.
 
     python benchmarks/recognition.py [OBJECT ...] [--views N] [--strangers N] [--seed S] [--calibration-views N]
-                                     [--fit modes|auto] [--output FOLDER]
+                                     [--method modes|auto] [--output FOLDER]
 
 For each object, with its shipped weights or a file of weights: the area under the receiver operating characteristic
 (AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from N views of every other shipped
@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from mereo.fitting.registration.readings import fitted_frame
 
 from mereo.evaluation.calibrate import VIEWS, calibrate
 from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
@@ -35,7 +36,6 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.probability_scaling import ece_of
 from mereo.evaluation.reliability import AskedCells
 from mereo.evaluation.scoring import trained_scene
-from mereo.fitting.registration.readings import fitted_frame
 from mereo.fitting.registration.recognition import Recognition, recognized
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
@@ -194,7 +194,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=TEST_SEED_START)
     parser.add_argument("--calibration-views", type=int, default=VIEWS)
     parser.add_argument("--scene", default=None)
-    parser.add_argument("--fit", default="modes", choices=("modes", "auto"))
+    parser.add_argument("--method", default="modes", choices=("modes", "auto"))
     parser.add_argument("--output", type=Path, default=None)
     arguments = parser.parse_args()
     torch.set_num_threads(1)

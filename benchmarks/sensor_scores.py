@@ -19,7 +19,7 @@ from mereo.evaluation.metrics import format_score
 from mereo.models.weights import shipped_names
 
 CAMERAS = {
-    "clean": "--fit off",
+    "clean": "--method network",
     "structured-light": "--sensor structured-light --image-size 192",
     "time-of-flight": "--sensor time-of-flight --image-size 192",
     "tool": "--sensor structured-light --sensor.tool 0.5 --image-size 192",

@@ -1,6 +1,6 @@
 """Many clients of ``mereo serve`` for a given time: are all answers right, when do they come, does memory grow?
 
-    python benchmarks/serving.py --clients 8 --minutes 2 --fit modes --output out/serving
+    python benchmarks/serving.py --clients 8 --minutes 2 --method modes --output out/serving
 
 The rival is the same frames one after the other in one process without HTTP, as `mereo reconstruct` takes a folder of
 them: its answers are what each served one is compared with (all but seconds), its rate what the server's is measured
@@ -197,7 +197,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         answered, alone = one_after_the_other(frames, options.fit, options.resolution, folder)
         alone_s, alone_processor_s = map(np.array, zip(*alone, strict=True))
         weights = [word for one in options.weights for word in ("--weights", one)]
-        more = ("--fit", options.fit, "--workers", str(options.workers), "--batch", str(options.batch))
+        more = ("--method", options.fit, "--workers", str(options.workers), "--batch", str(options.batch))
         memory: list[tuple[float, float]] = []
         with served(*weights, *more, "--resolution", str(options.resolution), scratch=folder) as (process, port):
             address = "/v1/{weights}/reconstruct"
@@ -265,7 +265,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=2.0)
     parser.add_argument("--weights", nargs="+", default=["bunny", "liver"], help="shipped ones that come with a frame")
     parser.add_argument("--frames", type=int, default=12, help="different ones of each weights")
-    parser.add_argument("--fit", choices=("off", "auto", "modes", "full"), default="modes")
+    parser.add_argument("--method", choices=("off", "auto", "modes", "full"), default="modes")
     parser.add_argument("--resolution", type=int, default=128)
     parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--batch", type=int, default=0)

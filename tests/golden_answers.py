@@ -2,8 +2,8 @@
 
     python tests/golden_answers.py [OBJECT ...] [--write] [--processes 2]
 
-prints for each frame whether the answer is the same to the last bit, the same within the precision that other processors
-have, or another one, and exits with 1 where any is another one. With --write it keeps the answers in ``golden/``.
+prints for each frame whether the answer is the same to the last bit, near (the same within the precision that other
+processors have), or another one, and exits with 1 where any is another one. With --write it keeps them in ``golden/``.
 
 The frames: four views of each object with shipped weights, of training seed 1000, by three cameras; the four scans of
 the bunny; and the same views of two objects of one's own (``golden_objects``). Views 0 and 1 state the unit where the

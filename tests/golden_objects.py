@@ -60,6 +60,7 @@ deformations:
     angle: [0, 35]
 """
 
+
 def write_lump(folder: Path) -> Path:
     """Write the soft object: a lobe with a core inside and a tip that lies on it, 120 mm long."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -106,7 +106,7 @@ class Server:
 
 
 def setup(max_points: int = 100_000, batch: int = 0) -> Setup:
-    return Setup((Served("balls", "balls"),), "off", InferenceConfig(precision="float32"), max_points, batch=batch)
+    return Setup((Served("balls", "balls"),), "network", InferenceConfig(precision="float32"), max_points, batch=batch)
 
 
 @asynccontextmanager

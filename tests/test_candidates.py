@@ -97,7 +97,7 @@ def test_an_evaluation_compares_all_who_could_answer(model: Model, tmp_path: Pat
     write_json(tmp_path / "metrics.json", values)
     assert json.loads((tmp_path / "metrics.json").read_text())["chosen"] == values["chosen"]
     assert "modes alone" in markdown_table(found)
-    off = evaluate(model, "engine", examples=2, seed=SEED, cells=24, choice="off")
+    off = evaluate(model, "engine", examples=2, seed=SEED, cells=24, method="network")
     assert (off.scores.iou, off.scores.miou) == (values["network"]["iou"], values["network"]["miou"])
     assert "alone" not in markdown_table(off) and metrics(off, {})["registration_error"] is None
     assert found.known == (True, True) and off.known == ()

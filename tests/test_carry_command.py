@@ -60,7 +60,7 @@ def carrying(folder: Path, *names: str) -> list[str]:
 
 
 def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Path) -> None:
-    options = ["--fit", "modes", "--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
+    options = ["--method", "modes", "--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
     assert run(folder, *options, *carrying(folder, "own.ply", "own.glb", "grasp.csv")) == 0
     out = folder / "out"
     summary = json.loads((out / "summary.json").read_text())
@@ -94,7 +94,7 @@ def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--fit", "off"], "--fit is off, but --carry needs a registration"),
+        (["--method", "network"], "--method is network, but --carry needs a registration"),
         (["--carry", "nowhere.stl"], "nowhere.stl does not exist"),
         (["--carry", "."], "has the suffix ''; what is carried is one of .stl"),
     ],

@@ -192,7 +192,7 @@ def without_seconds(value: Any) -> Any:
 def test_scores_are_those_of_one_process(rope: Model, tmp_path: Path) -> None:
     places = {"here": None, "one": Cluster(local_cpus=1), "two": Cluster(local_cpus=2)}
     for name, cluster in places.items():
-        evaluate_weights(rope, tmp_path / name, examples=5, cells=24, choice="modes", cluster=cluster)
+        evaluate_weights(rope, tmp_path / name, examples=5, cells=24, method="modes", cluster=cluster)
     here, one, two = (without_seconds(json.loads((tmp_path / name / "metrics.json").read_text())) for name in places)
     assert here == one == two and here["examples"] == 5
     assert (tmp_path / "one/errors.png").read_bytes() == (tmp_path / "two/errors.png").read_bytes()

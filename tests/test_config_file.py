@@ -21,9 +21,9 @@ LINES = {
     "--points 512 --sampler nested-sort-sample --observations all",
     "train": "train data --output out --preset tiny --epochs 2 --network.width 64 --augment.keep-points 0.4 0.9 "
     "--network.no-encode-positions --loss ce --init bunny",
-    "evaluate": "evaluate bunny --output out --examples 4 --sensor structured-light --noise-std 0.2 --fit modes",
+    "evaluate": "evaluate bunny --output out --examples 4 --sensor structured-light --noise-std 0.2 --method modes",
     "reconstruct": "reconstruct a.ply b.ply --weights bunny --output out --depth-range 0.4 0.9 --carry p.stl "
-    "--carry q.stl --formats glb ply --fit off --millimetres --unit-m 0.001",
+    "--carry q.stl --formats glb ply --method network --millimetres --unit-m 0.001",
     "learn": "learn a.stl b.stl --output out --minutes 3 --units mm",
 }
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mereo.visualization.answering import answer
 
 from mereo.cli import demo
 from mereo.evaluation.sample_views import load_view
@@ -15,7 +16,6 @@ from mereo.models.weights import load_model
 from mereo.reconstruction.pipeline import reconstruct
 from mereo.scenes.parameters import random_state
 from mereo.scenes.registry import load_scene
-from mereo.visualization.answering import answer
 from mereo.visualization.result_files import write_reconstruction
 from mereo.visualization.vertex_colors import confidence
 from mereo.visualization.viewer.laboratory import Laboratory

@@ -44,7 +44,7 @@ def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None
 
 
 def test_results_say_where_they_were_computed(tmp_path: Path) -> None:
-    reconstruct_file(cloud_file(tmp_path), tmp_path / "out", FrameJob("bunny", 12, inference=CPU, choice="off"))
+    reconstruct_file(cloud_file(tmp_path), tmp_path / "out", FrameJob("bunny", 12, inference=CPU, method="network"))
     facts = json.loads((tmp_path / "out/summary.json").read_text())
     assert (facts["device"], facts["precision"]) == ("cpu", "bfloat16")
 

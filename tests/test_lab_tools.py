@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import until
+from mereo.visualization.answering import answer
 from PIL import Image
 from shapes import ball, box
 from toy_scene import toy_scene
@@ -25,7 +26,6 @@ from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
 from mereo.scenes.parameters import random_state
 from mereo.scenes.registry import load_scene
-from mereo.visualization.answering import answer
 from mereo.visualization.renderer import Viewpoint, shade
 from mereo.visualization.viewer import display, film
 from mereo.visualization.viewer.film import MOST_FRAMES, SIZE, Film, picture, viewpoint

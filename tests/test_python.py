@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from analytic import AnalyticModel, ball, logits_of, untrained
+from mereo.visualization.result import SINGLE, Result
 from PIL import Image
 from toy_scene import toy_scene
 
@@ -26,7 +27,6 @@ from mereo.io.output_folders import MARKER
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
-from mereo.visualization.result import SINGLE, Result
 from mereo.visualization.units import Unit
 from mereo.visualization.viewer import result_page, serve
 from mereo.visualization.viewer.open_page import OpenPage

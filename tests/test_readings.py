@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mereo.fitting.registration.readings import FittedFrame, fitted_frame
 
 from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import SCANS, scan_in_camera
@@ -12,7 +13,6 @@ from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.noise import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, noise_of, shared
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import answer
-from mereo.fitting.registration.readings import FittedFrame, fitted_frame
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model

@@ -97,7 +97,7 @@ def test_what_is_no_frames_fault_stops_before_the_work(
     for options, sentence in (
         (("--carry-frame", "scene"), "nothing is carried"),
         (("--carry", tmp_path / "no.stl"), "no.stl"),
-        (("--scene", tmp_path / "no.yaml", "--fit", "modes"), "no.yaml"),
+        (("--scene", tmp_path / "no.yaml", "--method", "modes"), "no.yaml"),
     ):
         assert run(folder, "--output", out, *options) == 2
         printed = capsys.readouterr()

@@ -89,7 +89,7 @@ def test_a_scanners_frame_gets_its_answer_in_that_frame(model: Model, view: Samp
 
 def test_weights_without_states_say_what_to_do() -> None:
     other = replace(untrained(("a", "b")), provenance={"scene": "mine"})
-    with pytest.raises(ValueError, match="the weights of a, b carry no statistical model .* or use --fit off"):
+    with pytest.raises(ValueError, match="the weights of a, b carry no statistical model .* or use --method network"):
         statistical_model_of(other)
 
 
@@ -98,7 +98,7 @@ def test_the_command_says_which_answer_it_is(model: Model, view: SampleView, few
     save_model(model, tmp_path / "rope.safetensors")
     np.save(tmp_path / "cloud.npy", view.depth.to_points().points)
     arguments = ["reconstruct", str(tmp_path / "cloud.npy"), "--weights", str(tmp_path / "rope.safetensors")]
-    arguments += ["--output", str(tmp_path / "out"), "--resolution", "32", "--fit", "auto"]
+    arguments += ["--output", str(tmp_path / "out"), "--resolution", "32", "--method", "auto"]
     assert command_line.main(arguments) == 0
     facts = json.loads((tmp_path / "out/summary.json").read_text())["registration"]
     assert facts["answer"] == "registration" and facts["method"] in ("modes", "draws") and facts["explained"] > 0.95
@@ -130,14 +130,14 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
             assert registrar.finish(fitted).method == "modes"
         assert registrar.at_hand is None  # said once
     for given in (None, changed):
-        with pytest.raises(ValueError, match=f"{said}, so its draws .* or use --fit modes"):
+        with pytest.raises(ValueError, match=f"{said}, so its draws .* or use --method modes"):
             Registrar.of(model, "full", given)
     with pytest.raises(ValueError, match=f"{said}, so its draws"):  # named as that of other weights
         assert Registrar.of(replace(model, provenance={"scene": "mine"}), scene=changed).at_hand
     for choice in ("auto", "modes", "full"):
-        with pytest.raises(ValueError, match=f"{said}, so places cannot be compared: .* with --fit off"):
-            evaluate(model, changed, examples=1, choice=choice)
-    assert evaluate(model, changed, examples=1, cells=12, choice="off").sources == ("network",)
+        with pytest.raises(ValueError, match=f"{said}, so places cannot be compared: .* with --method network"):
+            evaluate(model, changed, examples=1, method=choice)
+    assert evaluate(model, changed, examples=1, cells=12, method="network").sources == ("network",)
 
 
 def test_auto_plays_the_scene_where_it_is_at_hand(
@@ -147,7 +147,7 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
     registrar = Registrar.of(model)
     fitted = registrar.fit_modes(view.depth.to_points())
     assert fitted.rest is None
-    modes = replace(registrar, choice="modes")
+    modes = replace(registrar, method="modes")
     assert modes.finish(fitted).method == "modes" and "states" not in vars(modes)
     foreign = replace(registrar, network=replace(model, provenance={"scene": "mine"}))
     assert foreign.finish(fitted).method == "modes" and foreign.at_hand is None
@@ -176,7 +176,7 @@ def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(
 
 def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> None:
     assert registrar_for(replace(model, statistical_model=None), "auto") is None
-    assert registrar_for(model, "off") is None and registrar_for(model, "auto") is not None
+    assert registrar_for(model, "network") is None and registrar_for(model, "auto") is not None
 
 
 @pytest.mark.usefixtures("without_turns")
@@ -195,7 +195,7 @@ def test_where_no_registration_is_found_auto_says_why(model: Model, view: Sample
     found = answer(view.depth.to_points(), other, registrar, 32)
     assert not found.taken and found.registration is None and "they must be of one object" in str(found.refusal)
     with pytest.raises(ValueError, match="they must be of one object"):
-        answer(view.depth.to_points(), other, replace(registrar, choice="modes"), 32)
+        answer(view.depth.to_points(), other, replace(registrar, method="modes"), 32)
 
 
 def test_points_may_be_plain_lists(found: Answer) -> None:

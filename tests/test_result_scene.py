@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from analytic import untrained
+from mereo.visualization.answering import answer
 from scene_files import write_bar
 
 from mereo.__main__ import main
@@ -23,7 +24,6 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
-from mereo.visualization.answering import answer
 from mereo.visualization.result_scene import scene_facts, scene_of_result
 from mereo.visualization.viewer import serve
 

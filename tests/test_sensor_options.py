@@ -110,7 +110,7 @@ def test_evaluation_looks_through_the_sensor_and_says_so(tmp_path: Path, monkeyp
     encode = Model.encode
     monkeypatch.setattr(Model, "encode", watch)
     for number, settings in enumerate((None, GenerateConfig(128, 0.5, sensor=SENSORS["structured-light"]))):
-        evaluate_weights("rope", tmp_path / str(number), examples=1, cells=12, settings=settings, choice="off")
+        evaluate_weights("rope", tmp_path / str(number), examples=1, cells=12, settings=settings, method="network")
     facts = [json.loads((tmp_path / str(number) / "metrics.json").read_text()) for number in range(2)]
     assert [(fact["image_size"], fact["noise_std"]) for fact in facts] == [(96, 0.1), (128, 0.5)]
     assert [SensorConfig(**fact["sensor"]) for fact in facts] == [SENSORS["paper"], SENSORS["structured-light"]]

@@ -15,6 +15,7 @@ pytest.importorskip("fastapi", reason="fastapi (extra `serve`) is not installed"
 pytest.importorskip("python_multipart", reason="python-multipart (extra `serve`) is not installed")
 
 from camera_files import write_camera
+from mereo.visualization.answering import answer
 from PIL import Image
 from serving_parts import ADDRESS, CLOUD, NPY, balls, figures, npy, run, running
 
@@ -27,7 +28,6 @@ from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
 from mereo.serving.config import ServeConfig
 from mereo.serving.messages import GLB, Served, Setup
-from mereo.visualization.answering import answer
 
 EXACT = InferenceConfig(precision="float32")
 
@@ -45,7 +45,7 @@ def rope_only(rope: Model, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: replace(balls(), name="balls"))
     np.save(tmp_path / "frame.npy", CLOUD)
-    reconstruct_file(tmp_path / "frame.npy", tmp_path / "out", FrameJob("any", 12, inference=EXACT, choice="off"))
+    reconstruct_file(tmp_path / "frame.npy", tmp_path / "out", FrameJob("any", 12, inference=EXACT, method="network"))
     expected = figures((tmp_path / "out/summary.json").read_bytes())
 
     async def ask() -> None:
@@ -146,8 +146,9 @@ def test_a_batch_leaves_others_their_share(tmp_path: Path) -> None:
 
 def test_frames_encoded_together_are_those_encoded_alone(rope: Model) -> None:
     """The network's own side: codes of one call, split, against a call each."""
-    from mereo.geometry.camera import PointCloud
     from mereo.models.joint_encoding import encode_all
+
+    from mereo.geometry.camera import PointCloud
 
     points = load_view("rope").depth.to_points().points
     sparse = points[np.random.default_rng(0).permutation(len(points))[:300]]

@@ -53,7 +53,7 @@ def test_twenty_seconds_of_four_clients_and_the_end(tmp_path: Path) -> None:
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     frames, _ = bench.one_after_the_other(bench.frames_of(["rope"], 6, tmp_path), "modes", 24, tmp_path)
-    arguments = ("--weights", "rope", "--fit", "modes", "--resolution", "24", "--workers", "2")
+    arguments = ("--weights", "rope", "--method", "modes", "--resolution", "24", "--workers", "2")
     with bench.served(*arguments, scratch=scratch) as (server, port):
         seen = bench.load(port, frames, 4, 20.0, ADDRESS, lambda _: None)
         assert set(seen.counts) == {"right"} and seen.counts["right"] >= 10
@@ -89,7 +89,7 @@ def test_twenty_seconds_of_four_clients_and_the_end(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_processes_end_with_a_server_that_is_killed(tmp_path: Path) -> None:
-    with bench.served("--weights", "rope", "--fit", "off", "--workers", "1", scratch=tmp_path) as (server, _):
+    with bench.served("--weights", "rope", "--method", "network", "--workers", "1", scratch=tmp_path) as (server, _):
         workers = [pid for pid in bench.resident_mb(server.pid) if pid != server.pid]
         server.send_signal(signal.SIGKILL)
         server.wait(20)
@@ -99,6 +99,6 @@ def test_processes_end_with_a_server_that_is_killed(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_weights_that_cannot_be_loaded_are_said_by_the_server(tmp_path: Path) -> None:
     (tmp_path / "bad.safetensors").write_bytes(b"nonsense")
-    setup = Setup((Served("bad", str(tmp_path / "bad.safetensors")),), "off", InferenceConfig(precision="float32"))
+    setup = Setup((Served("bad", str(tmp_path / "bad.safetensors")),), "network", InferenceConfig(precision="float32"))
     with pytest.raises(ValueError, match=r"bad\.safetensors is not a safetensors file"):
         WorkerProcess(setup).wait_until_ready()

@@ -37,8 +37,8 @@ def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest
 
 def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
     model = untrained(load_scene("rope").rest.names)
-    alone = mereo.evaluate(model, examples=1, cells=8, fit="off", progress=False)
-    written = mereo.evaluate(model, load_scene("rope"), output=tmp_path / "out", examples=1, cells=8, fit="off")
+    alone = mereo.evaluate(model, examples=1, cells=8, method="network", progress=False)
+    written = mereo.evaluate(model, load_scene("rope"), output=tmp_path / "out", examples=1, cells=8, method="network")
     np.testing.assert_array_equal(alone.confusion, written.confusion)
     assert json.loads((tmp_path / "out/metrics.json").read_text())["scene"] == "rope"
     with pytest.raises(ValueError, match="scans are real and take no simulated camera"):

@@ -282,6 +282,6 @@ def test_what_cannot_be_explained_is_said_in_one_sentence(cloud: PointCloud, tmp
             wish_of(text, ("liver", "gallbladder"))
     with pytest.raises(ValueError, match="--explain needs a registration, whose fit is explained"):
         explain(None, ["liver"], tmp_path, cloud.points, 1.0, Unit(1.0))
-    with pytest.raises(ValueError, match="--fit is off, but --explain needs a registration"):
-        FrameJob("liver", choice="off", explain=("liver",)).check()
+    with pytest.raises(ValueError, match="--method is network, but --explain needs a registration"):
+        FrameJob("liver", method="network", explain=("liver",)).check()
     assert not any(tmp_path.iterdir())

@@ -52,8 +52,8 @@ def said(text: str, capsys: pytest.CaptureFixture[str]) -> str:
          "see `mereo reconstruct --help`"),
         (f"{RECONSTRUCT} --depth-range 1 x", "--depth-range is '1 x'; it must be 2 values: a number, a number; "
          "see `mereo reconstruct --help`"),
-        (f"{RECONSTRUCT} --fit mods", "--fit is 'mods' (did you mean modes?); it must be one of off, auto, modes, "
-         "full; see `mereo reconstruct --help`"),
+        (f"{RECONSTRUCT} --method mods", "--method is 'mods' (did you mean modes?); it must be one of auto, "
+         "network, modes, full; see `mereo reconstruct --help`"),
         ("train data --output run --preset huge", "--preset is 'huge'; it must be one of paper, paper-autodecoder, "
          "base, large, tiny, tiny-autodecoder; see `mereo train --help`"),
         ("export bunny --output", "--output has no value; it must be a path; see `mereo export --help`"),
@@ -71,7 +71,7 @@ def test_what_is_wrong_is_said_in_one_sentence(text: str, sentence: str, capsys:
     [
         ("reconstruct scan.ply --output out", ("Missing from mereo reconstruct", "--weights")),
         ("train data --output run --batch x", ("--batch", "'x'")),
-        (f"{RECONSTRUCT} --fit mods", ("'mods'", "--fit", "'modes'")),
+        (f"{RECONSTRUCT} --method mods", ("'mods'", "--method", "'modes'")),
     ],
 )
 def test_a_tyro_that_tells_less_still_gives_one_sentence(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import BROWSER, Page, pixels_of, until
+from mereo.visualization.answering import answer
 from toy_scene import toy_scene
 
 from mereo.evaluation.sample_views import load_view
@@ -25,7 +26,6 @@ from mereo.models.weights import load_model, save_model
 from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.visualization.answering import answer
 from mereo.visualization.viewer import display, serve
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, ModeShapes
@@ -250,7 +250,7 @@ def test_the_laboratory_shows_and_scores_the_default_answer(model: Model) -> Non
     alone = Laboratory(load_scene("rope"), replace(model, statistical_model=None)).rebuild(view, 24, 24)
     assert "registered model" in trial.source and alone.source.startswith("network alone")
     assert trial.scores.miou > alone.scores.miou
-    assert laboratory.registrar is not None and laboratory.registrar.choice == "auto"
+    assert laboratory.registrar is not None and laboratory.registrar.method == "auto"
     assert laboratory.registrar is laboratory.registrar  # built once
 
 

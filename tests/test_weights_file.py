@@ -106,7 +106,16 @@ def test_names_that_look_like_markup_are_printed_as_they_are(
     weights = changed(tmp_path, lambda h, t: h.update(names=["[/x]", ":heart:[red]"]))
     cloud = tmp_path / "[red] [y].npy"
     np.save(cloud, np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))
-    arguments = ["--weights", str(weights), "--output", str(tmp_path / "out"), "--resolution", "8", "--fit", "off"]
+    arguments = [
+        "--weights",
+        str(weights),
+        "--output",
+        str(tmp_path / "out"),
+        "--resolution",
+        "8",
+        "--method",
+        "network",
+    ]
     assert command_line.main(["reconstruct", str(cloud), *arguments]) == 0
     printed = capsys.readouterr().out
     assert all(text in printed for text in ("[red] [y].npy", "[/x]", ":heart:[red]"))

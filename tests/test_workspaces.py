@@ -91,7 +91,7 @@ def test_settings_say_nothing_of_the_scenes_own_workspace() -> None:
 def test_evaluation_looks_from_the_workspace_and_says_so(tmp_path: Path) -> None:
     for name in ("own", "sphere"):
         settings = GenerateConfig(workspace=name)  # type: ignore[arg-type]
-        evaluate_weights("rope", tmp_path / name, examples=1, cells=12, settings=settings, choice="off")
+        evaluate_weights("rope", tmp_path / name, examples=1, cells=12, settings=settings, method="network")
     own, sphere = (read_metrics(tmp_path / name / "metrics.json") for name in ("own", "sphere"))
     assert (own["workspace"], sphere["workspace"]) == ("own", "sphere") and own["iou"] != sphere["iou"]
     said = ", cameras all around the object, noise 0.1 units"

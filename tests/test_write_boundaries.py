@@ -32,13 +32,13 @@ CASES = {
     "generate": Case(GENERATE, again="--resume"),
     "train": Case(TRAIN),
     "reconstruct": Case(
-        "reconstruct INPUTS/cloud.npy --weights INPUTS/w.safetensors --output out --resolution 24 --fit off",
+        "reconstruct INPUTS/cloud.npy --weights INPUTS/w.safetensors --output out --resolution 24 --method network",
         again="--force",
         timed=("summary.json", "report.html"),
         dear=True,
     ),
     "evaluate": Case(
-        "evaluate INPUTS/w.safetensors --output out --examples 1 --fit off",
+        "evaluate INPUTS/w.safetensors --output out --examples 1 --method network",
         again="choose another --output",
         timed=("metrics.json",),
         dear=True,

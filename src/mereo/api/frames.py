@@ -49,8 +49,8 @@ def load_frame(
         topic: of a recording.
         frame_index: of a recording's frames, or of an entry of the intrinsics.
 
-    Raises ``FileNotFoundError`` where there is no such file or name; ``ValueError`` for what is no frame or damaged, and
-    for options that do not belong to this kind of frame.
+    Raises ``FileNotFoundError`` where there is no such file or name; ``ValueError`` for what is damaged or no frame,
+    and for options that do not belong to this kind of frame.
     """
     if isinstance(source, str | Path):
         given = (axes, unit_m, intrinsics, depth_scale, mask, topic, frame_index)

@@ -5,9 +5,9 @@ weights, scene -load_object-> Object -registrar-> Registrar of a method
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import get_args
 
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, registrar_for, statistical_model_of
 from mereo.learning.object_files import SCENE
 from mereo.models.config import Device, InferenceConfig, Precision
@@ -15,12 +15,6 @@ from mereo.models.model import Model
 from mereo.models.weights import load_for
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-
-Method = Literal["auto", "network", "modes", "full"]
-"""Who answers: the registered model where that explains the frame, else the network; the network alone; the registered
-model in any case, by its modes or by the parameters of its scene as well."""
-
-CHOICES: dict[Method, FitChoice] = {"auto": "auto", "network": "off", "modes": "modes", "full": "full"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,15 +38,16 @@ class Object:
         """Names of the segments, in the order of their labels."""
         return self.model.names
 
-    def registrar(self, method: Method = "auto") -> Registrar | None:
+    def registrar(self, method: AnswerMethod = "auto") -> Registrar | None:
         """Registrar of the object's deformation model for a method, set up once; None where the network alone answers.
 
         Raises ``ValueError`` for a method that there is none of, and where it cannot be had of this object.
         """
-        if method not in CHOICES:
-            raise ValueError(f"the method is {method!r}; it must be one of {', '.join(CHOICES)}: correct the spelling")
+        if method not in get_args(AnswerMethod):
+            known = ", ".join(get_args(AnswerMethod))
+            raise ValueError(f"the method is {method!r}; it must be one of {known}: correct the spelling")
         if method not in self._registrars:
-            self._registrars[method] = registrar_for(self.model, CHOICES[method], self.scene)
+            self._registrars[method] = registrar_for(self.model, method, self.scene)
         return self._registrars[method]
 
     def with_deformation_model(self) -> "Object":

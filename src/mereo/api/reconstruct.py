@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, overload
 
 from mereo.api.frames import load_frame
-from mereo.api.objects import Method, Object, object_of
+from mereo.api.objects import Object, object_of
 from mereo.api.result import Result
 from mereo.api.words import SPEAKS_OPTIONS, in_python, python_words
+from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.io.point_arrays import is_frame_list
 from mereo.io.sensor_frame import SensorFrame
@@ -24,7 +25,7 @@ from mereo.reconstruction.observation import Observation, SizeWarning, find_obje
 def reconstruct(
     frame: Sequence[Any],
     object: Object | Model | str | Path,
-    method: Method = ...,
+    method: AnswerMethod = ...,
     *,
     resolution: int = ...,
     isolation: IsolationConfig | None = ...,
@@ -37,7 +38,7 @@ def reconstruct(
 def reconstruct(
     frame: Any,
     object: Object | Model | str | Path,
-    method: Method = ...,
+    method: AnswerMethod = ...,
     *,
     resolution: int = ...,
     isolation: IsolationConfig | None = ...,
@@ -49,7 +50,7 @@ def reconstruct(
 def reconstruct(
     frame: Any,
     object: Object | Model | str | Path,
-    method: Method = "auto",
+    method: AnswerMethod = "auto",
     *,
     resolution: int = 128,
     isolation: IsolationConfig | None = None,
@@ -75,16 +76,14 @@ def reconstruct(
     with python_words():
         known = object_of(object)
         if is_frame_list(frame):
-            return [
-                _reconstruct(one, known, method, resolution, isolation, label_points, reading) for one in frame
-            ]
+            return [_reconstruct(one, known, method, resolution, isolation, label_points, reading) for one in frame]
         return _reconstruct(frame, known, method, resolution, isolation, label_points, reading)
 
 
 def _reconstruct(
     frame: Any,
     object: Object,
-    method: Method,
+    method: AnswerMethod,
     resolution: int,
     isolation: IsolationConfig | None,
     label_points: bool,

@@ -17,7 +17,7 @@ from mereo.evaluation import scoring
 from mereo.evaluation.metrics import format_score
 from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scan_scoring import evaluate_scans
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.io.object_storage import ObjectPath, Place, place_of
 from mereo.learning import learn as learning
 from mereo.learning.example_frame import FRAME
@@ -120,7 +120,7 @@ def evaluate(
     seed: int = TEST_SEED_START,
     scans: Sequence[str | Path] | None = None,
     settings: GenerateConfig | None = None,
-    fit: FitChoice = "auto",
+    method: AnswerMethod = "auto",
     inference: InferenceConfig = EXACT,
     cells: int = scoring.CELLS,
     progress: bool = True,
@@ -136,7 +136,7 @@ def evaluate(
         seed: test seeds start at 1,000,000.
         scans: truth files, or their folders, of `mereo align`; none of them means the four range scans of the bunny.
         settings: the camera of rendered views (image size, noise, sensor); by default the paper's.
-        fit: whose answer is scored: "auto" what a user gets by default, with all others beside it.
+        method: whose answer is scored: "auto" what a user gets by default, with all others beside it.
         inference: where and how exactly the network computes, for weights that are loaded here.
         cells: of the grid along each axis, on which answers are compared with the truth; 100 is the paper's.
         progress: show the time left, where nothing is written.
@@ -154,10 +154,10 @@ def evaluate(
         if cluster is not None:
             raise ValueError("scans are few and are scored here: leave out ray")
         if output is not None:
-            return evaluate_on_scans(loaded, output, truths=scans, scene=place, cells=cells, choice=fit)
+            return evaluate_on_scans(loaded, output, truths=scans, scene=place, cells=cells, method=method)
         posed = load_scene(place) if isinstance(place, str) else place
-        return evaluate_scans(loaded, truths=scans, scene=posed, cells=cells, choice=fit)
-    asked: dict[str, Any] = {"examples": examples, "seed": seed, "cells": cells, "settings": settings, "choice": fit}
+        return evaluate_scans(loaded, truths=scans, scene=posed, cells=cells, method=method)
+    asked: dict[str, Any] = {"examples": examples, "seed": seed, "cells": cells, "settings": settings, "method": method}
     with joined_first(cluster):
         if output is not None:
             return evaluate_weights(loaded, output, scene=place, cluster=cluster, **asked)

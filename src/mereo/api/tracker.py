@@ -6,10 +6,11 @@ frame, time -Tracker.follow-> Result
 from pathlib import Path
 from typing import Any
 
-from mereo.api.objects import Method, Object, object_of
+from mereo.api.objects import Object, object_of
 from mereo.api.reconstruct import observation_of
 from mereo.api.result import Result
 from mereo.api.words import python_words
+from mereo.fitting.config import AnswerMethod
 from mereo.fitting.tracking import tracker
 from mereo.models.model import Model
 from mereo.reconstruction.config import IsolationConfig
@@ -22,7 +23,7 @@ class Tracker:
     lost.
     """
 
-    def __init__(self, object: Object | Model | str | Path, method: Method = "auto") -> None:
+    def __init__(self, object: Object | Model | str | Path, method: AnswerMethod = "auto") -> None:
         """Follow an object.
 
         Args:
@@ -35,14 +36,12 @@ class Tracker:
             registrar = None if method == "network" else object_of(object).registrar(method)
         if registrar is None or method == "full":
             raise ValueError(
-                f"the method is {method!r}, and only the modes of a deformation model can be followed: take \"auto\" "
+                f'the method is {method!r}, and only the modes of a deformation model can be followed: take "auto" '
                 "with weights that carry one"
             )
         self._tracker = tracker.Tracker(registrar)
 
-    def follow(
-        self, frame: Any, time_s: float, *, isolation: IsolationConfig | None = None, **reading: Any
-    ) -> Result:
+    def follow(self, frame: Any, time_s: float, *, isolation: IsolationConfig | None = None, **reading: Any) -> Result:
         """Find the object in the next frame.
 
         Args:

@@ -4,6 +4,9 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import get_args
+
+from mereo.fitting.config import AnswerMethod
 
 SPEAKS_OPTIONS: ContextVar[bool] = ContextVar("SPEAKS_OPTIONS", default=False)
 """Whether this is the command line, whose words are options."""
@@ -13,11 +16,7 @@ ARGUMENTS = {
     "--drop-invalid": "drop_invalid=True",
     "--keep-all": "isolation=IsolationConfig(keep_all=True)",
     "--frame": "axes",
-    "--fit off": 'method="network"',
-    "--fit auto": 'method="auto"',
-    "--fit modes": 'method="modes"',
-    "--fit full": 'method="full"',
-    "--fit": "method",
+    **{f"--method {name}": f'method="{name}"' for name in get_args(AnswerMethod)},
     "--box": "isolation=IsolationConfig(box=...)",
     "--depth-range": "isolation=IsolationConfig(depth_range=...)",
 }

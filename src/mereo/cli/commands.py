@@ -12,7 +12,7 @@ from tyro.conf import arg
 from mereo.cli.config_file import ConfigFile, options_of
 from mereo.cli.place_option import PlaceOption
 from mereo.cli.positionals import AssetNames, DatasetFolder, SceneName, WeightsName
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.geometry.conventions import WorkspaceName
 from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Threads, Workers
 from mereo.io.config import CONFIG
@@ -192,8 +192,8 @@ class Evaluate:
             around it, at any roll.
         terms: what else is wrong with the depth image.
         inference: where and how exactly the network computes.
-        fit: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the modes'
-            and the draws' own scores beside it; off the network alone; modes leaves the draws out.
+        method: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the
+            modes' and the draws' own scores beside it; network the network alone; modes leaves the draws out.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
         threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
         ray: score each view in a task of a Ray cluster: local, one of so many --threads for this run; auto or
@@ -214,7 +214,7 @@ class Evaluate:
     workspace: WorkspaceName = "own"
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = EXACT
-    fit: FitChoice = "auto"
+    method: AnswerMethod = "auto"
     force: bool = False
     threads: Threads = 0
     ray: RayAddress = None
@@ -246,7 +246,7 @@ class Evaluate:
                 self.output,
                 truths=self.scans,
                 scene=self.scene,
-                choice=self.fit,
+                method=self.method,
                 force=self.force,
                 options=options_of(self, "evaluate"),
             )
@@ -260,7 +260,7 @@ class Evaluate:
                 scene=self.scene,
                 settings=settings,
                 inference=self.inference,
-                choice=self.fit,
+                method=self.method,
                 force=self.force,
                 options=options_of(self, "evaluate"),
                 cluster=cluster,

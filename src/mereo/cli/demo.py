@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.api.frames import load_frame
-from mereo.api.objects import Method, Object, load_object
+from mereo.api.objects import Object, load_object
 from mereo.api.reconstruct import reconstruct
 from mereo.api.result import Result
 from mereo.cli.reconstruct import print_source
@@ -22,6 +22,7 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import grid_confusion, labels_on
 from mereo.evaluation.sample_views import SHIPPED_SCAN, T_MODEL_SCAN, load_view
+from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import statistical_model_of
 from mereo.io.output_folders import check_new_directory
 from mereo.io.scratch_folders import check_place
@@ -142,7 +143,7 @@ def _show(case: Case, folder: Path, console: Console) -> None:
     console.print(line, highlight=False, soft_wrap=True)
 
 
-def _answer(case: Case, method: Method) -> tuple[Result, Column]:
+def _answer(case: Case, method: AnswerMethod) -> tuple[Result, Column]:
     """Answer to a case, its scores and seconds."""
     started = time.perf_counter()
     result = reconstruct(case.frame, case.object, method, resolution=RESOLUTION)

@@ -67,7 +67,7 @@ def explain(
         if registered is None or registered.uncertainty is None:
             raise ValueError(
                 "the network's answer is kept, but --explain needs a registration, whose fit is explained: leave out "
-                "of the cloud what is not the object, or take the registered model in any case with --fit modes"
+                "of the cloud what is not the object, or take the registered model in any case with --method modes"
             )
         found, radius = registered.explain(wish), _radius(registered, wish)
         assert found is not None

@@ -76,6 +76,6 @@ def _needed(model: StatisticalModel) -> str:
     if count is None:
         return (
             f"even all modes leave {model.residue:.3f} units, more than {ENOUGH}, the noise of the paper's sensor: the "
-            "states lie on a curved set, so the scene's own draws fit better (--fit full)"
+            "states lie on a curved set, so the scene's own draws fit better (--method full)"
         )
     return f"{count} modes leave at most {ENOUGH} units, the noise of the paper's sensor"

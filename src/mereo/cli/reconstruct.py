@@ -10,10 +10,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mereo.api.objects import Method, Object, load_object
+from mereo.api.objects import Object, load_object
 from mereo.api.reconstruct import reconstruct
 from mereo.api.result import Result
 from mereo.cli.explain import explain, print_sure, wish_of
+from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried, Placed, place
 from mereo.fitting.registration.carry import carry as carry_one
@@ -61,7 +62,7 @@ class FrameJob:
     isolation: IsolationConfig = field(default_factory=IsolationConfig)
     inference: InferenceConfig = field(default_factory=InferenceConfig)
     files: FilesConfig = DEFAULT_FILES
-    method: Method = "auto"
+    method: AnswerMethod = "auto"
     scene: str | None = None
     carry: tuple[str | Path, ...] = ()
     carry_frame: CarryFrame = "source"
@@ -78,9 +79,11 @@ class FrameJob:
         if self.carry_frame != "source" and not self.attachments:
             raise ValueError(f"--carry-frame is {self.carry_frame!r} and nothing is carried: name a file with --carry")
         if self.attachments and self.method == "network":
-            raise ValueError("--fit is off, but --carry needs a registration, along which things move: use --fit auto")
+            raise ValueError("--method is network, but --carry needs a registration, along which things move: use auto")
         if self.explain and self.method == "network":
-            raise ValueError("--fit is off, but --explain needs a registration, whose fit is explained: use --fit auto")
+            raise ValueError(
+                "--method is network, but --explain needs a registration, whose fit is explained: use auto"
+            )
 
     @property
     def read(self) -> tuple[str | Path, ...]:
@@ -185,7 +188,7 @@ def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...
     if placed and (found.registration is None or not found.taken):
         raise ValueError(
             "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
-            "cloud what is not the object, or take the registered model in any case with --fit modes"
+            "cloud what is not the object, or take the registered model in any case with --method modes"
         )
     if found.registered is None:
         return ()
@@ -206,7 +209,7 @@ def print_source(found: Answer) -> None:
     explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
-        print("that is too little to believe it: --fit auto keeps the network's answer")
+        print("that is too little to believe it: --method auto keeps the network's answer")
     if found.recognition.told is not None:
         print(found.recognition.told)
 

@@ -8,7 +8,7 @@ from tyro.conf import UseAppendAction, arg
 
 from mereo.cli.config_file import ConfigFile, options_of
 from mereo.cli.positionals import Inputs
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.io.bounds import Cells, Threads
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import InferenceConfig
@@ -33,9 +33,9 @@ class ReconstructCommand:
         isolation: what of the frame is left out.
         inference: where and how exactly the network computes.
         files: which files, and in which unit.
-        fit: register the object's own deformation model to the frame: auto takes the registered model where it explains
-            the frame, if the weights carry one; off leaves the network's answer; modes and full take the model in any
-            case, full by fitting the draws of the scene as well.
+        method: register the object's own deformation model to the frame: auto takes the registered model where it
+            explains the frame, if the weights carry one; network leaves the network's answer; modes and full take the
+            model in any case, full by fitting the draws of the scene as well.
         scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
         carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
             glTF), points (PLY, PCD, XYZ, NPY) or CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses).
@@ -59,7 +59,7 @@ class ReconstructCommand:
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
     files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
-    fit: FitChoice = "auto"
+    method: AnswerMethod = "auto"
     scene: str | None = None
     carry: UseAppendAction[tuple[Path, ...]] = ()
     carry_frame: CarryFrame = "source"
@@ -85,7 +85,7 @@ class ReconstructCommand:
             self.isolation,
             for_tasks(self.inference, cluster),
             self.files,
-            "network" if self.fit == "off" else self.fit,
+            self.method,
             self.scene,
             self.carry,
             self.carry_frame,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.io.bounds import Cells, Port, Workers
 from mereo.models.config import InferenceConfig
 from mereo.serving.config import ServeConfig
@@ -26,8 +26,8 @@ class ServeCommand:
         weights: a shipped name or a file, once for each object; NAME=FILE says what clients call it.
         scene: NAME=FILE of the scene whose draws are fitted, where it is not the built-in one of the weights; once for
             each.
-        fit: register the object's own deformation model to the frames: auto takes the registered model where it
-            explains the frame, if the weights carry one; off leaves the network's answer; modes and full take the model
+        method: register the object's own deformation model to the frames: auto takes the registered model where it
+            explains the frame, if the weights carry one; network leaves the network's answer; modes and full take the model
             in any case, full by fitting the draws of the scene as well.
         port: where it listens; 0 takes any that is free.
         host: address of this machine. Only this machine reaches the default. Another one needs the token of the address
@@ -41,7 +41,7 @@ class ServeCommand:
 
     weights: UseAppendAction[tuple[str, ...]] = ()
     scene: UseAppendAction[tuple[str, ...]] = ()
-    fit: FitChoice = "auto"
+    method: AnswerMethod = "auto"
     port: Port = 8000
     host: str = "127.0.0.1"
     resolution: Cells = 128
@@ -59,7 +59,7 @@ class ServeCommand:
         serve(
             self.weights,
             scenes=self.scene,
-            fit=self.fit,
+            method=self.method,
             resolution=self.resolution,
             host=self.host,
             port=self.port,

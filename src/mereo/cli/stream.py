@@ -12,7 +12,7 @@ from typing import Any
 from mereo.cli.stream_answers import Answering, FrameAnswer, Seen
 from mereo.cli.stream_rerun import RerunLog, RerunTarget
 from mereo.fitting.registration.register import registrar_for
-from mereo.fitting.tracking.config import StreamFit
+from mereo.fitting.tracking.config import StreamMethod
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.atomic_files import atomic_file, to_json
 from mereo.io.config import InputConfig
@@ -41,7 +41,7 @@ def stream_reconstructions(
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,
     inference: InferenceConfig | None = None,
-    fit: StreamFit = "auto",
+    method: StreamMethod = "auto",
     uncertainty: bool = False,
 ) -> Summary:
     """Print a line of JSON for each answered or bad frame, and the summary at the end or after Ctrl-C.
@@ -63,7 +63,7 @@ def stream_reconstructions(
     frames: Iterable[StreamFrame[Observation] | None] = (
         watched_frames(source, reading, isolation) if watch else frames_of(source, reading, isolation, rate_hz)
     )
-    answer = Answering(model, registrar_for(model, fit), resolution, isolation.keep_all, uncertainty)
+    answer = Answering(model, registrar_for(model, method), resolution, isolation.keep_all, uncertainty)
     # what is written to standard input or into a watched folder arrives when it does
     pace = not every_frame and not watch and source != STANDARD_INPUT
     timed = (None if frame is None else with_time(frame) for frame in frames)

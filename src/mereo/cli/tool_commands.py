@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
-from mereo.fitting.tracking.config import StreamFit
+from mereo.fitting.tracking.config import StreamMethod
 from mereo.io.bounds import Cells, Count, CountOrNone, Port, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
 from mereo.io.cores import workers_for
@@ -134,8 +134,8 @@ class StreamCommand:
         input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
         weights: a shipped name or a file.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
-        fit: auto follows the registered model where it explains the frame, if the weights carry one, and else asks the
-            network; off asks the network alone, for each frame anew; modes takes the model in any case.
+        method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
+            the network; network asks it alone, for each frame anew; modes takes the model in any case.
         uncertainty: say how sure the registered model is: radii, in the input's unit, that hold the true places of the
             surface and of each segment's centroid with probability 0.95, and intervals of its volume; takes some 30 ms.
         rate: frames per second at which a folder was recorded.
@@ -153,7 +153,7 @@ class StreamCommand:
     input: InputName
     weights: str
     resolution: Cells = 48
-    fit: StreamFit = "auto"
+    method: StreamMethod = "auto"
     uncertainty: bool = False
     rate: Positive = 30.0
     every_frame: bool = False
@@ -185,7 +185,7 @@ class StreamCommand:
             reading=self.reading,
             isolation=self.isolation,
             inference=self.inference,
-            fit=self.fit,
+            method=self.method,
             uncertainty=self.uncertainty,
         )
 

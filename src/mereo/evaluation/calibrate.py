@@ -88,7 +88,7 @@ def calibrate(
     bare = replace(model, calibration=None)
     registrar = None if model.statistical_model is None else registrar_for(bare, "modes", scene)
     gauges: tuple[Gauge, ...] = (ProbabilityGauge(bare),)
-    radii = None if registrar is None else RadiusGauge(replace(registrar, choice="auto"))
+    radii = None if registrar is None else RadiusGauge(replace(registrar, method="auto"))
     if radii is not None:
         gauges = (*gauges, RecognitionGauge(), radii)
     more = radius_views if radii is not None else 0

@@ -106,7 +106,7 @@ def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
     """Names of the answers that can be had: the draws only of an object whose scene is at hand."""
     if registrar is None:
         return ("network",)
-    if registrar.choice == "modes" or registrar.at_hand is None:
+    if registrar.method == "modes" or registrar.at_hand is None:
         return ("network", "modes")
     return ("network", "modes", "full")
 

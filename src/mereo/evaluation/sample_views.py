@@ -5,7 +5,6 @@ A few views, rendered from test seeds, come with the package, so that a fresh cl
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,8 +13,8 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.labels import LabelGrid
 from mereo.io.atomic_files import atomic_file
 from mereo.io.errors import quiet, reason
-from mereo.io.sensor_frame import SensorFrame
 from mereo.io.readers import read_point_cloud
+from mereo.io.sensor_frame import SensorFrame
 from mereo.io.size_limits import read_arrays
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng

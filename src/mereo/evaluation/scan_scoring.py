@@ -12,7 +12,7 @@ from mereo.evaluation.registration.truth_file import read_truth
 from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scans import SCANS, PosedScan, bunny_posed
 from mereo.evaluation.scoring import CELLS, check_names, score_cases
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import registrar_for
 from mereo.models.model import Model
 from mereo.scenes.scene import Scene
@@ -25,7 +25,7 @@ def evaluate_scans(
     truths: Sequence[str | Path] = (),
     scene: Scene | None = None,
     cells: int = CELLS,
-    choice: FitChoice = "auto",
+    method: AnswerMethod = "auto",
 ) -> Evaluation:
     """Scores of a model on real scans.
 
@@ -35,7 +35,7 @@ def evaluate_scans(
         scene: the scene that the scans were aligned with; by default each truth file's own, which must be built in or
             YAML: a data file never has a Python scene run.
         cells: cells of the grid along each axis.
-        choice: which answer is scored: by default what a user gets, and beside it all others that can be had.
+        method: which answer is scored: by default what a user gets, and beside it all others that can be had.
 
     Raises ``ValueError`` for another object's model, two scans of one name and a scene without truths,
     ``FileNotFoundError`` for a missing file, and ``AssetUnavailable`` where a scan of the bunny cannot be had.
@@ -53,7 +53,7 @@ def evaluate_scans(
         )
     for scan in scans:
         check_names(model, scan.truth.names)
-    registrar = registrar_for(model, choice, scene)
+    registrar = registrar_for(model, method, scene)
     # every scan keeps its labels: there are few, and the paper shows all of its own (appendix D)
     return score_cases(model, lambda index: _case(scans[index], cells), len(scans), True, registrar, kept=len(scans))
 

@@ -18,7 +18,7 @@ from mereo.evaluation.cases import EvaluationTally, Scoring, TestCase
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import Evaluation, grid_confusion
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import CURE, Registrar, other_mesh, registrar_for
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
@@ -85,7 +85,7 @@ def evaluate(
     cells: int = CELLS,
     progress: bool = False,
     settings: GenerateConfig | None = None,
-    choice: FitChoice = "auto",
+    method: AnswerMethod = "auto",
     cluster: Cluster | None = None,
 ) -> Evaluation:
     """Scores of a model on synthetic views of a scene, seen as in training: through a noisy depth image.
@@ -98,7 +98,7 @@ def evaluate(
         cells: cells of the grid along each axis.
         progress: whether to show a bar with the time left.
         settings: the camera (image size, noise, sensor); by default the paper's.
-        choice: which answer is scored: by default what a user gets, and beside it all others that can be had.
+        method: which answer is scored: by default what a user gets, and beside it all others that can be had.
         cluster: where each view is a task; without one they are scored here, in order.
 
     Raises ``ValueError`` for a training seed, no examples, another object than the model's, and, where a registration
@@ -112,13 +112,15 @@ def evaluate(
     if scene is None or isinstance(scene, str):
         scene = load_scene(scene or trained_scene(model))
     check_names(model, scene.rest.names)
-    if choice != "off" and model.statistical_model is not None:
+    if method != "network" and model.statistical_model is not None:
         fault = other_mesh(scene, model.statistical_model)
         if fault is not None:
-            raise ValueError(f"{fault}, so places cannot be compared: {CURE}, or score the network with --fit off")
+            raise ValueError(
+                f"{fault}, so places cannot be compared: {CURE}, or score the network with --method network"
+            )
     case = partial(_scene_case, scene, settings or GenerateConfig(), seed, cells)
     unit_mm = None if scene.unit_m is None else 1000 * scene.unit_m
-    registrar = registrar_for(model, choice, scene)
+    registrar = registrar_for(model, method, scene)
     return replace(score_cases(model, case, examples, progress, registrar, cluster=cluster), unit_mm=unit_mm)
 
 

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Literal
 
-FitChoice = Literal["off", "auto", "modes", "full"]
-"""Source of the answer to a frame: the network alone; the registered model where that explains the frame, else the
-network; the registered model in any case, by its modes or by the draws of its scene as well."""
+AnswerMethod = Literal["auto", "network", "modes", "full"]
+"""Source of the answer to a frame: the registered model where that explains the frame, else the network; the network
+alone; the registered model in any case, by its modes or by the draws of its scene as well."""
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from mereo.api.objects import Method, Object, load_object
+from mereo.api.objects import Object, load_object
 from mereo.api.reconstruct import reconstruct
 from mereo.api.result import Result
+from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar
 from mereo.io.atomic_files import to_json
 from mereo.io.foreseen import is_foreseen, words_of
@@ -54,15 +55,15 @@ class Loaded:
 
     served: Served
     object: Object
-    method: Method
+    method: AnswerMethod
 
     @classmethod
     def of(cls, served: Served, setup: Setup) -> "Loaded":
         """Load weights, and make what every frame needs; raises as ``load_for`` and ``registrar_for`` do."""
         model = replace(load_for(served.weights, setup.inference), name=served.name)
-        loaded = cls(served, load_object(model, served.scene), "network" if setup.fit == "off" else setup.fit)
+        loaded = cls(served, load_object(model, served.scene), setup.method)
         registrar = loaded.registrar
-        if registrar is not None and registrar.choice != "modes":
+        if registrar is not None and registrar.method != "modes":
             _ = registrar.at_hand  # takes seconds, once
         _ = model.inference
         return loaded
@@ -89,7 +90,7 @@ class Loaded:
             ],
             "nested": [list(pair) for pair in model.nested],
             "scene": model.provenance.get("scene"),
-            "fit": "off" if self.registrar is None else self.registrar.choice,
+            "method": "network" if self.registrar is None else self.registrar.method,
             "scene_unit_m": None if frame is None else frame.unit_m,
             "calibrated": model.calibrates,
             "recognition_calibrated": own is not None and own.recognizing is not None,

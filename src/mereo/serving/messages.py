@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig, Precision
 from mereo.reconstruction.config import IsolationConfig
@@ -43,7 +43,7 @@ class Setup:
 
     Attributes:
         served: weights, by their names.
-        fit: source of the answers.
+        method: source of the answers.
         inference: where and how exactly the networks compute.
         max_points: most points of a frame.
         max_body: most bytes of a request.
@@ -51,7 +51,7 @@ class Setup:
     """
 
     served: tuple[Served, ...]
-    fit: FitChoice = "auto"
+    method: AnswerMethod = "auto"
     inference: InferenceConfig = field(default_factory=InferenceConfig)
     max_points: int = 1_000_000
     max_body: int = 64_000_000

@@ -12,7 +12,7 @@ from typing import Any
 
 import uvicorn
 
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.io.scratch_folders import scratch_folder
 from mereo.models.config import InferenceConfig
 from mereo.serving.app import Service, make_app
@@ -32,7 +32,7 @@ def serve(
     weights: Sequence[str],
     *,
     scenes: Sequence[str] = (),
-    fit: FitChoice = "auto",
+    method: AnswerMethod = "auto",
     resolution: int = 128,
     host: str = LOOPBACK,
     port: int = 8000,
@@ -45,7 +45,7 @@ def serve(
     Args:
         weights: shipped names or files, each as it is or as NAME=FILE.
         scenes: NAME=FILE of the scenes whose draws are fitted, where they are not the weights' built-in ones.
-        fit: source of the answers.
+        method: source of the answers.
         resolution: cells along the longest side where a request does not say.
         host: address of this machine; others than its own need the token of the printed address.
         port: 0 takes any that is free.
@@ -58,7 +58,7 @@ def serve(
     """
     config = config or ServeConfig()
     served = served_weights(weights, scenes)
-    setup = Setup(served, fit, inference or InferenceConfig(), config.max_points, config.max_body, config.batch)
+    setup = Setup(served, method, inference or InferenceConfig(), config.max_points, config.max_body, config.batch)
     entry, metrics = Entry.of(host), Metrics()
     with ExitStack() as stack:
         socket = stack.enter_context(bound_socket(host, port))

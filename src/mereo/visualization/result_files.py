@@ -10,7 +10,7 @@ from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.evaluation.scoring import CELLS, evaluate, trained_scene
 from mereo.evaluation.tables import markdown_table, metrics
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried
 from mereo.fitting.registration.register import describe
@@ -56,7 +56,7 @@ def evaluate_weights(
     cells: int = CELLS,
     settings: GenerateConfig | None = None,
     inference: InferenceConfig = EXACT,
-    choice: FitChoice = "auto",
+    method: AnswerMethod = "auto",
     force: bool = False,
     options: Mapping[str, Any] | None = None,
     cluster: Cluster | None = None,
@@ -78,7 +78,7 @@ def evaluate_weights(
             cells=cells,
             progress=True,
             settings=settings,
-            choice=choice,
+            method=method,
             cluster=cluster,
         )
         facts = {
@@ -106,7 +106,7 @@ def evaluate_on_scans(
     truths: Sequence[str | Path] = (),
     scene: Scene | str | None = None,
     cells: int = CELLS,
-    choice: FitChoice = "auto",
+    method: AnswerMethod = "auto",
     force: bool = False,
     options: Mapping[str, Any] | None = None,
 ) -> Evaluation:
@@ -116,7 +116,7 @@ def evaluate_on_scans(
     """
     with new_directory(output, force, [*truths, *_files_of(scene)]) as directory:
         loaded = load_scene(scene) if isinstance(scene, str) else scene
-        evaluation = evaluate_scans(model, truths=truths, scene=loaded, cells=cells, choice=choice)
+        evaluation = evaluate_scans(model, truths=truths, scene=loaded, cells=cells, method=method)
         facts = {"scans": list(evaluation.examples), "truths": [str(path) for path in truths]}
         write_evaluation(directory, evaluation, {**facts, "trained": model.provenance}, options)
     print(markdown_table(evaluation))

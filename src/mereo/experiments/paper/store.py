@@ -16,7 +16,7 @@ from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.evaluation.scoring import evaluate
 from mereo.evaluation.tables import read_metrics
 from mereo.experiments.paper.scales import TRAINING_SEED
-from mereo.fitting.config import FitChoice
+from mereo.fitting.config import AnswerMethod
 from mereo.io.atomic_files import write_json
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
@@ -28,7 +28,7 @@ from mereo.training.config import TrainConfig
 from mereo.training.trainer import train
 from mereo.visualization.result_files import evaluate_weights
 
-NETWORK: FitChoice = "off"
+NETWORK: AnswerMethod = "network"
 """The paper's experiments are about networks: no registered model answers in their place."""
 
 FINISHED = "finished.json"
@@ -93,16 +93,16 @@ class Store:
         path = self.root / "scores" / f"{scene}-{key}"
         _say("score", path)
         if not path.exists():
-            evaluate_weights(weights, path, examples=examples, cells=cells, settings=settings, choice=NETWORK)
+            evaluate_weights(weights, path, examples=examples, cells=cells, settings=settings, method=NETWORK)
         return read_score(path / "metrics.json")
 
     def view(self, weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
         """First test view of a run's network with its labels, for pictures."""
-        return evaluate(load_model(weights), examples=1, cells=cells, settings=settings, choice=NETWORK).views[0]
+        return evaluate(load_model(weights), examples=1, cells=cells, settings=settings, method=NETWORK).views[0]
 
     def scans(self, weights: Path, cells: int) -> tuple[Score, tuple[EvaluatedView, ...]]:
         """Score of a run's network on the real scans of the bunny, and each of them with its labels."""
-        evaluation = evaluate_scans(load_model(weights), cells=cells, choice=NETWORK)
+        evaluation = evaluate_scans(load_model(weights), cells=cells, method=NETWORK)
         scores, mean = evaluation.scores, evaluation.example_mean
         per_segment = dict(zip(evaluation.names, map(float, scores.per_segment), strict=True))
         return Score(scores.iou, scores.miou, *mean, per_segment), evaluation.views

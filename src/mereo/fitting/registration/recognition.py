@@ -93,7 +93,7 @@ class Signs:
     def of(
         cls, registration: Registration, displaced: float | None = None, stated_scene_unit: float | None = None
     ) -> "Signs":
-        """Signs of a registration; ``stated_scene_unit`` is the length of a scene unit in its unit as the input says it."""
+        """Signs of a registration; ``stated_scene_unit`` is the length of a scene unit as the frame's unit says it."""
         at_rest, z = registration.method == "rest", registration.modes_z  # at rest it is known, whatever was learned
         return cls(
             size=None if stated_scene_unit is None else abs(float(np.log(registration.scene_unit / stated_scene_unit))),
@@ -169,7 +169,7 @@ def told_of(known: Known, reason: str) -> str:
     return f"{'doubtful' if known == 'unsure' else 'not the object in a state that was learned'}: {reason}"
 
 
-NOT_ASKED = Recognition("unsure", "the network alone cannot tell its object from others: use --fit auto", 0.0)
+NOT_ASKED = Recognition("unsure", "the network alone cannot tell its object from others: use --method auto", 0.0)
 """Recognition of a frame to which no model was registered."""
 
 

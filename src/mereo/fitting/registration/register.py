@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.config import FitChoice, FitConfig
+from mereo.fitting.config import AnswerMethod, FitConfig
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration.fit import ModesFit, fit_frame
 from mereo.fitting.registration.registration import Registration
@@ -36,7 +36,7 @@ class Registrar:
     Attributes:
         network: the weights, from whose correspondences a fit starts.
         model: statistical model of the same object.
-        choice: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
+        method: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
             misfit; "auto" does the same where the scene is at hand, and else fits the modes.
         given: the object's scene, where it is not the built-in one that the weights were trained on.
         config: constants of the fit of the modes.
@@ -44,28 +44,28 @@ class Registrar:
 
     network: Model
     model: StatisticalModel
-    choice: FitChoice = "auto"
+    method: AnswerMethod = "auto"
     given: Scene | None = None
     config: FitConfig = FitConfig()  # noqa: RUF009 (frozen)
 
     @classmethod
-    def of(cls, network: Model, choice: FitChoice = "auto", scene: Scene | str | None = None) -> "Registrar":
+    def of(cls, network: Model, method: AnswerMethod = "auto", scene: Scene | str | None = None) -> "Registrar":
         """Registrar of the model that the weights carry, or of that of their built-in scene, which takes seconds.
 
         Args:
             network: the weights.
-            choice: which description of the states is fitted.
+            method: which description of the states is fitted.
             scene: the object's scene, its name or its file, where it is not the built-in one of the weights.
 
         Raises ``ValueError`` where the weights carry no statistical model and know no built-in scene, and where
-        ``choice`` is "full" without a scene or with one of another object.
+        ``method`` is "full" without a scene or with one of another object.
         """
         given = load_scene(scene) if isinstance(scene, str) else scene
-        result = cls(network, statistical_model_of(network), choice, given)
-        if choice == "full" and result.scene is None:
+        result = cls(network, statistical_model_of(network), method, given)
+        if method == "full" and result.scene is None:
             raise ValueError(
                 f"the weights were trained on {network.provenance.get('scene')!r}, which is no built-in scene; the fit "
-                "of a scene's draws plays it: name its file with --scene, or use --fit modes"
+                "of a scene's draws plays it: name its file with --scene, or use --method modes"
             )
         return result
 
@@ -73,7 +73,7 @@ class Registrar:
     def scene(self) -> Scene | None:
         """Scene whose draws can be played: the given one, or the built-in one of the weights; None where neither is.
 
-        Also None, with a ``ChangedSceneWarning``, where ``choice`` is "auto" and the scene that the weights were
+        Also None, with a ``ChangedSceneWarning``, where ``method`` is "auto" and the scene that the weights were
         trained on has other meshes since. Raises ``ValueError`` for such a scene with other choices and for a given
         scene of another object, and ``AssetUnavailable`` where its mesh cannot be had.
         """
@@ -82,7 +82,7 @@ class Registrar:
         fault = None if scene is None else other_mesh(scene, self.model)
         if scene is None or fault is None:
             return scene
-        if self.choice == "auto" and scene.name == name:
+        if self.method == "auto" and scene.name == name:
             warnings.warn(
                 f"{fault}: it has changed since they were trained, so only the modes of that model are fitted; train "
                 "them again for the fit of its draws",
@@ -90,7 +90,7 @@ class Registrar:
                 stacklevel=2,
             )
             return None
-        raise ValueError(f"{fault}, so its draws move other points: {CURE}, or use --fit modes")
+        raise ValueError(f"{fault}, so its draws move other points: {CURE}, or use --method modes")
 
     @cached_property
     def states(self) -> DrawnStates | None:
@@ -143,7 +143,7 @@ class Registrar:
         scene_unit: float | None = None,
         is_certain: bool = True,
     ) -> Registration:
-        """Registration of the model to a cloud, as ``choice`` says.
+        """Registration of the model to a cloud, as ``method`` says.
 
         Args:
             seen: observed points, camera frame, any unit.
@@ -156,13 +156,13 @@ class Registrar:
         return self.finish(self.fit_modes(seen, code, scene_unit, is_certain))
 
     def finish(self, fitted: ModesFit) -> Registration:
-        """The answer from a fit of the modes: the draws too where ``choice`` asks for them."""
-        states = None if self.choice == "modes" or not fitted.asks_draws else self.at_hand
+        """The answer from a fit of the modes: the draws too where ``method`` asks for them."""
+        states = None if self.method == "modes" or not fitted.asks_draws else self.at_hand
         return fitted.registration() if states is None else fitted.with_draws(states)
 
     def takes(self, registration: Registration) -> bool:
         """Whether a registration is the answer: with "auto" one that explains its frame, with other choices any."""
-        return registration.accepted or self.choice != "auto"
+        return registration.accepted or self.method != "auto"
 
     @cached_property
     def at_hand(self) -> DrawnStates | None:
@@ -170,16 +170,16 @@ class Registrar:
         try:
             return self.states
         except AssetUnavailable:
-            if self.choice == "auto":
+            if self.method == "auto":
                 return None
             raise
 
 
-def registrar_for(model: Model, choice: FitChoice, scene: Scene | str | None = None) -> Registrar | None:
-    """Registrar for a choice; None where the network alone answers: "auto" needs weights that carry a model."""
-    if choice == "off" or (choice == "auto" and model.statistical_model is None):
+def registrar_for(model: Model, method: AnswerMethod, scene: Scene | str | None = None) -> Registrar | None:
+    """Registrar for a method; None where the network alone answers: "auto" needs weights that carry a model."""
+    if method == "network" or (method == "auto" and model.statistical_model is None):
         return None
-    return Registrar.of(model, choice, scene)
+    return Registrar.of(model, method, scene)
 
 
 CURE = "name the scene that the weights were trained on, train them again if it has changed since"
@@ -211,7 +211,7 @@ def statistical_model_of(model: Model) -> StatisticalModel:
         raise ValueError(
             f"the weights of {', '.join(model.names)} carry no statistical model of their object's states; a "
             "registration needs one: finish the dataset with `mereo generate ... --resume` and train again, or use "
-            "--fit off"
+            "--method network"
         )
     return found
 

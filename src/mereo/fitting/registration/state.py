@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from mereo.fitting.draws.playback import Drawn, material_moved, shares_of
 from mereo.fitting.problem.noise import ACCEPTED
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.register import CURE, Registrar, other_mesh
+from mereo.fitting.registration.register import CURE, other_mesh
 from mereo.fitting.registration.registration import BELIEVED, Registration
 from mereo.fitting.registration.state_file import (
     FORMAT,

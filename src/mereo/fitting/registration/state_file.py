@@ -150,7 +150,7 @@ def read_state(path: str | Path) -> RegistrationState:
     if not path.is_file():
         raise FileNotFoundError(
             f"{path} does not exist; `mereo reconstruct` writes it where the answer is a registered model: check the "
-            "path, or reconstruct with --fit modes"
+            "path, or reconstruct with --method modes"
         )
     with path.open("rb") as file:
         content = file.read(MOST_BYTES + 1)

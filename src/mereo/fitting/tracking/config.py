@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-StreamFit = Literal["off", "auto", "modes"]
-"""Source of the answers to a sequence, as ``FitChoice``; draws take longer than the time between two frames."""
+StreamMethod = Literal["auto", "network", "modes"]
+"""Source of the answers to a sequence, as ``AnswerMethod``; draws take longer than the time between two frames."""
 
 MotionModel = Literal["pose", "velocity"]
 """What is expected of the next frame: the last state, or the last state moved on as it has moved."""

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mereo.fitting.config import FitChoice, FitConfig
+from mereo.fitting.config import AnswerMethod, FitConfig
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_of, fit_hypotheses
 from mereo.fitting.registration.fit import ModesFit
@@ -33,7 +33,7 @@ class Tracker:
     """Follows one object through a sequence of frames; not safe for use by several threads at once.
 
     Attributes:
-        registrar: of the object; its ``choice`` says whether a registration that does not explain its frame is taken.
+        registrar: of the object; its ``method`` says whether a registration that does not explain its frame is taken.
             Draws and rest model are not asked: they take longer than the time between two frames.
         config: constants.
     """
@@ -45,9 +45,9 @@ class Tracker:
         self.forget()
 
     @classmethod
-    def of(cls, network: Model, choice: FitChoice = "auto") -> "Tracker":
+    def of(cls, network: Model, method: AnswerMethod = "auto") -> "Tracker":
         """Tracker of the object that weights were trained on; raises as ``Registrar.of`` does."""
-        return cls(Registrar.of(network, choice))
+        return cls(Registrar.of(network, method))
 
     def forget(self) -> None:
         """Start anew: the next frame is fitted by itself."""
@@ -66,7 +66,7 @@ class Tracker:
             scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
             keep_all: take every point for the object's.
 
-        Raises ``ValueError`` for unusable clouds and, unless the registrar's choice is "auto", where a frame that is
+        Raises ``ValueError`` for unusable clouds and, unless the registrar's method is "auto", where a frame that is
         fitted by itself finds too little. The track is kept: the object may come again.
         """
         started = time.perf_counter()
@@ -74,7 +74,7 @@ class Tracker:
         if tracked is not None and self._believed(tracked):
             return self._gone_on(seen, tracked, started)
         found, likelier = fit_hypotheses(seen, self.registrar.network, self.registrar, keep_all, scene_unit)
-        if found.modes is None and tracked is None and self.registrar.choice != "auto":
+        if found.modes is None and tracked is None and self.registrar.method != "auto":
             assert found.error is not None
             raise found.error
         own = None if found.modes is None else _Tracked.of_frame(found, time_s, self.config, self.registrar.config)

@@ -124,7 +124,7 @@ class Laboratory:
     def quick_registrar(self) -> Registrar | None:
         """The same for while a slider moves."""
         full = self.registrar
-        return None if full is None else QuickRegistrar(full.network, full.model, full.choice, full.given)
+        return None if full is None else QuickRegistrar(full.network, full.model, full.method, full.given)
 
     def camera(self, size: int) -> Camera:
         """Virtual depth camera of the scene's workspace, of so many pixels a side."""

@@ -8,7 +8,6 @@ from jaxtyping import Float, UInt8
 
 from mereo.fitting.registration.answer import Answer as FrameAnswer
 from mereo.fitting.registration.recognition import Recognition, recognize
-from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh

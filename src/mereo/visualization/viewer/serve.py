@@ -13,7 +13,7 @@ from mereo.fitting.registration.register import registrar_for, statistical_model
 from mereo.fitting.registration.state import played_state, restored
 from mereo.fitting.registration.state_file import RegistrationState, is_state, read_state
 from mereo.io.config import InputConfig
-from mereo.io.sensor_frame import SensorFrame, read_frame
+from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
 from mereo.models.weights import find_weights, load_for, shipped_names
