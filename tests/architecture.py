@@ -27,6 +27,7 @@ ROOMS = (
     "training",
     "visualization",
     "learning",
+    "api",
     "experiments",
     "serving",
     "cli",

@@ -27,8 +27,8 @@ class ServeCommand:
         scene: NAME=FILE of the scene whose draws are fitted, where it is not the built-in one of the weights; once for
             each.
         method: register the object's own deformation model to the frames: auto takes the registered model where it
-            explains the frame, if the weights carry one; network leaves the network's answer; modes and full take the model
-            in any case, full by fitting the draws of the scene as well.
+            explains the frame, if the weights carry one; network leaves the network's answer; modes and full take the
+            model in any case, full by fitting the draws of the scene as well.
         port: where it listens; 0 takes any that is free.
         host: address of this machine. Only this machine reaches the default. Another one needs the token of the address
             that is printed, and others on the network can read along: a proxy that encrypts is safer.

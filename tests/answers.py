@@ -1,0 +1,41 @@
+"""Answers to clouds, for tests of the network alone and of what is done with an answer."""
+
+from typing import Any
+
+import numpy as np
+
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.register import Registrar
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.models.model import Model
+from mereo.reconstruction.observation import observe
+from mereo.reconstruction.pipeline import Reconstruction
+
+
+def answer_to(
+    points: PointCloud | np.ndarray,
+    model: Model,
+    registrar: Registrar | None = None,
+    resolution: int = 128,
+    axes: CloudAxes = "camera",
+    unit_m: float | None = None,
+    **options: Any,
+) -> Answer:
+    """Answer to a cloud that is all the object's; without a registrar the network's."""
+    cloud = points if isinstance(points, PointCloud) else PointCloud(np.asarray(points, dtype=np.float64))
+    return answer_frame(observe(cloud, axes, unit_m), model, registrar, resolution=resolution, **options)
+
+
+def reconstruct(
+    points: PointCloud | np.ndarray,
+    model: Model,
+    resolution: int = 128,
+    axes: CloudAxes = "camera",
+    label_points: bool = False,
+    keep_all: bool = False,
+) -> Reconstruction:
+    """What the network alone finds in a cloud."""
+    options = {"label_points": label_points, "keep_all": keep_all}
+    return answer_to(points, model, None, resolution, axes, **options).reconstruction
