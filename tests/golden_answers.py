@@ -90,9 +90,9 @@ def scene_of(name: str) -> Scene:
 @cache
 def object_of(name: str) -> mereo.Object:
     """Object that answers the frames of a name."""
-    if name in OWN:
-        return mereo.load_object(weights_of(name), scene=scene_of(name))
-    return mereo.load_object("bunny" if name == "scans" else name)
+    weights = weights_of(name) if name in OWN else "bunny" if name == "scans" else name
+    scene = scene_of(name) if name in OWN else None
+    return mereo.load_object(weights, scene, device="cpu", precision="float32")
 
 
 def facts_of(name: str, frame: Frame) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import sys
 import time
 import warnings
 from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from contextlib import nullcontext, redirect_stderr, redirect_stdout, suppress
 from dataclasses import field, make_dataclass
 from functools import cache
 from itertools import pairwise
@@ -17,15 +17,18 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
+from mereo.api.words import SPEAKS_OPTIONS
 from mereo.cli import commands, dataset_commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
 from mereo.cli.calibrate import CalibrateCommand
 from mereo.cli.config_file import GivenOptions, defaults_from, read_options
 from mereo.cli.last_resort import sentence
 from mereo.cli.learn import LearnCommand
+from mereo.cli.outcome import Outcome
 from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.cli.serve_command import ServeCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.cli.usage import noted_events, usage_sentence
+from mereo.io.atomic_files import json_text
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import FreeCores, use_free_cores, use_threads
 from mereo.io.foreseen import is_foreseen, printable_line, words_of
@@ -63,7 +66,7 @@ USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 class Command(Protocol):
     """Command that arguments are read into: a class of ``commands``, ``scene_commands`` or ``tool_commands``."""
 
-    def run(self) -> None:
+    def run(self) -> Outcome | None:
         """Do the work, and print what a person wants to know of it."""
 
 
@@ -84,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
                 use_threads(threads)
             elif isinstance(command, ANSWERING):
                 use_free_cores(watch)
-            command.run()
+            status = _run(command)
             sys.stdout.flush()
     except Stopped as stopped:
         return _stop(f"mereo: stopped by {stopped.signal.name}", 128 + stopped.signal)
@@ -100,7 +103,25 @@ def main(arguments: list[str] | None = None) -> int:
         if is_foreseen(error):
             return _stop(f"mereo: error: {words_of(error)}", USER_ERROR)
         return _stop(f"mereo: error: {sentence(error, arguments, TRACEBACK_VARIABLE)}", FAULT)
-    return 0
+    return status
+
+
+def _run(command: Command) -> int:
+    """Run a command and return its exit status; with ``--json`` standard output gets one object, all else goes beside.
+
+    Messages name options, not arguments of functions.
+    """
+    as_json, speaking = getattr(command, "json", False), SPEAKS_OPTIONS.set(True)
+    try:
+        with redirect_stdout(sys.stderr) if as_json else nullcontext():
+            outcome = command.run()
+    finally:
+        SPEAKS_OPTIONS.reset(speaking)
+    if outcome is None:
+        return 0
+    if as_json:
+        print(json_text(outcome.facts), end="")
+    return outcome.status
 
 
 def version() -> str:

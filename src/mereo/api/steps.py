@@ -8,11 +8,12 @@ They print their progress as the commands do, and raise the sentences that those
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from mereo.api.words import python_words
 from mereo.evaluation import scoring
 from mereo.evaluation.metrics import format_score
 from mereo.evaluation.results import Evaluation
@@ -22,7 +23,7 @@ from mereo.io.object_storage import ObjectPath, Place, place_of
 from mereo.learning import learn as learning
 from mereo.learning.example_frame import FRAME
 from mereo.learning.object_files import scene_for
-from mereo.models.config import EXACT, InferenceConfig
+from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.models.elsewhere import for_tasks
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
@@ -36,7 +37,7 @@ from mereo.training import trainer
 from mereo.training.config import PRESETS, PresetName, TrainConfig
 from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
 from mereo.workers.cluster import joined_first
-from mereo.workers.config import cluster_of
+from mereo.workers.config import Cluster, cluster_of
 
 
 def generate(
@@ -74,7 +75,7 @@ def generate(
     place = place_of(output)
     processes = workers or os.cpu_count() or 1
     cluster = cluster_of(ray, processes)
-    with joined_first(cluster):
+    with python_words(), joined_first(cluster):
         shards.generate(
             made,
             place,
@@ -91,7 +92,12 @@ def generate(
 
 
 def train(
-    dataset: str | Path | ObjectPath, output: str | Path, config: TrainConfig | PresetName = "base", **changes: Any
+    dataset: str | Path | ObjectPath,
+    output: str | Path,
+    config: TrainConfig | PresetName = "base",
+    *,
+    device: Device = "auto",
+    **changes: Any,
 ) -> Path:
     """File of weights, trained on generated examples; the same call again continues a stopped run: `mereo train`.
 
@@ -99,6 +105,7 @@ def train(
         dataset: folder written by ``generate``, or its URL.
         output: folder of the run: config.json, metrics.csv, curves.png, checkpoint.safetensors, weights.safetensors.
         config: the recipe, or the name of a preset.
+        device: where the network is trained; "auto" takes a CUDA device where there is one.
         changes: fields of ``TrainConfig`` to be changed in it, such as ``init="bunny"`` or ``epochs=20.0``.
 
     Raises ``TypeError`` for a field that there is none of, ``ValueError`` for a preset that is unknown and values that
@@ -108,7 +115,8 @@ def train(
         if config not in PRESETS:
             raise ValueError(f"the preset is {config!r}; it must be one of {', '.join(PRESETS)}: correct the spelling")
         config = PRESETS[config]
-    return trainer.train(place_of(dataset), Path(output), replace(config, **changes))
+    with python_words():
+        return trainer.train(place_of(dataset), Path(output), replace(config, **changes), device=device)
 
 
 def evaluate(
@@ -124,7 +132,9 @@ def evaluate(
     inference: InferenceConfig = EXACT,
     cells: int = scoring.CELLS,
     progress: bool = True,
-    ray: str | None = None,
+    ray: str | Cluster | None = None,
+    overwrite: bool = False,
+    options: Mapping[str, Any] | None = None,
 ) -> Evaluation:
     """Scores of weights on test examples of their scene, or on real scans: `mereo evaluate`.
 
@@ -141,31 +151,54 @@ def evaluate(
         cells: of the grid along each axis, on which answers are compared with the truth; 100 is the paper's.
         progress: show the time left, where nothing is written.
         ray: score each view in a task of one CPU of a Ray cluster, as in ``generate``; "local" has one for each core.
+            Or a cluster that is described already.
+        overwrite: replace an output folder that mereo wrote, and nothing else is in.
+        options: content of config.json in the output folder; None writes none.
 
     Raises ``ValueError`` for a training seed, no examples, another object than the model's, and settings with scans,
     which are real; ``FileExistsError`` for an output with content.
     """
-    cluster = cluster_of(ray)
-    loaded = model if isinstance(model, Model) else load_for(model, for_tasks(inference, cluster))
-    place = str(scene) if isinstance(scene, Path) else scene
-    if scans is not None:
-        if settings is not None:
-            raise ValueError("scans are real and take no simulated camera: leave out the settings")
-        if cluster is not None:
-            raise ValueError("scans are few and are scored here: leave out ray")
-        if output is not None:
-            return evaluate_on_scans(loaded, output, truths=scans, scene=place, cells=cells, method=method)
-        posed = load_scene(place) if isinstance(place, str) else place
-        return evaluate_scans(loaded, truths=scans, scene=posed, cells=cells, method=method)
-    asked: dict[str, Any] = {"examples": examples, "seed": seed, "cells": cells, "settings": settings, "method": method}
-    with joined_first(cluster):
-        if output is not None:
-            return evaluate_weights(loaded, output, scene=place, cluster=cluster, **asked)
-        return scoring.evaluate(loaded, place, progress=progress, cluster=cluster, **asked)
+    cluster = ray if isinstance(ray, Cluster) else cluster_of(ray)
+    named = str(scene) if isinstance(scene, Path) else scene
+    with python_words():
+        if scans is not None:
+            if settings is not None:
+                raise ValueError("scans are real and take no simulated camera: leave out the settings")
+            if cluster is not None:
+                raise ValueError("scans are few and are scored here: leave out --ray")
+            loaded = model if isinstance(model, Model) else load_for(model, inference)
+            if output is None:
+                posed = load_scene(named) if isinstance(named, str) else named
+                return evaluate_scans(loaded, truths=scans, scene=posed, cells=cells, method=method)
+            return evaluate_on_scans(
+                loaded,
+                output,
+                truths=scans,
+                scene=named,
+                cells=cells,
+                method=method,
+                force=overwrite,
+                options=options,
+            )
+        views: dict[str, Any] = {
+            "examples": examples,
+            "seed": seed,
+            "cells": cells,
+            "settings": settings,
+            "method": method,
+            "cluster": cluster,
+        }
+        with joined_first(cluster):
+            if output is None:
+                loaded = model if isinstance(model, Model) else load_for(model, for_tasks(inference, cluster))
+                return scoring.evaluate(loaded, named, progress=progress, **views)
+            return evaluate_weights(
+                model, output, scene=named, inference=inference, force=overwrite, options=options, **views
+            )
 
 
 def export(
-    model: Model | str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", force: bool = False
+    model: Model | str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", overwrite: bool = False
 ) -> Path:
     """Folder with a network as two graphs, encoder and query, for other runtimes: `mereo export`.
 
@@ -173,12 +206,13 @@ def export(
         model: the weights, or their shipped name or file.
         output: folder to create; for ONNX with mereo_onnx.py, which runs the graphs with numpy and onnxruntime alone.
         format: "onnx", or "torch" for .pt2 files.
-        force: replace an existing folder that mereo wrote, and nothing else is in.
+        overwrite: replace an existing folder that mereo wrote, and nothing else is in.
 
     Raises ``ValueError`` for an autodecoder, ``ImportError`` without the extra `onnx`, ``FileExistsError`` for a folder
-    with content unless ``force``.
+    with content unless ``overwrite``.
     """
-    export_weights(model, output, format, force)
+    with python_words():
+        export_weights(model, output, format, overwrite)
     return Path(output)
 
 
@@ -241,7 +275,8 @@ def learn(
     given = [object] if isinstance(object, str | Path) else object
     files, folder = [Path(file) for file in given], Path(output)
     processes = workers or os.cpu_count() or 1
-    metrics = learning.learn(files, folder, minutes=minutes, init=init, units=units, workers=processes)
+    with python_words():
+        metrics = learning.learn(files, folder, minutes=minutes, init=init, units=units, workers=processes)
     return Learned(
         weights=folder / WEIGHTS,
         scene=scene_for(files, folder, units),

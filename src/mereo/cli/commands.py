@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import arg
 
 from mereo.cli.config_file import ConfigFile, options_of
+from mereo.cli.outcome import Outcome
 from mereo.cli.place_option import PlaceOption
 from mereo.cli.positionals import AssetNames, DatasetFolder, SceneName, WeightsName
 from mereo.fitting.config import AnswerMethod
@@ -29,15 +30,17 @@ class Demo:
 
     Attributes:
         output: folder for meshes, pictures and reports.
+        json: print one JSON object on standard output, of the scores, and all else on standard error.
     """
 
     output: Path = Path("out/demo")
+    json: bool = False
 
-    def run(self) -> None:
-        """Reconstruct and print every input of the demo that can be had."""
+    def run(self) -> Outcome:
+        """Reconstruct and print every input of the demo."""
         from mereo.cli.demo import main
 
-        main(self.output)
+        return Outcome(main(self.output))
 
 
 @dataclass(frozen=True)
@@ -119,26 +122,22 @@ class Generate:
 
     def run(self) -> None:
         """Write the folder of labelled examples."""
+        from mereo.api.steps import generate
         from mereo.io.atomic_files import json_text
         from mereo.io.places import write_whole
-        from mereo.synthesis.shards import generate
-        from mereo.workers.cluster import joined_first
 
-        workers = workers_for(self.workers, self.threads)
-        cluster = cluster_of(self.ray, workers)
-        with joined_first(cluster):
-            generate(
-                self.scene,
-                self.output,
-                self.settings,
-                examples=self.examples,
-                seed=self.seed,
-                workers=workers,
-                shard=part_of(self.shard),
-                resume=self.resume,
-                test=self.test,
-                cluster=cluster,
-            )
+        generate(
+            self.scene,
+            self.output,
+            self.settings,
+            examples=self.examples,
+            seed=self.seed,
+            workers=workers_for(self.workers, self.threads),
+            shard=part_of(self.shard),
+            resume=self.resume,
+            test=self.test,
+            ray=self.ray,
+        )
         write_whole(self.output / CONFIG, json_text(options_of(self, "generate")).encode())
 
 
@@ -167,7 +166,7 @@ class Train:
 
     def run(self) -> None:
         """Train, and print where the weights are."""
-        from mereo.training.trainer import train
+        from mereo.api.steps import train
 
         print(f"weights: {train(self.dataset, self.output, self.config, device=self.device)}")
 
@@ -199,6 +198,7 @@ class Evaluate:
         ray: score each view in a task of a Ray cluster: local, one of so many --threads for this run; auto or
             HOST:PORT, the one that this machine is a node of.
         task: what each task has for itself.
+        json: print the scores as one JSON object on standard output, and all else on standard error.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
@@ -219,52 +219,37 @@ class Evaluate:
     threads: Threads = 0
     ray: RayAddress = None
     task: Annotated[TaskResources, arg(name="")] = ONE_CPU
+    json: bool = False
     options_from: ConfigFile = None
 
-    def run(self) -> None:
+    def run(self) -> Outcome:
         """Write scores and pictures of their errors, and print the table."""
-        from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
-        from mereo.workers.cluster import joined_first
+        from mereo.api.steps import evaluate
+        from mereo.evaluation.tables import read_metrics
 
         settings = GenerateConfig(
             image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms, workspace=self.workspace
         )
-        cluster = cluster_of(self.ray, self.threads, self.task)
-        if self.scans is not None:
-            from mereo.models.weights import load_for
-
-            if settings != GenerateConfig():
-                raise ValueError(
-                    "--scans are real and take no simulated camera: leave out --sensor, --image-size, --noise-std and "
-                    "--workspace"
-                )
-            if cluster is not None:
-                raise ValueError("--scans are few and are scored here: leave out --ray")
-            model = load_for(self.weights, self.inference)
-            evaluate_on_scans(
-                model,
-                self.output,
-                truths=self.scans,
-                scene=self.scene,
-                method=self.method,
-                force=self.force,
-                options=options_of(self, "evaluate"),
+        if self.scans is not None and settings != GenerateConfig():
+            raise ValueError(
+                "--scans are real and take no simulated camera: leave out --sensor, --image-size, --noise-std and "
+                "--workspace"
             )
-            return
-        with joined_first(cluster):
-            evaluate_weights(
-                self.weights,
-                self.output,
-                examples=self.examples,
-                seed=self.seed,
-                scene=self.scene,
-                settings=settings,
-                inference=self.inference,
-                method=self.method,
-                force=self.force,
-                options=options_of(self, "evaluate"),
-                cluster=cluster,
-            )
+        evaluate(
+            self.weights,
+            self.scene,
+            output=self.output,
+            examples=self.examples,
+            seed=self.seed,
+            scans=self.scans,
+            settings=None if self.scans is not None else settings,
+            method=self.method,
+            inference=self.inference,
+            ray=cluster_of(self.ray, self.threads, self.task),
+            overwrite=self.force,
+            options=options_of(self, "evaluate"),
+        )
+        return Outcome(read_metrics(self.output / "metrics.json"))
 
 
 @dataclass(frozen=True)
@@ -285,9 +270,9 @@ class Export:
 
     def run(self) -> None:
         """Write the folder with both graphs of a network."""
-        from mereo.models.export.onnx_export import export_weights
+        from mereo.api.steps import export
 
-        export_weights(self.weights, self.output, self.format, self.force)
+        export(self.weights, self.output, self.format, self.force)
 
 
 def part_of(shard: str) -> tuple[int, int]:

@@ -24,6 +24,7 @@ ConfigFile = Annotated[Path | None, arg(name="config")]
 NOT_RESULT = (
     "output",
     "force",
+    "json",
     "resume",
     "shard",
     "workers",

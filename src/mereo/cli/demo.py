@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -71,16 +72,24 @@ class Column:
     scores: Scores
     seconds: float
 
+    def facts(self) -> dict[str, float | None]:
+        """IoU, mIoU and seconds."""
+        return {"iou": self.scores.iou, "miou": self.scores.miou, "seconds": self.seconds}
 
-def main(output: str | Path = Path("out/demo")) -> None:
-    """Reconstruct every input, print tables, and write a folder each below ``output``."""
+
+def main(output: str | Path = Path("out/demo")) -> dict[str, Any]:
+    """Reconstruct every input, print tables, and write a folder each below ``output``; returns the scores."""
     check_place(Path(output), may_be_link=True)
     console, started = Console(markup=False, emoji=False), time.perf_counter()
+    scores: dict[str, Any] = {}
     for make in _inputs():
         case = make()
-        _show(case, _folder(Path(output) / case.name), console)
+        folder = _folder(Path(output) / case.name)
+        columns = _show(case, folder, console)
+        scores[case.name] = {"output": str(folder), **{name: column.facts() for name, column in columns.items()}}
     console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
     console.print(OWN_OBJECT, markup=True, highlight=False, soft_wrap=True)
+    return scores
 
 
 def _folder(wanted: Path) -> Path:
@@ -123,7 +132,7 @@ def _frame_case(name: str) -> Case:
     return Case(name, title, load_object(name), frame, view.truth.scaled(view.metres))
 
 
-def _show(case: Case, folder: Path, console: Console) -> None:
+def _show(case: Case, folder: Path, console: Console) -> dict[str, Column]:
     """Reconstruct a case, print network and registered model beside the truth, and write the default answer."""
     columns: dict[str, Column] = {}
     result, columns["network"] = _answer(case, "network")
@@ -141,6 +150,7 @@ def _show(case: Case, folder: Path, console: Console) -> None:
     page = f", or in the browser: mereo view {folder}" if result.taken else ""
     line = f"{len(case.frame.cloud)} points; written in {written_s:.1f} s; look at {folder / 'report.html'}{page}\n"
     console.print(line, highlight=False, soft_wrap=True)
+    return columns
 
 
 def _answer(case: Case, method: AnswerMethod) -> tuple[Result, Column]:

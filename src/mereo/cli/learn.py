@@ -50,7 +50,7 @@ class LearnCommand:
 
     def run(self) -> None:
         """Learn, and print the scores and how to use the weights."""
-        from mereo.learning.learn import learn
+        from mereo.api.steps import learn
         from mereo.learning.object_folders import is_folder_of_objects, learn_objects
         from mereo.workers.cluster import joined_first
 

@@ -14,6 +14,7 @@ from mereo.api.objects import Object, load_object
 from mereo.api.reconstruct import reconstruct
 from mereo.api.result import Result
 from mereo.cli.explain import explain, print_sure, wish_of
+from mereo.cli.outcome import NOT_RECOGNIZED, Outcome
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried, Placed, place
@@ -32,7 +33,7 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import files_of
 from mereo.visualization.report_words import confidence_title
-from mereo.visualization.result_files import write_answer
+from mereo.visualization.result_files import summary_of, write_answer
 from mereo.visualization.units import Unit
 
 
@@ -171,6 +172,12 @@ def answer_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: Path)
     if job.options is not None:
         write_json(directory / CONFIG, {**job.options, "inputs": [str(path)]})
     return found
+
+
+def outcome_of(result: Result, output: str | Path) -> Outcome:
+    """Outcome of a frame whose results are in a folder."""
+    facts = {"output": str(output), **summary_of(result)}
+    return Outcome(facts, NOT_RECOGNIZED if result.known is False else 0)
 
 
 def written(output: str | Path, seconds: float) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated
 from tyro.conf import UseAppendAction, arg
 
 from mereo.cli.config_file import ConfigFile, options_of
+from mereo.cli.outcome import Outcome
 from mereo.cli.positionals import Inputs
 from mereo.fitting.config import AnswerMethod
 from mereo.io.bounds import Cells, Threads
@@ -21,13 +22,17 @@ class ReconstructCommand:
     """Reconstruct all segments from a frame, a depth image, point cloud or ROS recording, or from many frames.
 
     Several frames, or folders of them, share one loading of the weights and all options. Each gets a folder of its own
-    in --output, named by its file; one that cannot be answered is said and passed over, and the exit status is then 2.
+    in --output, named by its file; one that cannot be answered is reported and skipped.
+
+    The exit status is 0 where every frame is answered, 3 where an answer is not recognized as the object, 2 where a
+    frame cannot be answered.
 
     Attributes:
         inputs: depth images (PNG, TIFF, EXR, NPY), point clouds (PLY, PCD, XYZ, NPY, NPZ, ZDF), ROS recordings (bag,
             MCAP; one frame of each), or folders of images and clouds; results are in each one's frame and units.
         weights: a shipped name or a file.
-        output: folder to create; of several frames, the folder in which each one's is created.
+        output: folder to create, by default result, result2, ...; of several frames, the folder in which each one's is
+            created.
         resolution: grid cells along the longest side.
         reading: how the frame is read.
         isolation: what of the frame is left out.
@@ -48,12 +53,14 @@ class ReconstructCommand:
         ray: answer each of several frames in a task of a Ray cluster: local, one of so many --threads for this run;
             auto or HOST:PORT, the one that this machine is a node of.
         task: what each task has for itself.
+        json: print the summary as one JSON object on standard output, of several frames a list of them in it, and all
+            else on standard error.
         options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
     """
 
     inputs: Inputs
     weights: str
-    output: Path
+    output: Path | None = None
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
@@ -68,10 +75,12 @@ class ReconstructCommand:
     threads: Threads = 0
     ray: RayAddress = None
     task: Annotated[TaskResources, arg(name="")] = ONE_CPU
+    json: bool = False
     options_from: ConfigFile = None
 
-    def run(self) -> None:
+    def run(self) -> Outcome:
         """Write the folder of results and print the segments."""
+        from mereo.api.result import free_folder
         from mereo.cli.reconstruct import FrameJob
         from mereo.cli.reconstruct_many import reconstruct_inputs
         from mereo.models.elsewhere import for_tasks
@@ -94,4 +103,4 @@ class ReconstructCommand:
             options_of(self, "reconstruct"),
         )
         with joined_first(cluster):
-            reconstruct_inputs(self.inputs, self.output, job, cluster)
+            return reconstruct_inputs(self.inputs, self.output or free_folder(), job, cluster)

@@ -12,9 +12,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from mereo.cli.reconstruct import FrameJob, reconstruct_file
+from mereo.cli import outcome as command
+from mereo.cli.reconstruct import FrameJob, outcome_of, reconstruct_file
 from mereo.cli.reconstruct_tasks import answer_in_tasks
-from mereo.cli.reconstruct_told import Told
+from mereo.cli.reconstruct_told import KNOWN, Told
 from mereo.io.config import InputConfig
 from mereo.io.output_folders import MARKER
 from mereo.io.progress import duration
@@ -41,7 +42,9 @@ class Outcome:
     told: Told | None
 
 
-def reconstruct_inputs(inputs: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None) -> None:
+def reconstruct_inputs(
+    inputs: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None
+) -> command.Outcome:
     """Reconstruct one frame into ``output``, or several, or folders of them, into ``output``/NAME each.
 
     Several are tasks of ``cluster``, where one is given; ``ValueError`` for a single one then.
@@ -53,9 +56,11 @@ def reconstruct_inputs(inputs: Sequence[Path], output: Path, job: FrameJob, clus
     if len(inputs) == 1 and not is_folder_of_frames(inputs[0]):
         if cluster is not None:
             raise ValueError("--ray is for several frames, each of which is a task: name more, or leave it out")
-        reconstruct_file(inputs[0], output, job)
-    else:
-        reconstruct_frames(list_frames(inputs, job.reading), output, job, cluster)
+        return outcome_of(reconstruct_file(inputs[0], output, job), output)
+    found = reconstruct_frames(list_frames(inputs, job.reading), output, job, cluster)
+    frames = [{"output": str(one.folder), **one.told.summary} for one in found if one.told is not None]
+    unknown = any(one.told is not None and one.told.known == KNOWN[False] for one in found)
+    return command.Outcome({"output": str(output), "frames": frames}, command.NOT_RECOGNIZED if unknown else 0)
 
 
 def is_folder_of_frames(path: Path) -> bool:

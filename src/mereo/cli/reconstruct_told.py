@@ -1,11 +1,13 @@
 """What a table of many frames says of each."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from mereo.cli.reconstruct import seconds_of
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.recognition import Known
+from mereo.visualization.result_files import summary_of
 
 KNOWN: Mapping[Known, str] = {True: "yes", False: "no", "unsure": "unsure"}
 """Words of a table for whether a frame shows the object."""
@@ -21,6 +23,7 @@ class Told:
         known: whether it shows the object.
         segments: how many of them were found.
         seconds: that the answer took.
+        summary: content of its summary.json.
     """
 
     answer: str
@@ -28,6 +31,7 @@ class Told:
     known: str
     segments: str
     seconds: float
+    summary: Mapping[str, Any] = field(compare=False, repr=False)
 
     @classmethod
     def of(cls, found: Answer) -> "Told":
@@ -39,4 +43,5 @@ class Told:
             known=KNOWN[found.recognition.known],
             segments=f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}",
             seconds=seconds_of(found),
+            summary=summary_of(found),
         )
