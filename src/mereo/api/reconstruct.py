@@ -105,7 +105,7 @@ def _reconstruct(
     _ = result.reconstruction  # raises where nothing is found
     warning = size_warning(seen.read_as(answer.hypothesis), object.model.provenance)
     if warning is not None:
-        warnings.warn(warning if SPEAKS_OPTIONS.get() else in_python(warning), SizeWarning, stacklevel=4)
+        warnings.warn(warning if SPEAKS_OPTIONS.get() else in_python(warning), SizeWarning, stacklevel=3)
     return result
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.mesh import Segment
 from mereo.geometry.scanner_axes import camera_axes
@@ -183,16 +184,17 @@ class Result(Answer):
         a format that there is none of, and ``ImportError`` where a format's extra is missing.
         """
         path = free_folder() if path is None else Path(path)
-        suffix = file_suffix(path)
-        if suffix == "":
-            wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
-            with new_directory(path, overwrite, self._read()) as directory:
-                write_answer(directory, self, FilesConfig(wanted, millimetres))
-        elif formats is not None:
-            raise ValueError(f"{path} is one file, whose suffix says its format: leave out formats, or name a folder")
-        else:
-            with atomic_file(path, force=overwrite, inputs=self._read()) as partial:
-                write_answer_file(partial, suffix, self, FilesConfig((), millimetres))
+        with python_words():
+            suffix = file_suffix(path)
+            if suffix == "":
+                wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
+                with new_directory(path, overwrite, self._read()) as directory:
+                    write_answer(directory, self, FilesConfig(wanted, millimetres))
+            elif formats is not None:
+                raise ValueError(f"{path} is one file, whose suffix says its format: leave out formats")
+            else:
+                with atomic_file(path, force=overwrite, inputs=self._read()) as partial:
+                    write_answer_file(partial, suffix, self, FilesConfig((), millimetres))
         return path
 
     def show(self, *, port: int | None = None, host: str = "127.0.0.1", block: bool | None = None) -> "OpenPage":

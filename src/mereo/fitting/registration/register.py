@@ -25,6 +25,10 @@ from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 
+ROUNDING = 1e-6
+"""Relative difference up to which a unit that was known is exactly the metre."""
+
+
 class ChangedSceneWarning(UserWarning):
     """Scene with other meshes than when the weights were trained on it: its draws are not fitted."""
 
@@ -123,7 +127,10 @@ class Registrar:
     def unit_of(self, registration: Registration) -> float | None:
         """Metres per unit of a registered frame, by the object's true size; None where that is not known."""
         frame = self.model.source_frame
-        return None if frame is None or frame.unit_m is None else frame.unit_m / registration.scene_unit
+        if frame is None or frame.unit_m is None:
+            return None
+        unit_m = frame.unit_m / registration.scene_unit
+        return 1.0 if registration.unit_known and abs(unit_m - 1.0) < ROUNDING else unit_m
 
     def fit_modes(
         self,
