@@ -8,11 +8,13 @@ Result[name] -> SegmentResult
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from importlib import import_module
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 
 from mereo.api.words import python_words
@@ -68,6 +70,24 @@ class SegmentResult:
     def is_found(self) -> bool:
         """Whether the frame shows it, or the registered model has it."""
         return len(self.mesh.faces) > 0
+
+    def to_trimesh(self) -> "trimesh.Trimesh":
+        """Surface as a mesh of trimesh, in the segment's colour."""
+        mesh = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False)
+        mesh.visual.face_colors = (*self.mesh.color, 255)
+        return mesh
+
+    def to_open3d(self) -> Any:
+        """Surface as a ``TriangleMesh`` of Open3D, in the segment's colour; ``ImportError`` without Open3D."""
+        try:
+            open3d = import_module("open3d")
+        except ImportError:
+            raise ImportError("Open3D is not installed: pip install open3d, or take to_trimesh()") from None
+        vertices = open3d.utility.Vector3dVector(self.mesh.vertices)
+        mesh = open3d.geometry.TriangleMesh(vertices, open3d.utility.Vector3iVector(self.mesh.faces))
+        mesh.paint_uniform_color([channel / 255 for channel in self.mesh.color])
+        mesh.compute_vertex_normals()
+        return mesh
 
     def __repr__(self) -> str:
         found = f"volume {self.volume:.3g}, confidence {self.confidence:.2f}" if self.is_found else "not found"
@@ -132,6 +152,21 @@ class Result(Answer):
             return None
         source = self.registered.model.source_frame
         return self.registered.scene_unit * (1.0 if source is None else source.scale)
+
+    def to_trimesh(self) -> "trimesh.Scene":
+        """Scene of trimesh with a mesh for each segment that was found, by its name and in its colour."""
+        scene = trimesh.Scene()
+        for segment in self:
+            if segment.is_found:
+                scene.add_geometry(segment.to_trimesh(), node_name=segment.name, geom_name=segment.name)
+        return scene
+
+    def to_open3d(self) -> dict[str, Any]:
+        """Mesh of Open3D for each segment that was found, by its name and in its colour.
+
+        Raises ``ImportError`` without Open3D.
+        """
+        return {segment.name: segment.to_open3d() for segment in self if segment.is_found}
 
     @cached_property
     def _segments(self) -> dict[str, SegmentResult]:

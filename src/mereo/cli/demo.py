@@ -26,6 +26,7 @@ from mereo.evaluation.sample_views import SHIPPED_SCAN, T_MODEL_SCAN, load_view
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import statistical_model_of
 from mereo.io.output_folders import check_new_directory
+from mereo.io.progress import shown_stages
 from mereo.io.scratch_folders import check_place
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.pipeline import segment_names
@@ -85,7 +86,8 @@ def main(output: str | Path = Path("out/demo")) -> dict[str, Any]:
     for make in _inputs():
         case = make()
         folder = _folder(Path(output) / case.name)
-        columns = _show(case, folder, console)
+        with shown_stages():
+            columns = _show(case, folder, console)
         scores[case.name] = {"output": str(folder), **{name: column.facts() for name, column in columns.items()}}
     console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
     console.print(OWN_OBJECT, markup=True, highlight=False, soft_wrap=True)

@@ -24,6 +24,7 @@ from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
 from mereo.io.output_folders import new_directory
+from mereo.io.progress import shown_stages, stage
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.medical import MM_PER_M
@@ -136,7 +137,7 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Re
     ``explain`` without a registration.
     """
     job.check()
-    with new_directory(output, job.force, [input, *job.read]) as directory:
+    with shown_stages(), new_directory(output, job.force, [input, *job.read]) as directory:
         found = answer_frame(read_frame(input, job.reading), directory, job, Path(input).absolute())
     print_segments(found)
     print(written(output, seconds_of(found)))
@@ -166,7 +167,8 @@ def answer_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: Path)
     if job.registrar is not None:
         print_source(found)
         print_sure(found.registered, unit)
-    write_answer(directory, found, job.files, carried_along(placed, found))
+    with stage("write the files"):
+        write_answer(directory, found, job.files, carried_along(placed, found))
     factor = MM_PER_M * found.seen.frame.metres if job.files.millimetres else 1.0
     explain(found.registered, wishes, directory, found.seen.cloud.points, factor, unit)
     if job.options is not None:

@@ -6,10 +6,12 @@ is a bar on a terminal, and elsewhere the same as a plain line now and then. Wha
 """
 
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn
@@ -137,6 +139,49 @@ def tracked(stage: str, count: int, unit: str, *, quiet: bool = False) -> Iterat
         for index in range(count):
             yield index
             shown.advance()
+
+
+SHOWS_STAGES: ContextVar[bool] = ContextVar("SHOWS_STAGES", default=False)
+"""Whether ``stage`` shows anything; commands that answer single frames set it."""
+
+STAGE_S = 2.0
+"""Seconds from which on a stage is shown."""
+
+
+@contextmanager
+def shown_stages() -> Iterator[None]:
+    """Context in which every ``stage`` that takes long is shown."""
+    token = SHOWS_STAGES.set(True)
+    try:
+        yield
+    finally:
+        SHOWS_STAGES.reset(token)
+
+
+@contextmanager
+def stage(text: str) -> Iterator[None]:
+    """Context of a stage without a count, which is shown on standard error once it takes ``STAGE_S``.
+
+    ``text`` says what is done: "register the model". A line now and then says for how long.
+    """
+    if not SHOWS_STAGES.get():
+        yield
+        return
+    started, ended = time.monotonic(), threading.Event()
+
+    def show() -> None:
+        wait_s = STAGE_S
+        while not ended.wait(wait_s):
+            print(f"{text}: {duration(time.monotonic() - started)} so far", file=sys.stderr, flush=True)
+            wait_s = LINE_EVERY_S
+
+    thread = threading.Thread(target=show, daemon=True, name="stage")
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 class _Quiet(Progress):

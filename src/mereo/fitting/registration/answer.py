@@ -16,6 +16,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.registration.surfaces import registered_reconstruction
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.io.progress import stage
 from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, encode_frame, extract
@@ -128,12 +129,13 @@ class Answer:
 
         Raises ``ValueError`` where the network answers and finds no segment.
         """
-        if self.taken and self.registration is not None:
-            return registered_reconstruction(
-                self.encoded, self.registration, self.model, self.resolution, self.label_points
-            )
-        assert self.likelier is not None
-        return extract(self.likelier, self.model, self.resolution, self.label_points)
+        with stage("extract surfaces and labels"):
+            if self.taken and self.registration is not None:
+                return registered_reconstruction(
+                    self.encoded, self.registration, self.model, self.resolution, self.label_points
+                )
+            assert self.likelier is not None
+            return extract(self.likelier, self.model, self.resolution, self.label_points)
 
     @cached_property
     def surfaces(self) -> SegmentedMesh:

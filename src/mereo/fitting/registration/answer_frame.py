@@ -16,6 +16,7 @@ from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.transforms import transform_points
+from mereo.io.progress import stage
 from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame, encode_frame
@@ -60,10 +61,12 @@ def answer_frame(
     Raises ``ValueError`` for unusable clouds.
     """
     started = time.perf_counter()
-    candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
+    with stage("register the model"):
+        candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
     registration = None
     if registrar is not None and candidate.modes is not None:
-        registration = registrar.finish(candidate.modes)
+        with stage("fit the parameters of the scene"):
+            registration = registrar.finish(candidate.modes)
     answer = answer_of(seen, model, registrar, candidate, likelier, registration)
     seconds = time.perf_counter() - started
     return replace(answer, resolution=resolution, label_points=label_points, seconds=seconds)

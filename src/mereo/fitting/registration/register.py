@@ -17,13 +17,13 @@ from mereo.fitting.registration.fit import ModesFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.brief import listed
 from mereo.geometry.camera import PointCloud
+from mereo.io.progress import stage
 from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.random_states import built_in_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.statistical_model import StatisticalModel
-
 
 ROUNDING = 1e-6
 """Relative difference up to which a unit that was known is exactly the metre."""
@@ -99,7 +99,8 @@ class Registrar:
     @cached_property
     def states(self) -> DrawnStates | None:
         """Random states of the scene, among which a fit of its draws starts; they take seconds once."""
-        return None if self.scene is None else DrawnStates.of(self.scene, self.model)
+        with stage("simulate random states of the scene, once for an object"):
+            return None if self.scene is None else DrawnStates.of(self.scene, self.model)
 
     @property
     def at_once(self) -> "Registrar":

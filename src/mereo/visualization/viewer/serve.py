@@ -13,6 +13,7 @@ from mereo.fitting.registration.register import registrar_for, statistical_model
 from mereo.fitting.registration.state import played_state, restored
 from mereo.fitting.registration.state_file import RegistrationState, is_state, read_state
 from mereo.io.config import InputConfig
+from mereo.io.progress import shown_stages
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
@@ -124,8 +125,9 @@ def view_frame(
     isolation = isolation or IsolationConfig()
     seen = find_object(frame, isolation)
     registrar = registrar_for(model, "auto")
-    answer = answer_frame(seen, model, registrar, keep_all=isolation.keep_all, resolution=resolution)
-    return open_answer(answer, port=port, host=host)
+    with shown_stages():
+        answer = answer_frame(seen, model, registrar, keep_all=isolation.keep_all, resolution=resolution)
+        return open_answer(answer, port=port, host=host)
 
 
 def view_state(
