@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from mereo.api.words import python_words
@@ -32,6 +31,8 @@ from mereo.visualization.result_html import result_html
 from mereo.visualization.units import Unit
 
 if TYPE_CHECKING:
+    import trimesh
+
     from mereo.visualization.viewer.open_page import OpenPage
 
 SINGLE = (".glb", ".ply", ".npz", ".vti", ".nii.gz", ".seg.nrrd", ".json", ".html", ".png")
@@ -73,9 +74,11 @@ class SegmentResult:
 
     def to_trimesh(self) -> "trimesh.Trimesh":
         """Surface as a mesh of trimesh, in the segment's colour."""
-        mesh = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False)
-        mesh.visual.face_colors = (*self.mesh.color, 255)
-        return mesh
+        import trimesh
+
+        vertices, faces = self.mesh.vertices, self.mesh.faces
+        colors = np.tile(np.array([*self.mesh.color, 255], dtype=np.uint8), (len(faces), 1))
+        return trimesh.Trimesh(vertices, faces, face_colors=colors, process=False)
 
     def to_open3d(self) -> Any:
         """Surface as a ``TriangleMesh`` of Open3D, in the segment's colour; ``ImportError`` without Open3D."""
@@ -155,6 +158,8 @@ class Result(Answer):
 
     def to_trimesh(self) -> "trimesh.Scene":
         """Scene of trimesh with a mesh for each segment that was found, by its name and in its colour."""
+        import trimesh
+
         scene = trimesh.Scene()
         for segment in self:
             if segment.is_found:
