@@ -1,9 +1,9 @@
-"""The process that answers: frames are read, encoded together where that is faster, and fitted one by one.
+"""The process that answers: frames are read, answered and written one by one.
 
-    Begin -read, isolate-> Observation of each -encode together-> EncodedFrame of each
-    Finish -answer, write-> Reply: summary.json or segments.glb, as ``mereo reconstruct`` writes them
+    FrameRequest -read, isolate-> Observation -reconstruct-> Result -write-> Reply
 
-Whatever goes wrong with a frame is its own ``Reply``; nothing is raised for it.
+A reply is summary.json or segments.glb, as ``mereo reconstruct`` writes them. Whatever goes wrong with a frame is its
+own ``Reply``; nothing is raised for it.
 """
 
 import json
@@ -28,15 +28,12 @@ from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import Precision
 from mereo.models.model import Model
 from mereo.models.weights import load_for
-from mereo.reconstruction.observation import Observation, find_object
-from mereo.serving.messages import JSON, Begin, Finish, FrameRequest, Ready, Reply, Served, Setup
+from mereo.reconstruction.observation import find_object
+from mereo.serving.messages import JSON, FrameRequest, Ready, Reply, Served, Setup
 from mereo.serving.refusals import FAULT, failed
 from mereo.visualization.result_files import radii_of, summary_of
 
 LOG = logging.getLogger("mereo.serving")
-
-GPU_BATCH = 8
-"""Frames that are encoded together on a GPU."""
 
 
 class TooManyPoints(ValueError):
@@ -100,25 +97,8 @@ class Loaded:
 
 
 @dataclass(eq=False)
-class Begun:
-    """Frame that is read and waits for its answer.
-
-    Attributes:
-        request: what is wanted.
-        observation: the object in the frame.
-        told: warnings so far, for the client.
-        read_s: seconds of reading.
-    """
-
-    request: FrameRequest
-    observation: Observation
-    told: list[str]
-    read_s: float
-
-
-@dataclass(eq=False)
 class Answerer:
-    """Answers frames, a batch after the other.
+    """Answers frames, one after the other.
 
     Attributes:
         setup: what is served.
@@ -127,7 +107,6 @@ class Answerer:
 
     setup: Setup
     loaded: dict[str, Loaded] = field(default_factory=dict)
-    _begun: list[Begun | None] = field(default_factory=list)
 
     @classmethod
     def of(cls, setup: Setup) -> "Answerer":
@@ -135,40 +114,21 @@ class Answerer:
         return cls(setup, {one.name: Loaded.of(one, setup) for one in setup.served})
 
     def ready(self) -> Ready:
-        """What is told first."""
+        """What is reported first."""
         facts = tuple(one.facts() for one in self.loaded.values())
-        on_gpu = any(one.model.device.type == "cuda" for one in self.loaded.values())
         precision = next(iter(self.loaded.values())).model.working_precision
-        return Ready(facts, self.setup.batch or (GPU_BATCH if on_gpu else 1), cast(Precision, precision))
+        return Ready(facts, cast(Precision, precision))
 
-    def __call__(self, message: Begin | Finish) -> Any:
-        """Answer to a message: a refusal or None for each frame of a ``Begin``, a ``Reply`` to a ``Finish``."""
-        return self.begin(message.frames) if isinstance(message, Begin) else self.finish(message.number)
-
-    def begin(self, frames: tuple[FrameRequest, ...]) -> list[Reply | None]:
-        """Read frames, all of the same weights; a refusal for each that cannot be."""
-        self._begun, replies = [], list[Reply | None]()
-        for frame in frames:
-            try:
-                self._begun.append(self._read(frame))
-                replies.append(None)
-            except Exception as error:
-                self._begun.append(None)
-                replies.append(refusal(error, frame))
-        return replies
-
-    def finish(self, number: int) -> Reply:
-        """The answer to a frame that was begun."""
-        begun, self._begun[number] = self._begun[number], None
-        assert begun is not None, "only asked for a frame that was read"
+    def __call__(self, frame: FrameRequest) -> Reply:
+        """Answer to a frame, or why there is none."""
         try:
-            return self._answer(begun)
+            return self._answer(frame)
         except Exception as error:
-            return refusal(error, begun.request)
+            return refusal(error, frame)
 
-    def _read(self, frame: FrameRequest) -> Begun:
-        started, told = time.perf_counter(), list[str]()
-        with taken_warnings(told, frame):
+    def _answer(self, frame: FrameRequest) -> Reply:
+        started, messages, loaded = time.perf_counter(), list[str](), self.loaded[frame.weights]
+        with taken_warnings(messages, frame):
             read = read_frame(frame.path, frame.reading)
             if len(read.cloud) > self.setup.max_points:
                 raise TooManyPoints(
@@ -176,26 +136,18 @@ class Answerer:
                     "thin it out, or crop it around the object"
                 )
             seen = find_object(read, frame.isolation)
-        return Begun(frame, seen, told, time.perf_counter() - started)
-
-    def _answer(self, begun: Begun) -> Reply:
-        request, loaded = begun.request, self.loaded[begun.request.weights]
-        with taken_warnings(begun.told, request):
-            found = reconstruct(
-                begun.observation,
-                loaded.object,
-                loaded.method,
-                resolution=request.resolution,
-                isolation=request.isolation,
+            read_s = time.perf_counter() - started
+            result = reconstruct(
+                seen, loaded.object, loaded.method, resolution=frame.resolution, isolation=frame.isolation
             )
         started = time.perf_counter()
-        body = json_of(found, begun.told) if request.media == JSON else glb_of(found, request)
-        seconds = {"read": begun.read_s, **found.reconstruction.timings_s, "write": time.perf_counter() - started}
+        body = json_of(result, messages) if frame.media == JSON else glb_of(result, frame)
+        seconds = {"read": read_s, **result.reconstruction.timings_s, "write": time.perf_counter() - started}
         headers = {
-            "Mereo-Known": str(found.recognition.known).lower(),
-            "Mereo-Answer": "registration" if found.taken else "network",
+            "Mereo-Known": str(result.known).lower(),
+            "Mereo-Answer": "registration" if result.taken else "network",
         }
-        return Reply(200, body, request.media, headers, seconds)
+        return Reply(200, body, frame.media, headers, seconds)
 
 
 def json_of(found: Result, told: list[str]) -> bytes:

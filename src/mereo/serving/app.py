@@ -197,7 +197,7 @@ def make_app(service: Service) -> Any:
 
     @app.get("/metrics", response_class=Response, responses={200: {"description": "Always", "content": {TEXT: {}}}})
     async def metrics() -> Response:
-        """Numbers for Prometheus: requests by code, what waits, batches, seconds of each stage."""
+        """Numbers for Prometheus: requests by code, what waits, seconds of each stage."""
         return Response(service.metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
     @cache

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mereo.io.bounds import Cells, Count, CountOrNone, NotNegative, Positive, check_bounds
+from mereo.io.bounds import Cells, Count, Positive, check_bounds
 
 
 @dataclass(frozen=True)
@@ -11,10 +11,6 @@ class ServeConfig:
 
     Attributes:
         queue: frames that may wait, those whose bodies are still coming included; one more is refused (429).
-        batch: frames of the same weights that one process takes together, at most, and encodes in one call; 0 means 8
-            on a GPU, and on a CPU, which gains next to nothing by it, 1: answers are then those of single frames bit by
-            bit.
-        batch_wait_ms: how long it waits for the others, in milliseconds.
         max_body_mb: largest body of a request, in megabytes of 10^6 bytes (413).
         max_points: most points of a frame, or measured pixels of a depth image (413).
         max_resolution: most cells along the longest side that a request may ask for (422).
@@ -22,8 +18,6 @@ class ServeConfig:
     """
 
     queue: Count = 64
-    batch: CountOrNone = 0
-    batch_wait_ms: NotNegative = 5.0
     max_body_mb: Positive = 64.0
     max_points: Count = 1_000_000
     max_resolution: Cells = 256

@@ -1,6 +1,6 @@
-"""Frames that wait, and the processes that answer them: a bounded queue, batches across clients, every answer once.
+"""Frames that wait, and the processes that answer them: a bounded queue, every answer once.
 
-    admit -Place-> (the body comes) -submit-> Waiting -take, with others of the same weights-> Begin, Finish -> Reply
+    admit -Place-> (the body comes) -submit-> Waiting -take-> FrameRequest -> Reply
 
 All is done in the thread of the event loop, so nothing here is locked; only processes are asked in threads, one each.
 """
@@ -14,10 +14,9 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 from mereo.serving.config import ServeConfig
-from mereo.serving.messages import Begin, Finish, FrameRequest, Reply
+from mereo.serving.messages import FrameRequest, Reply
 from mereo.serving.metrics import Metrics
 from mereo.serving.refusals import CRASHED, FULL, GOING, Refused, failed
 from mereo.serving.workers import Worker, WorkerDied
@@ -56,14 +55,12 @@ class Waiting:
         place: in the queue.
         answer: to come; done where nobody wants it any more.
         since: when it came, by the monotonic clock.
-        alone: taken with no other, since a batch with it has ended its process.
     """
 
     frame: FrameRequest
     place: Place
     answer: "asyncio.Future[Reply]"
     since: float
-    alone: bool = False
 
     @property
     def wanted(self) -> bool:
@@ -91,7 +88,7 @@ class Dispatcher:
 
     def __init__(self, workers: Sequence[Worker], config: ServeConfig, metrics: Metrics) -> None:
         self.config, self.metrics, self.held, self.stopping = config, metrics, 0, False
-        self._workers, self._alive, self._idle = list(workers), len(workers), 0
+        self._workers, self._alive = list(workers), len(workers)
         self._waiting, self._arrived = deque[Waiting](), asyncio.Event()
         self._threads = ThreadPoolExecutor(len(workers), "mereo-worker")
         self._tasks: list[asyncio.Task[None]] = []
@@ -155,90 +152,43 @@ class Dispatcher:
 
     # --- taking -------------------------------------------------------------------------------------------------------
 
-    async def _take(self, worker: Worker) -> list[Waiting]:
-        """The frame that has waited longest and others of the same weights; none at the end."""
-        while not self._waiting:
-            if self.stopping:
-                return []
-            self._arrived.clear()
-            self._idle += 1
-            await self._arrived.wait()
-            self._idle -= 1
-        first = self._waiting.popleft()
-        most = worker.ready.batch
-        if first.alone or most == 1:
-            return self._begun([first])
-        if self.config.batch_wait_ms > 0:
-            await asyncio.sleep(self.config.batch_wait_ms / 1e3)
-        alike = [one for one in self._waiting if one.frame.weights == first.frame.weights and not one.alone]
-        # what one process takes, another that idles cannot
-        share = math.ceil((len(alike) + 1) / (self._idle + 1))
-        others = alike[: min(share, most) - 1]
-        for one in others:
-            self._waiting.remove(one)
-        return self._begun([first, *others])
-
-    def _begun(self, batch: list[Waiting]) -> list[Waiting]:
-        """Those of a batch that are wanted still, now that their work begins."""
-        wanted = [one for one in batch if one.wanted]
-        now = time.monotonic()
-        for one in batch:
-            one.place.leave()
-            if one.wanted:
-                self.metrics.stages({"wait": now - one.since})
-            else:
-                one.release()
-        return wanted
+    async def _take(self) -> Waiting | None:
+        """The frame that has waited longest, where it is wanted still; None at the end."""
+        while True:
+            while not self._waiting:
+                if self.stopping:
+                    return None
+                self._arrived.clear()
+                await self._arrived.wait()
+            first = self._waiting.popleft()
+            first.place.leave()
+            if first.wanted:
+                self.metrics.stages({"wait": time.monotonic() - first.since})
+                return first
+            first.release()
 
     # --- answering ----------------------------------------------------------------------------------------------------
 
     async def _run(self, worker: Worker) -> None:
-        """Answer batches with one process until the end."""
-        while not self.stopping or self._waiting:
-            batch = await self._take(worker)
-            if batch:
-                self.metrics.taken(len(batch))
-                left = deque(batch)
-                try:
-                    await self._answer(worker, left)
-                except WorkerDied as error:
-                    LOG.error("%s; it is started again", error)
-                    await self._revive(worker)
-
-    async def _answer(self, worker: Worker, left: deque[Waiting]) -> None:
-        """Answer frames one after the other; those that are done leave ``left``."""
-        began = False
-        try:
+        """Answer frames with one process until the end."""
+        while (waiting := await self._take()) is not None:
             started = time.monotonic()
-            refusals: list[Reply | None] = await self._ask(worker, Begin(tuple(one.frame for one in left)))
-            began = True
-            for number, refusal in enumerate(refusals):
-                if left[0].wanted:
-                    reply = refusal or await self._ask(worker, Finish(number))
-                    self.metrics.stages(reply.seconds)
-                    left[0].reply(reply)
-                    self._frame_s += 0.1 * (time.monotonic() - started - self._frame_s)
-                started = time.monotonic()
-                left.popleft().release()
-        except WorkerDied:
-            self._blame(left, began)
-            raise
+            try:
+                reply = await self._ask(worker, waiting.frame)
+                self.metrics.stages(reply.seconds)
+                self._frame_s += 0.1 * (time.monotonic() - started - self._frame_s)
+            except WorkerDied as error:
+                waiting.reply(failed(500, CRASHED))
+                waiting.release()
+                LOG.error("%s; it is started again", error)
+                await self._revive(worker)
+            else:
+                waiting.reply(reply)
+                waiting.release()
 
-    def _blame(self, left: deque[Waiting], began: bool) -> None:
-        """Refuse the frame that has ended its process; the others wait again, alone where it is not known which."""
-        if began or len(left) == 1:
-            guilty = left.popleft()
-            guilty.reply(failed(500, CRASHED))
-            guilty.release()
-        for one in reversed(left):
-            one.alone = one.alone or not began
-            self._waiting.appendleft(one)
-        if self.stopping:
-            self.stop()
-
-    async def _ask(self, worker: Worker, message: Begin | Finish) -> Any:
+    async def _ask(self, worker: Worker, frame: FrameRequest) -> Reply:
         """Answer of a process; one that takes far too long is ended."""
-        future = asyncio.get_running_loop().run_in_executor(self._threads, worker.ask, message)
+        future = asyncio.get_running_loop().run_in_executor(self._threads, worker.ask, frame)
         done, _ = await asyncio.wait([future], timeout=HANGS * self.config.timeout)
         if not done:
             worker.kill()

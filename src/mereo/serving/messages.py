@@ -47,7 +47,6 @@ class Setup:
         inference: where and how exactly the networks compute.
         max_points: most points of a frame.
         max_body: most bytes of a request.
-        batch: frames that are encoded together, at most; 0 leaves it to the device.
     """
 
     served: tuple[Served, ...]
@@ -55,7 +54,6 @@ class Setup:
     inference: InferenceConfig = field(default_factory=InferenceConfig)
     max_points: int = 1_000_000
     max_body: int = 64_000_000
-    batch: int = 0
 
 
 @dataclass(frozen=True)
@@ -106,29 +104,13 @@ class Reply:
 
 
 @dataclass(frozen=True)
-class Begin:
-    """Read these frames, and encode them together where that is faster; answered by a refusal or None for each."""
-
-    frames: tuple[FrameRequest, ...]
-
-
-@dataclass(frozen=True)
-class Finish:
-    """Answer the frame of this number of the last ``Begin``; answered by a ``Reply``."""
-
-    number: int
-
-
-@dataclass(frozen=True)
 class Ready:
     """What a process says first: that it is ready.
 
     Attributes:
         facts: what is known of each of its weights.
-        batch: frames that it takes together, at most.
         precision: of the products, as settled: "auto" measures, and two processes might measure otherwise.
     """
 
     facts: tuple[dict[str, Any], ...]
-    batch: int
     precision: Precision = "float32"

@@ -8,9 +8,6 @@ from prometheus_client.exposition import generate_latest
 SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
 """Bounds of the histograms of seconds: from reading a small cloud to a fit of draws on a busy machine."""
 
-SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 32)
-"""Bounds of the histogram of batches."""
-
 OTHER = "other"
 """Place of requests to nowhere: names that clients make up must not become series without end."""
 
@@ -33,7 +30,6 @@ class Metrics:
         self._stages = Histogram(
             "mereo_stage_seconds", "Seconds of each stage of a frame.", ["stage"], buckets=SECONDS, registry=own
         )
-        self._batch = Histogram("mereo_batch_frames", "Frames that were taken together.", buckets=SIZES, registry=own)
         self._dropped = Counter("mereo_dropped_frames", "Frames nobody waited for any more.", ["reason"], registry=own)
         self._restarts = Counter("mereo_restarts", "Processes that had to be started again.", registry=own)
         self._waiting = Gauge("mereo_waiting_frames", "Frames that wait, their bodies included.", registry=own)
@@ -53,10 +49,6 @@ class Metrics:
         """Add the stages of an answered frame."""
         for stage, spent in seconds.items():
             self._stages.labels(stage).observe(spent)
-
-    def taken(self, frames: int) -> None:
-        """Count a batch."""
-        self._batch.observe(frames)
 
     def dropped(self, reason: str) -> None:
         """Count a frame that was dropped: "gone" clients, "timeout"."""

@@ -58,7 +58,7 @@ def serve(
     """
     config = config or ServeConfig()
     served = served_weights(weights, scenes)
-    setup = Setup(served, method, inference or InferenceConfig(), config.max_points, config.max_body, config.batch)
+    setup = Setup(served, method, inference or InferenceConfig(), config.max_points, config.max_body)
     entry, metrics = Entry.of(host), Metrics()
     with ExitStack() as stack:
         socket = stack.enter_context(bound_socket(host, port))

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol, runtime_checkable
 
 from mereo.io.size_limits import LIMIT_VARIABLE
-from mereo.serving.messages import Begin, Finish, Ready, Setup
+from mereo.serving.messages import FrameRequest, Ready, Reply, Setup
 from mereo.workers.processes import exit_with_parent, one_thread_each, start_resource_tracker
 
 POINT_BYTES = 256
@@ -28,7 +28,7 @@ class WorkerDied(RuntimeError):
 
 @runtime_checkable
 class Worker(Protocol):
-    """What answers messages, one at a time.
+    """What answers frames, one at a time.
 
     Attributes:
         ready: what it said first.
@@ -36,8 +36,8 @@ class Worker(Protocol):
 
     ready: Ready
 
-    def ask(self, message: Begin | Finish) -> Any:
-        """Answer to a message; raises ``WorkerDied``. Blocks."""
+    def ask(self, frame: FrameRequest) -> Reply:
+        """Answer to a frame; raises ``WorkerDied``. Blocks."""
 
     def restart(self) -> None:
         """Begin anew after ``WorkerDied``; raises ``WorkerDied`` or what loading raises. Blocks."""
@@ -75,13 +75,14 @@ class WorkerProcess:
         self.ready = said
         self.setup = replace(self.setup, inference=replace(self.setup.inference, precision=said.precision))
 
-    def ask(self, message: Begin | Finish) -> Any:
-        """Answer to a message, see ``Worker``."""
+    def ask(self, frame: FrameRequest) -> Reply:
+        """Answer to a frame, see ``Worker``."""
         try:
-            self._pipe.send(message)
+            self._pipe.send(frame)
         except OSError as error:
             raise WorkerDied("a process that answers has ended") from error
-        return self._receive()
+        reply: Reply = self._receive()
+        return reply
 
     def restart(self) -> None:
         """Start another process in its place, see ``Worker``."""
@@ -120,7 +121,7 @@ class WorkerProcess:
 
 
 def answer_frames(pipe: Connection, setup: Setup) -> None:
-    """Work of a process: load the weights, say so, and answer messages until nobody sends any more."""
+    """Work of a process: load the weights, say so, and answer frames until nobody sends any more."""
     # Ctrl-C, TERM to a whole group and a closed terminal are the server's business: what is begun is answered
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
@@ -137,7 +138,7 @@ def answer_frames(pipe: Connection, setup: Setup) -> None:
     pipe.send(answerer.ready())
     while True:
         try:
-            message = pipe.recv()
+            frame = pipe.recv()
         except EOFError:
             return
-        pipe.send(answerer(message))
+        pipe.send(answerer(frame))
