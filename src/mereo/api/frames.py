@@ -87,12 +87,12 @@ def load_frame(
         raise ValueError("depth_scale is given without intrinsics; a depth image needs both: give intrinsics=...")
     if unit_m is not None and not 0 < unit_m < np.inf:
         raise ValueError(f"the unit is {unit_m} m; it must be positive: give 0.001 for millimetres")
-    observed, _ = points_of(source, drop_invalid)
+    observed, invalid = points_of(source, drop_invalid)
     if isinstance(observed, DepthImage):
         if axes == "scanner":
             raise ValueError("a depth image is in the camera's axes: leave out axes")
         return SensorFrame(CLOUD, observed.to_points(), unit_m, "camera", observed)
-    return SensorFrame(CLOUD, observed, unit_m, axes or "camera")
+    return SensorFrame(CLOUD, observed, unit_m, axes or "camera", invalid=invalid)
 
 
 def _depth_frame(

@@ -40,6 +40,11 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
             ``drop_invalid`` is false.
         ImportError: a ZDF file, without the extra `sensors`.
     """
+    return PointCloud(valid_points(read_points(path), path, drop_invalid))
+
+
+def read_points(path: str | Path) -> Float[np.ndarray, "n 3"]:
+    """Points of a file as ``read_point_cloud`` reads them, those without a measurement included."""
     path = Path(path)
     reader = CLOUD_READERS.get(path.suffix.lower())
     if reader is None and path.exists():
@@ -49,8 +54,7 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
         )
     with readable(path, "point cloud"):
         assert reader is not None
-        points = np.asarray(reader(path), dtype=np.float64).reshape(-1, 3)
-    return PointCloud(valid_points(points, path, drop_invalid))
+        return np.asarray(reader(path), dtype=np.float64).reshape(-1, 3)
 
 
 def valid_points(

@@ -20,7 +20,7 @@ from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
 from mereo.io.depth_formats import is_depth_image, read_raw_depth
 from mereo.io.intrinsics import read_intrinsics
-from mereo.io.readers import depth_of, read_point_cloud, usable_depth, valid_points
+from mereo.io.readers import depth_of, read_points, usable_depth, valid_points
 from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frame, recorded_frames
 
 FORMAT_UNITS_M = {".zdf": 0.001}
@@ -41,6 +41,7 @@ class SensorFrame:
         axes: the cloud's.
         depth: the depth image in metres that the points come from, without what a mask leaves out; None for clouds.
         message: the recording's message, by topic and time; empty for other files.
+        invalid: number of points without a measurement that were left out.
     """
 
     path: Path
@@ -49,6 +50,7 @@ class SensorFrame:
     axes: CloudAxes
     depth: DepthImage | None = None
     message: str = ""
+    invalid: int = 0
 
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in np.ptp(self.cloud.points, axis=0) * self.metres)
@@ -88,7 +90,9 @@ def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> Sensor
     if kind == "depth image":
         return _depth_image(path, reading)
     unit_m = FORMAT_UNITS_M.get(path.suffix.lower()) if reading.unit_m is None else reading.unit_m
-    return SensorFrame(path, read_point_cloud(path, reading.drop_invalid), unit_m, reading.frame)
+    points = read_points(path)
+    cloud = PointCloud(valid_points(points, path, reading.drop_invalid))
+    return SensorFrame(path, cloud, unit_m, reading.frame, invalid=len(points) - len(cloud))
 
 
 def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFrame, Callable[[], SensorFrame]]]:
@@ -145,4 +149,5 @@ def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> Senso
     if reading.mask is not None:
         raise ValueError(f"{message.topic} in {path} has point clouds; leave out the mask, or name an image's --topic")
     cloud = PointCloud(valid_points(content, path, reading.drop_invalid))
-    return SensorFrame(path, cloud, 1.0, reading.frame, message=message.name)
+    lost = len(content) - len(cloud)
+    return SensorFrame(path, cloud, 1.0, reading.frame, message=message.name, invalid=lost)

@@ -84,12 +84,15 @@ class Observation:
             "unit_m": self.frame.unit_m,
             "depth_m": self.depth_m if known and self.frame.axes == "camera" else None,
             "visible_size_m": self.size_m if known else None,
+            "invalid_points": self.frame.invalid,
             "isolation": [asdict(step) for step in self.steps],
         }
 
     def __str__(self) -> str:
         """One line for the frame, one for each step, one for what is left."""
         lines = [self._line("the frame has", self.frame.cloud)] if self.steps else []
+        if self.frame.invalid:
+            lines.append(f"{counted(self.frame.invalid, 'point')} without a measurement left out")
         lines += [f"  {step}" for step in self.steps]
         lines.append(self._line("the object has", self.cloud))
         size = " x ".join(f"{side:.3g}" for side in self.size_m)

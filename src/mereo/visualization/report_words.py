@@ -42,7 +42,16 @@ SAID_ELSEWHERE = frozenset(
 """Keys of a summary that the page shows in another place, or that its units say."""
 
 FOR_PROGRAMS = frozenset(
-    {"precision", "evaluated_points", "depth_m", "visible_size_m", "isolation", "carried", "scene_file"}
+    {
+        "precision",
+        "evaluated_points",
+        "depth_m",
+        "visible_size_m",
+        "invalid_points",
+        "isolation",
+        "carried",
+        "scene_file",
+    }
 )
 """Keys that only summary.json has."""
 
