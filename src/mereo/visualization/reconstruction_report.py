@@ -17,6 +17,7 @@ from jaxtyping import Float, Int, UInt16
 
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.creases import split_at_creases
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
@@ -135,10 +136,10 @@ def _base64(array: np.ndarray) -> str:
 
 
 def _fit(surfaces: SegmentedMesh, extent: float, room_bytes: int) -> list[Segment]:
-    """The segments, coarsened together until they take at most ``room_bytes``."""
-    shown, cells = list(surfaces.segments), 400.0
+    """The segments, split at their creases, and coarsened together until they take at most ``room_bytes``."""
+    shown, cells = [split_at_creases(segment)[0] for segment in surfaces.segments], 400.0
     while (size := sum(7 * len(s.vertices) + 12 * len(s.faces) for s in shown)) > room_bytes and cells > 4:
-        shown = [cluster(segment, extent / cells) for segment in surfaces.segments]
+        shown = [split_at_creases(cluster(segment, extent / cells))[0] for segment in surfaces.segments]
         # a surface meets about cells^2 cells of the grid; the factor keeps the last steps from crawling
         cells *= min(0.95, max(0.5, (max(room_bytes, 0) / size) ** 0.5))
     return shown

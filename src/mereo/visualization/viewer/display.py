@@ -15,6 +15,7 @@ import trimesh
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.geometry.creases import split_at_creases
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.visualization.viewer.guard import Entry, bound_socket, guarded_servers
 
@@ -183,13 +184,14 @@ class SegmentLayer:
     ) -> None:
         """Replace the surfaces that are shown.
 
-        ``colors`` holds one colour per vertex for each segment; ``shift`` is on the stage.
+        ``colors`` holds one colour per vertex for each segment; ``shift`` is on the stage. Surfaces keep their creases.
         """
         visible, opacity = shown.visible(), shown.opacity()
         offset = np.zeros(3) if shift is None else shift
         self.clear_from(len(mesh.segments))
         handles = []
-        for k, segment in enumerate(mesh.segments):
+        for k, whole in enumerate(mesh.segments):
+            segment, source = split_at_creases(whole)
             name, is_on = f"{self.name}/{k}", visible[k] and len(segment.faces) > 0
             vertices = self.stage.place(segment.vertices) + offset if len(segment.vertices) else np.zeros((3, 3))
             faces = segment.faces if len(segment.faces) else np.array([[0, 1, 2]])
@@ -207,7 +209,7 @@ class SegmentLayer:
                     )
                 )
             else:
-                painted = _painted(segment, vertices, colors[k], opacity[k])
+                painted = _painted(segment, vertices, colors[k][source], opacity[k])
                 handles.append(add.add_mesh_trimesh(name, painted, visible=is_on))
         self.handles = handles
 
