@@ -14,7 +14,7 @@ from mereo.fitting.config import FitChoice
 from mereo.fitting.registration.carry import Carried
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty.uncertainty import Uncertainty
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
@@ -211,11 +211,13 @@ def write_files(
     carried: Sequence[Carried] = (),
     unit: Unit = UNKNOWN,
     registered: Registration | None = None,
+    depth: DepthImage | None = None,
 ) -> None:
     """Write what ``write_reconstruction`` does into a directory that is there; ``facts`` go into the summary.
 
     ``unit`` is that of the report, which tells no metres where they were only assumed. ``registered`` is the model that
     the result is, in the input's frame (``Answer.registered``): then files, summary and report say how sure it is.
+    ``depth`` is the image that the cloud comes from, which the report shows.
 
     What is carried goes into ``carried/`` under its files' own names; its surfaces also into pictures and report, and
     together with the segments into ``carried.glb``, where GLB is asked for.
@@ -237,7 +239,8 @@ def write_files(
     summary = summarize(replace(result, timings_s=timings_s), sure, **{"frame": frame, "unit_m": unit_m, **facts})
     extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
     told = [*({"name": part.name} for part in extra), *summary["segments"]]
-    write_report(directory / "report.html", cloud, drawn, {**summary, "segments": told}, to_viewer, unit, registered)
+    told_all, page = {**summary, "segments": told}, directory / "report.html"
+    write_report(page, cloud, drawn, told_all, to_viewer, unit, registered, depth)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
 
 
@@ -252,6 +255,7 @@ def write_one(
     facts: dict[str, object],
     unit: Unit = UNKNOWN,
     registered: Registration | None = None,
+    depth: DepthImage | None = None,
 ) -> None:
     """Write the one file of a folder of results that has this suffix (".glb", ".html", ...) to a path."""
     if suffix in (".png", ".html"):
@@ -262,7 +266,7 @@ def write_one(
     sure = None if registered is None else registered.uncertainty
     summary = summarize(result, sure, **{"frame": frame, "unit_m": unit_m, **facts})
     if suffix == ".html":
-        write_report(path, cloud, drawn, summary, viewer_rotation(frame), unit, registered)
+        write_report(path, cloud, drawn, summary, viewer_rotation(frame), unit, registered, depth)
         return
     (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
     chosen_formats([name])
