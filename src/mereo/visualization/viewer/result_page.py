@@ -9,7 +9,9 @@ from mereo.visualization.viewer.display import import_viser, start_server
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.guard import Entry
 from mereo.visualization.viewer.open_page import OpenPage
+from mereo.visualization.viewer.panels import DepthPicture
 from mereo.visualization.viewer.probe import Inspection
+from mereo.visualization.viewer.tab_title import tab_title
 
 
 def open_answer(
@@ -22,7 +24,7 @@ def open_answer(
     import_viser()
     inspection = Inspection.of_answer(found, model, registrar)
     entry = Entry.of(host)
-    server = start_server(port, "mereo", entry)
+    server = start_server(port, tab_title(seen.frame.source), entry)
     facts = f"{len(seen.cloud):,} points · weights {model.name or 'of this program'}"
-    FramePage(server, inspection, seen.frame.source, facts, unit)
+    FramePage(server, inspection, seen.frame.source, facts, unit, DepthPicture.of(seen.frame.depth, unit))
     return OpenPage(server, entry)
