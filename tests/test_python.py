@@ -292,8 +292,8 @@ def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyP
     with result.show(block=False) as page, mereo.view(result, block=False, port=8081):
         assert page.address == "http://127.0.0.1:1234"
     assert shown[0] == 0 and shown[2] == 8081
-    _, inspection, title, facts, unit = shown[1]
+    _, inspection, title, facts, unit, depth = shown[1]
     assert inspection.surfaces is result.reconstruction.surfaces and inspection.code is result.reconstruction.code
-    assert (title, unit) == ("cloud", Unit(1.0)) and facts.startswith("1,200 points")
+    assert (title, unit, depth) == ("cloud", Unit(1.0), None) and facts.startswith("1,200 points")
     with pytest.raises(ValueError, match="both .* and --scene rope are given; one can be shown: drop one"):
         mereo.view("frame.ply", scene="rope", block=False)

@@ -1,6 +1,7 @@
 """The page is self-contained, small, and shows the segments in a real browser, with and without WebGL."""
 
 import base64
+import io
 import json
 import re
 import subprocess
@@ -14,8 +15,10 @@ from browser import BROWSER, Page, until
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.visualization.contact_sheets import MISSING
+from mereo.visualization.depth_picture import MOST_SIDE, depth_data
 from mereo.visualization.reconstruction_report import BUDGET_BYTES, cluster, write_report
 from mereo.visualization.units import Unit
 
@@ -108,7 +111,7 @@ def test_figures_are_in_millimetres_where_the_unit_is_known(
 def test_the_page_counts_the_points_once_and_has_no_words_of_programs(tmp_path: Path) -> None:
     cloud, mesh, summary = example()
     told = {"answer": "registration", "explained": 0.973}
-    said = {"recognition": {"known": "unsure", "reason": "look at it", "signs": {"size": 0.1}}}
+    said = {"recognition": {"known": "unsure", "reason": "a part is bent: look at it", "signs": {"size": 0.1}}}
     write_report(tmp_path / "r.html", cloud, mesh, {**summary, **said, "registration": told, "patient_pose": "supine"})
     data = page_data(tmp_path / "r.html")
     words = data["words"]
@@ -117,8 +120,38 @@ def test_the_page_counts_the_points_once_and_has_no_words_of_programs(tmp_path: 
     text = " ".join(words["facts"])
     assert not re.search(r"float32|camera|clipped|points:|104|_", text), text
     assert data["cloud"]["count"] == len(cloud)
-    assert words["warnings"][0] == "Doubtful: look at it." and "may be cut off there." in words["warnings"][1]
+    assert words["trust"] == ["doubt", "Doubtful:", "a part is bent."]
+    assert words["warnings"][0] == "Look at it." and "may be cut off there." in words["warnings"][1]
     assert words["timings_s"] == {"reading the points": 0.1, "field": 1.5}
+
+
+def wall(width: int, height: int, unit: float = 1.0) -> DepthImage:
+    """Image of a slanted wall in the middle of an empty frame, 0.5 m to 0.7 m away."""
+    depth = np.zeros((height, width))
+    depth[height // 4 : height // 2, width // 4 : width // 2] = np.linspace(0.5, 0.7, width // 2 - width // 4) * unit
+    return DepthImage(depth, Camera.from_fov(width, height, 0.7))
+
+
+@pytest.mark.parametrize("unit, ends", [(Unit(1.0), ["500 mm", "700 mm"]), (Unit(None), ["0.5 units", "0.7 units"])])
+def test_the_page_has_the_depth_image_where_there_is_one(tmp_path: Path, unit: Unit, ends: list[str]) -> None:
+    cloud, mesh, summary = example()
+    write_report(tmp_path / "r.html", cloud, mesh, summary, unit=unit, depth=wall(80, 60))
+    told = page_data(tmp_path / "r.html")["depth"]
+    assert told["ends"] == ends
+    kind, _, content = told["url"].partition(",")
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(content))).convert("RGB"))
+    assert kind == "data:image/png;base64" and picture.shape[:2] == (told["height"], told["width"])
+    # what was measured, and a little around it: 20 x 15 pixels
+    assert (picture != np.array(MISSING)).any(axis=2).sum() == 20 * 15 and picture.shape[:2] == (19, 24)
+    write_report(tmp_path / "none.html", cloud, mesh, summary)
+    assert page_data(tmp_path / "none.html")["depth"] is None
+
+
+def test_large_and_empty_depth_images_are_small_pictures() -> None:
+    large = depth_data(wall(4000, 3000), Unit(1.0))
+    assert MOST_SIDE / 2 < large["width"] <= MOST_SIDE and len(large["url"]) < 100_000
+    empty = depth_data(DepthImage(np.zeros((4, 6)), Camera.from_fov(6, 4, 0.7)), Unit(1.0))
+    assert (empty["width"], empty["height"], empty["ends"]) == (6, 4, [])
 
 
 def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Path) -> None:
@@ -193,13 +226,27 @@ def test_every_column_is_seen_on_a_phone_too(tmp_path: Path, width: int) -> None
     segments = [{**told, **sure, "volume95": [3.43e-5, 3.59e-5]} for told in summary["segments"]]
     names = [replace(one, name=f"finger_{k}") for k, one in enumerate(mesh.segments)]
     summary = {**summary, "segments": segments, "radius95": {"median": 1e-4, "max": 1e-3, "calibrated": True}}
-    write_report(tmp_path / "r.html", cloud, SegmentedMesh(tuple(names)), summary, unit=Unit(1.0))
+    write_report(tmp_path / "r.html", cloud, SegmentedMesh(tuple(names)), summary, unit=Unit(1.0), depth=wall(80, 60))
     with Page(tmp_path, (tmp_path / "r.html").as_uri(), (width, 800)) as page:
         until(lambda: page.evaluate("document.body.dataset.drawing"))
         words = page.text().replace("\N{NO-BREAK SPACE}", " ")
+        assert "Network alone: nothing says whether this is the object." in words
         assert "-63.64" in words and "± 0.60" in words and "35.1 (34.3 to 35.9)" in words
         room = page.evaluate("(t => [t.scrollWidth, t.parentElement.clientWidth])(document.getElementById('table'))")
         assert room[0] <= room[1], "the table is wider than its card"
+        room = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+        assert room[0] <= room[1], "the page is scrolled sideways"
+        assert page.evaluate("document.getElementById('depthimage').naturalWidth") == 24
+        places = page.evaluate(
+            "[...document.querySelectorAll('#table tbody tr')].map(r => [...r.cells].map(c => c.offsetTop))"
+        )
+        for name, centre, volume, confidence in places:
+            # on a phone name and volume are the first line of a card, centre and confidence its second
+            assert (abs(name - volume) < 4, abs(centre - confidence) < 4, centre - name > 9) == (
+                True,
+                True,
+                width < 500,
+            )
 
 
 def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:

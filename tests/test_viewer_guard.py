@@ -78,7 +78,7 @@ def test_a_refusal_says_which_address_to_open() -> None:
 
 def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     @contextlib.contextmanager
-    def unused(_: object) -> Iterator[list[str]]:
+    def unused(*_: object) -> Iterator[list[str]]:
         yield []
 
     monkeypatch.setattr(display, "guarded_servers", unused)

@@ -16,11 +16,13 @@ import numpy as np
 from jaxtyping import Float, Int, UInt16
 
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import DepthImage, PointCloud
+from mereo.geometry.creases import split_at_creases
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, OUTER_OPACITY
+from mereo.visualization.depth_picture import depth_data
 from mereo.visualization.report_words import page_words
 from mereo.visualization.sure_colors import SureColors, sure_colors
 from mereo.visualization.units import UNKNOWN, Unit
@@ -44,6 +46,7 @@ def write_report(
     frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
     unit: Unit = UNKNOWN,
     registered: Registration | None = None,
+    depth: DepthImage | None = None,
 ) -> None:
     """Write the page of a reconstruction.
 
@@ -58,12 +61,14 @@ def write_report(
         frame_rotation: rotation from the input's frame to the viewer's (x right, y up, z toward the viewer).
         unit: of the cloud's lengths; the page has millimetres and cubic centimetres where it is known.
         registered: the model that the last of ``surfaces`` are, in the cloud's frame, to show how sure they are.
+        depth: the image that the cloud comes from, in its unit, where it comes from one.
 
     Raises ``ValueError`` when the page cannot be brought under the budget.
     """
     page = files("mereo.visualization").joinpath("report.html").read_text(encoding="utf-8")
     sure = None if registered is None else sure_colors(registered, unit)
-    data = _page_data(cloud, surfaces, page_words(summary, unit), np.asarray(frame_rotation), sure)
+    picture = None if depth is None else depth_data(depth, unit)
+    data = _page_data(cloud, surfaces, page_words(summary, unit), np.asarray(frame_rotation), sure, picture)
     # "</script>" inside a name must not end the script; \u003c is the same character to JSON
     text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
     title = data["words"]["title"]
@@ -81,12 +86,14 @@ def _page_data(
     words: dict[str, Any],
     rotation: Float[np.ndarray, "3 3"],
     sure: SureColors | None,
+    depth: dict[str, Any] | None,
 ) -> dict[str, Any]:
     points = _thin(cloud.points)
     low, high = _joint_bounds(points, surfaces)
     marks = None if sure is None else sure.of_points(points)
     # binary room: the page's text takes the rest; base64 grows data by a third
-    room = int((BUDGET_BYTES - 300_000 - len(json.dumps(words))) * 3 / 4) - (6 + len(marks or ())) * len(points)
+    taken = len(json.dumps([words, depth]))
+    room = int((BUDGET_BYTES - 300_000 - taken) * 3 / 4) - (6 + len(marks or ())) * len(points)
     shown = _fit(surfaces, float((high - low).max()), room)
     return {
         "low": low.tolist(),
@@ -107,6 +114,7 @@ def _page_data(
         ],
         "coarsened": any(len(a.faces) != len(b.faces) for a, b in zip(surfaces.segments, shown, strict=True)),
         "words": words,
+        "depth": depth,
         "sure": None if sure is None else sure.page_data(marks),
     }
 
@@ -135,10 +143,10 @@ def _base64(array: np.ndarray) -> str:
 
 
 def _fit(surfaces: SegmentedMesh, extent: float, room_bytes: int) -> list[Segment]:
-    """The segments, coarsened together until they take at most ``room_bytes``."""
-    shown, cells = list(surfaces.segments), 400.0
+    """The segments, split at their creases, and coarsened together until they take at most ``room_bytes``."""
+    shown, cells = [split_at_creases(segment)[0] for segment in surfaces.segments], 400.0
     while (size := sum(7 * len(s.vertices) + 12 * len(s.faces) for s in shown)) > room_bytes and cells > 4:
-        shown = [cluster(segment, extent / cells) for segment in surfaces.segments]
+        shown = [split_at_creases(cluster(segment, extent / cells))[0] for segment in surfaces.segments]
         # a surface meets about cells^2 cells of the grid; the factor keeps the last steps from crawling
         cells *= min(0.95, max(0.5, (max(room_bytes, 0) / size) ** 0.5))
     return shown

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mereo.fitting.registration.recognition import told_of
 from mereo.geometry.radii import level_told
+from mereo.visualization.trust import Trust, trust
 from mereo.visualization.units import Unit, rounded
 
 STAGES = {
@@ -27,6 +27,7 @@ STAGES = {
 SAID_ELSEWHERE = frozenset(
     {
         "title",
+        "recognition",
         "radius95",
         "unit",
         "unit_m",
@@ -72,17 +73,20 @@ def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
         summary: as ``write_report`` takes it.
         unit: of the lengths in it.
 
-    Returns ``title``, ``facts`` (phrases), ``warnings`` (sentences), ``heads`` (of the table), ``rows`` (centre,
-    volume and confidence of each segment; confidence is None where there is none), ``weights`` (their name) and
-    ``timings_s``, seconds of each stage in words.
+    Returns ``title``, ``trust`` (level, verdict and why), ``facts`` (phrases), ``warnings`` (sentences), ``heads``
+    (of the table), ``units`` (of its lengths and volumes), ``rows`` (centre, volume and confidence of each segment;
+    confidence is None where there is none), ``weights`` (their name) and ``timings_s``, seconds of each stage in words.
     """
+    verdict = trust(summary)
     title = confidence_title(summary.get("calibrated") is True)
     times = {name: _number(seconds) for name, seconds in dict(summary.get("timings_s") or {}).items()}
     return {
         "title": str(summary.get("title", "mereo reconstruction")),
-        "facts": _facts(summary, unit),
-        "warnings": _warnings(summary),
+        "trust": [verdict.level, f"{verdict.verdict}:", f"{verdict.why}."],
+        "facts": _facts(summary, unit, verdict),
+        "warnings": _warnings(summary, verdict),
         "heads": _heads(summary, unit, title),
+        "units": [unit.length_name, unit.volume_name],
         "rows": [_row(told, unit) for told in summary.get("segments") or ()],
         "weights": str(summary.get("weights") or ""),
         "timings_s": {STAGES.get(name, _plain(name)): value for name, value in times.items() if value is not None},
@@ -97,9 +101,10 @@ def _heads(summary: Mapping[str, Any], unit: Unit, confidence: str) -> list[str]
     return ["segment", *heads, confidence]
 
 
-def _facts(summary: Mapping[str, Any], unit: Unit) -> list[str]:
+def _facts(summary: Mapping[str, Any], unit: Unit, verdict: Trust) -> list[str]:
     """Where the answer comes from, what it was made with, then whatever else a caller has to say."""
-    facts = [_answer(summary["registration"])] if isinstance(summary.get("registration"), Mapping) else []
+    registration = summary.get("registration")
+    facts = [_answer(registration, verdict)] if isinstance(registration, Mapping) else []
     source, spacing = summary.get("source"), _number(summary.get("spacing"))
     if source is not None and str(source) != str(summary.get("title")):
         facts.append(f"from {source}")
@@ -123,22 +128,18 @@ def _sure(radius95: Mapping[str, Any], unit: Unit) -> str:
     return f"surface within {middle} {unit.length_name} in the median, {most} at most ({level})"
 
 
-def _answer(registration: Mapping[str, Any]) -> str:
+def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
     explained = _number(registration.get("explained"))
-    if registration.get("answer") == "registration" and explained is not None:
-        return f"your model, registered: it explains {explained:.1%} of the points"
-    return "the network's own answer"
+    if registration.get("answer") != "registration":
+        return "the network's own answer"
+    if explained is None or verdict.level in ("yes", "unchecked"):  # which say it themselves
+        return "your model, registered"
+    return f"your model, registered: it explains {explained:.1%} of the points"
 
 
-def _warnings(summary: Mapping[str, Any]) -> list[str]:
-    """Sentences on why the result may not be what it seems."""
-    registration = summary.get("registration")
-    told = registration if isinstance(registration, Mapping) else {}
-    warnings = [str(told["refusal"])] if told.get("refusal") else []
-    recognition = summary.get("recognition")
-    known = recognition if isinstance(recognition, Mapping) else {}
-    if known.get("reason") and known.get("signs"):  # without signs nobody was asked, or the refusal has said it
-        warnings.append(told_of(known["known"], str(known["reason"])))
+def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:
+    """Sentences on what to do about a result that may not be what it seems; the verdict itself has said why."""
+    warnings = [] if verdict.cure is None else [verdict.cure]
     if summary.get("clipped"):
         warnings.append("the object reaches the border of the volume that was searched and may be cut off there")
     return [text[0].upper() + text[1:] + ("" if text.endswith(".") else ".") for text in warnings]

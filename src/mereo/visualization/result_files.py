@@ -244,7 +244,7 @@ def write_answer(
     extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
     rows = [*({"name": part.name} for part in extra), *summary["segments"]]
     page, unit = {**summary, "segments": rows}, Unit(frame.unit_m)
-    write_report(directory / "report.html", cloud, drawn, page, to_viewer, unit, answer.registered)
+    write_report(directory / "report.html", cloud, drawn, page, to_viewer, unit, answer.registered, frame.depth)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
     write_state(directory, answer)
 
@@ -256,7 +256,7 @@ def write_answer_file(path: Path, suffix: str, answer: Answer, files: FilesConfi
         write_preview(path, pictured(result.surfaces), cloud, frame.axes, frame.source)
     elif suffix == ".html":
         drawn, summary, unit = pictured(result.surfaces), summary_of(answer), Unit(frame.unit_m)
-        write_report(path, cloud, drawn, summary, viewer_rotation(frame.axes), unit, answer.registered)
+        write_report(path, cloud, drawn, summary, viewer_rotation(frame.axes), unit, answer.registered, frame.depth)
     else:
         (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
         chosen_formats([name])

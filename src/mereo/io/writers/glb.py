@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.creases import split_at_creases
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii
 from mereo.io.atomic_files import atomic_file
@@ -38,8 +39,9 @@ def write_segments_glb(
 ) -> None:
     """Write a GLB file: one named, coloured node per segment, below a root node that turns the frame for viewers.
 
-    Vertices stay as they are (rounded to float32, all that glTF holds), each with its normal. Segments without faces
-    are left out; those around a nested segment that was found are translucent.
+    Vertices stay as they are (rounded to float32, all that glTF holds), each with its normal; where faces meet at a
+    crease (``geometry.creases``), copies follow them, with the same attributes but normals of their own. Segments
+    without faces are left out; those around a nested segment that was found are translucent.
 
     Args:
         path: the .glb file.
@@ -85,13 +87,15 @@ def _gltf_document(
     solid = with_faces(surfaces)
     chunks: list[bytes] = []
     document = _gltf_skeleton(solid, surfaces.opaque, np.asarray(frame_rotation) * unit_m)
-    for _, segment in solid:
+    creased = [split_at_creases(segment) for _, segment in solid]
+    for segment, _ in creased:
         _add_array(document, chunks, segment.vertices.astype("<f4"), "VEC3", 34962)
         _add_array(document, chunks, _unit_normals(segment).astype("<f4"), "VEC3", 34962)
         _add_array(document, chunks, segment.faces.astype("<u4").reshape(-1, 1), "SCALAR", 34963)
     for index, (label, segment) in enumerate(solid if radii is not None else ()):
         assert radii is not None
-        _add_radii(document, chunks, index, radii, radii.at(segment.vertices, label), unit_m, colored)
+        values = radii.at(segment.vertices, label)[creased[index][1]]
+        _add_radii(document, chunks, index, radii, values, unit_m, colored)
     binary = b"".join(chunks)
     document["buffers"] = [{"byteLength": len(binary)}]
     return document, binary

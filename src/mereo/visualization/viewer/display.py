@@ -15,8 +15,10 @@ import trimesh
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.geometry.creases import split_at_creases
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.visualization.viewer.guard import Entry, bound_socket, guarded_servers
+from mereo.visualization.viewer.tab_title import PROGRAM, titling
 
 BACKDROP = ((58, 65, 78), (22, 25, 32))
 """Top and bottom of the background, neutral and dark: the palette's yellow is hard to see on white."""
@@ -53,6 +55,8 @@ def import_viser() -> Any:
 def start_server(port: int, title: str, entry: Entry | None = None) -> Any:
     """Server of viser that answers its own page only (``guard``), by default on 127.0.0.1; port 0 means any.
 
+    ``title`` is that of the browser's tab.
+
     Raises ``OSError`` where the port is taken, or the host no address of this machine, and ``ImportError`` for a viser
     that the guard does not know.
     """
@@ -62,8 +66,11 @@ def start_server(port: int, title: str, entry: Entry | None = None) -> Any:
         port = probe.getsockname()[1]
     # browsers open connections ahead and drop them, which websockets reports with a traceback each
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
-    with contextlib.redirect_stdout(io.StringIO()), guarded_servers(entry) as guards:  # without its own banner
-        server = viser.ViserServer(host=entry.host, port=port, label=title, verbose=False)
+    with (
+        contextlib.redirect_stdout(io.StringIO()),
+        guarded_servers(entry, titling(title)) as guards,
+    ):  # without its own banner
+        server = viser.ViserServer(host=entry.host, port=port, label=PROGRAM, verbose=False)
     if not guards:
         stop_server(server)
         raise ImportError(
@@ -183,13 +190,14 @@ class SegmentLayer:
     ) -> None:
         """Replace the surfaces that are shown.
 
-        ``colors`` holds one colour per vertex for each segment; ``shift`` is on the stage.
+        ``colors`` holds one colour per vertex for each segment; ``shift`` is on the stage. Surfaces keep their creases.
         """
         visible, opacity = shown.visible(), shown.opacity()
         offset = np.zeros(3) if shift is None else shift
         self.clear_from(len(mesh.segments))
         handles = []
-        for k, segment in enumerate(mesh.segments):
+        for k, whole in enumerate(mesh.segments):
+            segment, source = split_at_creases(whole)
             name, is_on = f"{self.name}/{k}", visible[k] and len(segment.faces) > 0
             vertices = self.stage.place(segment.vertices) + offset if len(segment.vertices) else np.zeros((3, 3))
             faces = segment.faces if len(segment.faces) else np.array([[0, 1, 2]])
@@ -207,7 +215,7 @@ class SegmentLayer:
                     )
                 )
             else:
-                painted = _painted(segment, vertices, colors[k], opacity[k])
+                painted = _painted(segment, vertices, colors[k][source], opacity[k])
                 handles.append(add.add_mesh_trimesh(name, painted, visible=is_on))
         self.handles = handles
 

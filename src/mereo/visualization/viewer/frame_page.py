@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mereo.geometry.camera import PointCloud
 from mereo.visualization.units import UNKNOWN, Unit
 from mereo.visualization.vertex_colors import (
     CONFIDENCE,
@@ -17,7 +16,8 @@ from mereo.visualization.vertex_colors import (
     radius_scale,
 )
 from mereo.visualization.viewer import html
-from mereo.visualization.viewer.display import CLOUD_COLOR, Display, SegmentControls, SegmentLayer, point_size
+from mereo.visualization.viewer.display import Display, SegmentControls, SegmentLayer
+from mereo.visualization.viewer.panels import DepthPicture, add_cloud, add_depth, add_views
 from mereo.visualization.viewer.probe import Inspection, first_hit
 from mereo.visualization.viewer.why import WhyLayer
 
@@ -29,7 +29,15 @@ SURE = "how sure"
 class FramePage:
     """Page that shows an ``Inspection`` and answers clicks, check boxes and sliders until its server stops."""
 
-    def __init__(self, server: Any, inspection: Inspection, title: str, facts: str, unit: Unit = UNKNOWN) -> None:
+    def __init__(
+        self,
+        server: Any,
+        inspection: Inspection,
+        title: str,
+        facts: str,
+        unit: Unit = UNKNOWN,
+        depth: DepthPicture | None = None,
+    ) -> None:
         self.server, self.inspection, self.unit = server, inspection, unit
         self.mesh = inspection.surfaces
         self._drawing = threading.Lock()
@@ -38,7 +46,7 @@ class FramePage:
         self.stage = Display(server, self._bounds(), np.array([0.0, y, 0.0]))
         self.layer = SegmentLayer(self.stage, "/segments")
         self._painted: dict[str, tuple[list[UInt8[np.ndarray, "_ 3"]], str]] = {}
-        self._build(title, facts)
+        self._build(title, facts, depth)
         self._draw()
         self.stage.look_from(self.toward + 0.28 * np.array([1.0, y, 0.0]), self._bounds())
 
@@ -48,7 +56,7 @@ class FramePage:
         joint = np.concatenate([*([] if cloud is None else [cloud.points]), *corners])
         return np.stack([joint.min(axis=0), joint.max(axis=0)])
 
-    def _build(self, title: str, facts: str) -> None:
+    def _build(self, title: str, facts: str, depth: DepthPicture | None) -> None:
         gui = self.server.gui
         gui.add_html(html.heading(title, facts))
         gui.add_html(html.message(self.inspection.source))
@@ -59,30 +67,16 @@ class FramePage:
         self.coloring.on_update(lambda _: self._draw())
         self.controls = SegmentControls(gui, self.mesh, self._draw)
         if self.inspection.cloud is not None:
-            self._build_cloud(self.inspection.cloud)
-        view = gui.add_button_group("View", ("camera", "side", "behind"))
-        view.on_click(lambda _: self._turn(view.value))
+            add_cloud(gui, self.stage, self.inspection.cloud, self.coloring)
+        add_views(gui, self.stage, self.toward, self._bounds)
         self._build_probe()
+        add_depth(gui, depth)
 
     def _colorings(self) -> tuple[str, ...]:
         """What surfaces can be coloured by: confidence is the network's, distance needs what was seen."""
         has_code, has_cloud = self.inspection.code is not None, self.inspection.cloud is not None
-        sure = [SURE] if self.inspection.here is not None else []
+        sure = [SURE] if self.inspection.sure is not None else []
         return ("segment", *(["confidence"] if has_code else []), *(["distance"] if has_cloud else []), *sure)
-
-    def _build_cloud(self, seen: PointCloud) -> None:
-        gui = self.server.gui
-        points = self.stage.place(seen.points)
-        with gui.add_folder("Observed points"):
-            cloud_on = gui.add_checkbox("show", True)
-            size = gui.add_slider("size (%)", 0.05, 4.0, 0.05, round(100 * point_size(points), 2))
-        cloud = self.server.scene.add_point_cloud(
-            "/cloud", points, CLOUD_COLOR, point_size=size.value / 100, point_shape="circle", precision="float32"
-        )
-        cloud_on.on_update(lambda _: setattr(cloud, "visible", cloud_on.value))
-        # white points would hide the colours that are looked at
-        self.coloring.on_update(lambda _: setattr(cloud_on, "value", self.coloring.value == "segment"))
-        size.on_update(lambda _: setattr(cloud, "point_size", size.value / 100))
 
     def _build_probe(self) -> None:
         gui = self.server.gui
@@ -129,14 +123,10 @@ class FramePage:
 
     def _radii(self) -> tuple[list[Float[np.ndarray, " _"]], ColorScale]:
         """Radius of 95 % at each vertex, in the unit of the page, and its scale."""
-        here = self.inspection.here
-        assert here is not None and here.uncertainty is not None
-        radii = here.uncertainty.radii(here.material).scaled(self.unit.length_factor)
+        found = self.inspection.sure
+        assert found is not None
+        radii = found.scaled(self.unit.length_factor)
         return list(radii.vertices), radius_scale(radii, f" {self.unit.length_name}")
-
-    def _turn(self, name: str) -> None:
-        side = np.array([1.0, 0.0, 0.0])
-        self.stage.look_from({"camera": self.toward, "side": side, "behind": -self.toward}[name], self._bounds())
 
     # --- probing ------------------------------------------------------------------------------------------------------
 

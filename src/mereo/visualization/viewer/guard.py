@@ -102,8 +102,10 @@ def _tokens(path: str, cookies: Sequence[str], name: str) -> tuple[list[str], li
 
 
 @contextmanager
-def guarded_servers(entry: Entry) -> Iterator[list[str]]:
+def guarded_servers(entry: Entry, changed: Callable[[Any], None] | None = None) -> Iterator[list[str]]:
     """Guard every server of ``websockets`` that is started meanwhile; the list holds a word for each.
+
+    ``changed`` may change, in place, what is answered to a request that is let in.
 
     viser takes no hook for requests, but starts its server by the public ``websockets.asyncio.server.serve``. A caller
     looks into the list, so that another version of viser, which starts it otherwise, is not left without a guard.
@@ -120,6 +122,8 @@ def guarded_servers(entry: Entry) -> Iterator[list[str]]:
             if reason := refusal(hosts, headers.get_all("Origin"), entry, [*queried, *kept]):
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
             answer = None if process_request is None else process_request(connection, request)
+            if answer is not None and changed is not None:
+                changed(answer)
             if answer is not None and entry.token and queried:
                 answer.headers["Set-Cookie"] = f"{_cookie_name(hosts)}={entry.token}; Path=/; HttpOnly; SameSite=Strict"
                 answer.headers["Referrer-Policy"] = "no-referrer"

@@ -11,6 +11,7 @@ from mereo.fitting.registration.recognition import Recognition, recognize
 from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
+from mereo.geometry.radii import Radii
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
 from mereo.models.model import Answer, EncodedCloud, Model
@@ -53,6 +54,7 @@ class Inspection:
         cloud: the object's points, in the input's frame; None for a state without its frame.
         code: what the weights made of the cloud, camera frame.
         registration: of the object's own model, camera frame, where the surfaces are that model.
+        radii: how sure its vertices are, as files say it, in the input's frame; None where the registration knows it.
     """
 
     surfaces: SegmentedMesh
@@ -62,6 +64,7 @@ class Inspection:
     cloud: PointCloud | None = None
     code: EncodedCloud | None = None
     registration: Registration | None = None
+    radii: Radii | None = None
 
     @classmethod
     def of_answer(cls, found: FrameAnswer) -> "Inspection":
@@ -135,6 +138,14 @@ class Inspection:
         if self.registration is None or self.registration.uncertainty is None:
             return None
         return self.registration.moved(inverse_rigid(self.T_camera_input))
+
+    @property
+    def sure(self) -> Radii | None:
+        """Radii of 95 % of the surfaces' vertices, in the input's frame; None where they are not known."""
+        here = self.here
+        if here is None or here.uncertainty is None:
+            return self.radii
+        return here.uncertainty.radii(here.material)
 
     def _turned(self, direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Directions of the camera frame in the input's."""

@@ -6,7 +6,9 @@ from mereo.visualization.viewer.display import import_viser, start_server
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.guard import Entry
 from mereo.visualization.viewer.open_page import OpenPage
+from mereo.visualization.viewer.panels import DepthPicture
 from mereo.visualization.viewer.probe import Inspection
+from mereo.visualization.viewer.tab_title import tab_title
 
 
 def open_answer(answer: Answer, *, port: int, host: str) -> OpenPage:
@@ -18,7 +20,8 @@ def open_answer(answer: Answer, *, port: int, host: str) -> OpenPage:
     seen = answer.seen
     inspection = Inspection.of_answer(answer)
     entry = Entry.of(host)
-    server = start_server(port, "mereo", entry)
+    server = start_server(port, tab_title(seen.frame.source), entry)
     facts = f"{len(seen.cloud):,} points · weights {answer.model.name or 'of this program'}"
-    FramePage(server, inspection, seen.frame.source, facts, Unit(seen.frame.unit_m))
+    unit = Unit(seen.frame.unit_m)
+    FramePage(server, inspection, seen.frame.source, facts, unit, DepthPicture.of(seen.frame.depth, unit))
     return OpenPage(server, entry)

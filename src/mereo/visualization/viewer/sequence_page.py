@@ -29,6 +29,7 @@ from mereo.visualization.viewer.display import (
 )
 from mereo.visualization.viewer.guard import Entry
 from mereo.visualization.viewer.open_page import OpenPage
+from mereo.visualization.viewer.tab_title import tab_title
 
 SHOWN = ("answer", "truth", "side by side")
 ASIDE = 1.2
@@ -53,7 +54,7 @@ def view_recording(
     answer = None if known is None else following(recording, known, inference or InferenceConfig())
     facts = f"{len(recording)} frames, {recording.index.rate_hz:g} Hz · " + (f"weights {known}" if known else "truth")
     entry = Entry.of(host)
-    server = start_server(port, "mereo", entry)
+    server = start_server(port, tab_title(f"Recording: {recording.index.scene}"), entry)
     return OpenPage(server, entry, SequencePage(server, recording, answer, facts))
 
 

@@ -1,5 +1,6 @@
 """``mereo view``: load what is to be shown, and open its page."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from mereo.fitting.registration.register import registrar_for, statistical_model
 from mereo.fitting.registration.state import played_state, restored
 from mereo.fitting.registration.state_file import RegistrationState, is_state, read_state
 from mereo.io.config import InputConfig
+from mereo.io.glb_scene import is_glb
 from mereo.io.progress import shown_stages
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
@@ -29,12 +31,16 @@ from mereo.visualization.viewer.display import import_viser, start_server
 from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom, ModeShapes
 from mereo.visualization.viewer.guard import LOOPBACK, Entry
+from mereo.visualization.viewer.kept_result import KeptResult, is_kept
 from mereo.visualization.viewer.lab_page import LabPage
 from mereo.visualization.viewer.laboratory import Laboratory
+from mereo.visualization.viewer.mesh_page import view_glb, view_kept
 from mereo.visualization.viewer.open_page import OpenPage, is_interactive
+from mereo.visualization.viewer.panels import DepthPicture
 from mereo.visualization.viewer.probe import Inspection
 from mereo.visualization.viewer.result_page import open_answer
 from mereo.visualization.viewer.sequence_page import view_recording
+from mereo.visualization.viewer.tab_title import tab_title
 
 PORT = 8080
 """Port of the page where none is chosen."""
@@ -58,8 +64,8 @@ def view(
 
     Args:
         input: a point cloud or depth image; a folder of `mereo scene record`, which is played; a result of
-            `mereo reconstruct` with a registered model (the folder, or its state.json), by the scene file that its
-            summary names; a ``Result``; without it (and ``scene``) a shipped frame.
+            `mereo reconstruct` (the folder, or its state.json), by the scene file that its summary names; a GLB file,
+            whose meshes are shown; a ``Result``; without it (and ``scene``) a shipped frame.
         weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
         scene: open the laboratory of this scene: its name, or a scene file.
         state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
@@ -84,6 +90,10 @@ def view(
     named = None if weights is None else str(weights)
     if path is not None and scene is None and is_recording_folder(path):
         return view_recording(read_recording(path), named, place, host, inference).stay(block)
+    if path is not None and scene is None and known is None and (is_glb(path) or is_kept(path)):
+        if named is not None:
+            raise ValueError(f"{path} is shown as it is, and --weights {named} are not asked: leave them out")
+        return (view_glb if is_glb(path) else view_kept)(path, place, host).stay(block)
     if scene is not None:
         if path is not None:
             raise ValueError(f"both {path} and --scene {scene} are given; one can be shown: drop one")
@@ -157,11 +167,16 @@ def view_state(
     plays = state.draws is not None and state.scene not in SCENES
     registration = restored(state, statistical_model_of(model), scene_of_result(path) if plays else None)
     cloud = None if seen is None else seen.cloud
-    inspection = Inspection.of_registration(registration, model, np.array(state.T_camera_input), cloud)
+    kept = KeptResult() if seen is not None else KeptResult.of(path)
+    T_camera_input = np.array(state.T_camera_input)
+    inspection = Inspection.of_registration(registration, model, T_camera_input, kept.cloud if cloud is None else cloud)
+    inspection = replace(inspection, radii=kept.radii(inspection.surfaces), source=kept.verdict or inspection.source)
+    title = (kept.title or str(path)) if frame is None else frame.source
+    facts, unit = f"{state.scene} · weights {weights}", kept.unit or Unit(state.unit_m)
+    depth = kept.depth if frame is None else DepthPicture.of(frame.depth, unit)
     entry = Entry.of(host)
-    server = start_server(port, "mereo", entry)
-    title = str(path) if frame is None else frame.source
-    FramePage(server, inspection, title, f"{state.scene} · weights {weights}", Unit(state.unit_m))
+    server = start_server(port, tab_title(title), entry)
+    FramePage(server, inspection, title, facts, unit, depth)
     return OpenPage(server, entry)
 
 
@@ -192,8 +207,9 @@ def view_scene(
     laboratory = Laboratory(scene, model, shapes=None if chosen is None else shapes_of(chosen, scene, model))
     facts = f"weights {known}" if known else "no weights: states and depth images only"
     entry = Entry.of(host)
-    server = start_server(port, "mereo", entry)
-    page = LabPage(server, laboratory, f"Laboratory: {scene.name}", facts)
+    title = f"Laboratory: {scene.name}"
+    server = start_server(port, tab_title(title), entry)
+    page = LabPage(server, laboratory, title, facts)
     return OpenPage(server, entry, page)
 
 
