@@ -15,6 +15,7 @@ from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
 from mereo.io.point_arrays import points_of
 from mereo.io.readers import depth_of, usable_depth
+from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.reconstruction.observation import CLOUD
 
@@ -54,11 +55,12 @@ def load_frame(
     """
     if isinstance(source, str | Path):
         given = (axes, unit_m, intrinsics, depth_scale, mask, topic, frame_index)
-        if not Path(source).exists() and str(source) in shipped_frames():
+        path = Path(source)
+        if str(source) in shipped_frames() and not (path.is_file() or is_recording(path)):
             if any(value is not None for value in given):
                 raise ValueError(f"the shipped frame {str(source)!r} is in metres and needs no options: leave them out")
             return shipped_frame(str(source))
-        if not Path(source).exists() and Path(source).suffix == "":
+        if not path.exists() and path.suffix == "":
             known = ", ".join(shipped_frames())
             raise FileNotFoundError(f"there is no frame {str(source)!r}; give a file or one of the shipped: {known}")
         if isinstance(intrinsics, Camera):

@@ -14,7 +14,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from mereo.api.frames import load_frame
 from mereo.api.objects import Object, load_object
 from mereo.api.reconstruct import reconstruct
 from mereo.api.result import Result
@@ -22,7 +21,7 @@ from mereo.cli.reconstruct import print_source
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import grid_confusion, labels_on
-from mereo.evaluation.sample_views import SHIPPED_SCAN, T_MODEL_SCAN, load_view
+from mereo.evaluation.sample_views import SHIPPED_SCAN, T_MODEL_SCAN, load_view, shipped_frame
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import statistical_model_of
 from mereo.io.output_folders import check_new_directory
@@ -119,7 +118,7 @@ def _inputs() -> Iterator[Callable[[], Case]]:
 
 
 def _scan_case() -> Case:
-    frame, known = load_frame(SHIPPED_SCAN), load_object("bunny")
+    frame, known = shipped_frame(SHIPPED_SCAN), load_object("bunny")
     model = statistical_model_of(known.model)
     assert model.source_frame is not None
     truth = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source @ T_MODEL_SCAN))
@@ -128,7 +127,7 @@ def _scan_case() -> Case:
 
 
 def _frame_case(name: str) -> Case:
-    frame, view = load_frame(name), load_view(name)
+    frame, view = shipped_frame(name), load_view(name)
     camera = view.depth.camera
     title = f"{name}: a rendered {camera.width} x {camera.height} depth image with noise"
     return Case(name, title, load_object(name), frame, view.truth.scaled(view.metres))
