@@ -15,6 +15,8 @@ from mereo.fitting.registration.register import Registrar
 from mereo.io.attachments import Surfaces, read_attachments
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.pose_tables import PoseTable, read_pose_table
+from mereo.io.volume_files import Volume, read_volume
+from mereo.io.writers.scalar_volumes import write_volume
 from mereo.models.model import Model
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
@@ -37,7 +39,7 @@ def view() -> SampleView:
 
 @pytest.fixture(scope="module")
 def folder(weights: Model, view: SampleView, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights, a cloud in centimetres that is said to be so, and three files to carry."""
+    """Weights, a cloud in centimetres that is said to be so, and four files to carry."""
     folder = tmp_path_factory.mktemp("carry")
     save_model(weights, folder / "rope.safetensors")
     np.save(folder / "cloud.npy", view.depth.to_points().points)
@@ -46,6 +48,10 @@ def folder(weights: Model, view: SampleView, tmp_path_factory: pytest.TempPathFa
     trimesh.Trimesh(part.vertices, part.faces, process=False).export(folder / "own.ply")
     trimesh.Trimesh(part.vertices, part.faces, process=False).export(folder / "own.glb")
     x, y, z = part.vertices.mean(axis=0)
+    volume = Volume(np.arange(8, dtype=np.int16).reshape(2, 2, 2), np.diag([*np.ptp(rest.bounds, axis=0), 1.0]))
+    volume.T_world_index[:3, 3] = rest.bounds[0]  # a voxel at each corner of the rest box
+    lps = replace(volume, T_world_index=np.diag([-1.0, -1.0, 1.0, 1.0]) @ volume.T_world_index)  # as it is written
+    write_volume(folder / "ct.nrrd", lps, 0.001)
     (folder / "grasp.csv").write_text(f"x,y,z,qx,qy,qz,qw,width\n{x},{y},{z},0,0,0,1,0.02\n", encoding="utf-8")
     return folder
 
@@ -61,11 +67,11 @@ def carrying(folder: Path, *names: str) -> list[str]:
 
 def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Path) -> None:
     options = ["--method", "modes", "--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
-    assert run(folder, *options, *carrying(folder, "own.ply", "own.glb", "grasp.csv")) == 0
+    assert run(folder, *options, *carrying(folder, "own.ply", "own.glb", "grasp.csv", "ct.nrrd")) == 0
     out = folder / "out"
     summary = json.loads((out / "summary.json").read_text())
-    assert [one["file"] for one in summary["carried"]] == ["own.ply", "own.glb", "grasp.csv"]
-    assert all(one["farthest"] < 0.01 for one in summary["carried"]) and summary["registration"]["unit"] == "known"
+    assert [one["file"] for one in summary["carried"]] == ["own.ply", "own.glb", "grasp.csv", "ct.nrrd"]
+    assert all(one["farthest"] < 0.01 for one in summary["carried"][:3]) and summary["registration"]["unit"] == "known"
     own = read_segmented_mesh(out / "segments.glb").segments[1].vertices
     carried = read_segmented_mesh(out / "carried/own.glb").segments[0].vertices
     assert np.linalg.norm(carried[: len(own)] - own, axis=1).max() < 0.3
@@ -74,6 +80,12 @@ def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Pa
     grasp = read_pose_table(out / "carried/grasp.csv")
     assert np.linalg.norm(grasp.points[0] / 10 - own.mean(axis=0)) < 1.0
     assert grasp.rows[0][-1] == "0.02" and grasp.rotations is not None
+    volume = read_volume(out / "carried/ct.nrrd")  # millimetres: ten of the input's unit
+    low, high = (np.diag([-1.0, -1.0, 1.0]) @ bound for bound in read_segmented_mesh(out / "segments.glb").bounds)
+    assert (volume.bounds[0] < 10 * np.minimum(low, high)).all() and (
+        volume.bounds[1] > 10 * np.maximum(low, high)
+    ).all()
+    assert list(volume.values.shape) == summary["carried"][3]["voxels"] and volume.values.dtype == np.int16
     together = read_segmented_mesh(out / "carried.glb")
     assert together.names[:2] == ("own.ply", "own.glb") and len(together.names) == 2 + len(summary["segments"])
 

@@ -203,9 +203,7 @@ def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...
         return ()
     carried = tuple(carry_one(one, found.registered) for one in placed)
     for one in carried:
-        outside = len(one.content.points) - one.inside
-        away = f"{outside} of them outside, up to {one.farthest:.4g} away" if outside else "all inside"
-        print(f"carried {one.name}: {len(one.content.points)} points, {away}")
+        print(one.told)
     return carried
 
 

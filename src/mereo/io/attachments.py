@@ -1,7 +1,7 @@
 """Attachments: files of what is defined beside an object's rest model (vessels, a resection plane, a grasp).
 
-Meshes (STL, PLY, OBJ, GLB, glTF), point clouds (PLY, PCD, XYZ, NPY) and tables of points or poses (CSV). They are read
-whole, moved elsewhere, and written in their own format again.
+Meshes (STL, PLY, OBJ, GLB, glTF), point clouds (PLY, PCD, XYZ, NPY), tables of points or poses (CSV), volumes (NIfTI,
+NRRD). They are read whole, moved elsewhere, and written in their own format again.
 """
 
 from collections.abc import Sequence
@@ -17,9 +17,11 @@ from mereo.io.errors import readable
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.point_cloud_formats import CLOUD_READERS, ply_counts
 from mereo.io.pose_tables import PoseTable, read_pose_table
+from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, is_volume, read_scalar_volume
 from mereo.io.writers.glb import write_segments_glb, write_segments_gltf
 from mereo.io.writers.obj import write_segments_obj
 from mereo.io.writers.ply import write_positions_ply, write_segments_ply
+from mereo.io.writers.scalar_volumes import write_volume
 from mereo.io.writers.stl import write_surface_stl
 
 MESHES = (".stl", ".ply", ".obj", ".glb", ".gltf")
@@ -65,8 +67,11 @@ class Positions:
         return replace(self, points=points)
 
 
-Content = Surfaces | Positions | PoseTable
-"""Content of an attachment: all have ``points``, ``rotations`` and ``at``."""
+Placeable = Surfaces | Positions | PoseTable
+"""Content that is moved point by point: all have ``points``, ``rotations`` and ``at``."""
+
+Content = Placeable | Volume
+"""Content of an attachment. A volume is not moved but resampled: each voxel elsewhere asks what was there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +90,8 @@ class Attachment:
 def read_attachments(paths: Sequence[str | Path]) -> tuple[Attachment, ...]:
     """Attachments of files, whose names must differ.
 
-    Raises ``FileNotFoundError``, and ``ValueError`` for files that are empty, damaged, without points or of another
-    format.
+    Raises ``FileNotFoundError``, ``ValueError`` for files that are empty, damaged, without points or of another format,
+    and ``ImportError`` for volumes without the extra `medical`.
     """
     files = [Path(path) for path in paths]
     names = [file.name.lower() for file in files]
@@ -98,8 +103,10 @@ def read_attachments(paths: Sequence[str | Path]) -> tuple[Attachment, ...]:
 
 
 def _read(path: Path) -> Content:
+    if is_volume(path):
+        return read_scalar_volume(path)
     suffix = path.suffix.lower()
-    known = dict.fromkeys((*MESHES, *CLOUDS, *TABLES))
+    known = dict.fromkeys((*MESHES, *CLOUDS, *TABLES, *VOLUME_SUFFIXES))
     if path.exists() and suffix not in known:
         raise ValueError(
             f"{path} has the suffix {path.suffix!r}; what is carried is one of {', '.join(known)}: convert it"
@@ -139,10 +146,12 @@ def write_attachment(
         content: in the input's frame and unit.
         factor: of positions in files that have no unit of their own.
         frame_rotation: from the input's frame to glTF's (y up), for the root node of glTF.
-        unit_m: metres per unit of the input, for the same.
+        unit_m: metres per unit of the input, for the same and for volumes, which are in millimetres.
     """
     suffix = path.suffix.lower()
-    if isinstance(content, PoseTable):
+    if isinstance(content, Volume):
+        write_volume(path, content, unit_m)
+    elif isinstance(content, PoseTable):
         with atomic_file(path) as partial:
             partial.write_text(content.text(factor), encoding="utf-8")
     elif isinstance(content, Positions):

@@ -1,16 +1,12 @@
 """Label volumes (NIfTI, NRRD) as segments: closed surfaces of voxel labels, smoothed, neighbours in contact.
 
-Both formats come out in one frame: RAS, x to the right, y to the front, z to the head, in the file's unit (millimetres
-by NIfTI's convention). NRRD files say which frame they are in; those of 3D Slicer are LPS and are turned.
+Where their voxels are is read by ``volume_files``: RAS in the file's unit.
 """
 
-import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -18,10 +14,8 @@ from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.io.errors import quiet, readable
-from mereo.io.size_limits import ENGINES, check_bytes, check_stream
-
-VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
+from mereo.io.errors import quiet
+from mereo.io.volume_files import VOLUME_SUFFIXES, is_volume, read_volume, segment_fields
 
 SMOOTHING = 0.8
 """Standard deviation of the smoothing, in the longest side of a cell: enough against stairs, and little volume lost."""
@@ -31,10 +25,6 @@ MARGIN = 4
 
 LEAST_VOLUME = 0.6
 """Share of its volume that a segment keeps at least; what keeps less is too thin for the grid."""
-
-
-WIDEST = 8
-"""Bytes of a label in memory, and of the widest one in a file."""
 
 LEAST_MARGIN = 1e-3
 """Least distance of a margin from zero: a tie between two segments at a node would make faces without area there."""
@@ -55,11 +45,6 @@ class LabelVolume:
     names: Mapping[int, str]
 
 
-def is_volume(path: Path) -> bool:
-    """Whether a file's name is that of a label volume."""
-    return path.name.lower().endswith(VOLUME_SUFFIXES)
-
-
 def read_label_volume(path: Path) -> LabelVolume:
     """Label volume from a NIfTI or NRRD file of whole numbers.
 
@@ -68,80 +53,24 @@ def read_label_volume(path: Path) -> LabelVolume:
     """
     if path.exists() and not is_volume(path):
         raise ValueError(f"{path} is no label volume; its name must end in {', '.join(VOLUME_SUFFIXES)}: convert it")
-    nifti = ".nii" in path.suffixes
-    library: Any = _library("nibabel" if nifti else "nrrd")
-    with readable(path, "label volume"):
-        values, transform, names = _nifti(library, path) if nifti else _nrrd(library, path)
+    volume = read_volume(path, "label volume")
+    values = volume.values
     if values.ndim != 3:
         raise ValueError(f"{path} has {values.ndim} dimensions; a label volume has 3: export one label map, not layers")
     with quiet():  # what becomes of NaN and of numbers beyond all is not what it was
+        if (volume.slope, volume.intercept) != (1.0, 0.0):
+            values = volume.slope * values + volume.intercept
         labels = np.rint(values).astype(np.int64)
     if not (np.array_equal(labels, values) and labels.min(initial=0) >= 0):
         raise ValueError(f"{path} holds values that are no labels; they must be whole numbers from 0: threshold it")
-    return LabelVolume(labels, transform, names)
+    return LabelVolume(labels, volume.T_world_index, _slicer_names(segment_fields(volume.header)))
 
 
-def _library(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError:
-        raise ImportError(f"{name} is needed to read label volumes: pip install 'mereo[medical]'") from None
-
-
-Content = tuple[np.ndarray, Float[np.ndarray, "4 4"], dict[int, str]]
-
-
-def _nifti(nibabel: Any, path: Path) -> Content:
-    try:
-        image = nibabel.load(path)
-    except MemoryError:  # nibabel asks for what an extension states, before it is read
-        raise ValueError("an extension of its header is larger than the memory") from None
-    _check_voxels(path, image.shape)
-    values = np.asarray(image.dataobj)
-    return values[..., 0] if values.ndim == 4 and values.shape[3] == 1 else values, np.asarray(image.affine, float), {}
-
-
-def _nrrd(nrrd: Any, path: Path) -> Content:
-    with path.open("rb") as file:
-        header, start = nrrd.read_header(file), file.tell()
-    _check_voxels(path, header["sizes"])
-    detached = header.get("data file", header.get("datafile"))
-    data, start = (path, start) if detached is None else (path.parent / detached, 0)
-    # pynrrd unpacks all there is, whatever the header says
-    if header["encoding"] in ENGINES and not header.get("line skip", header.get("lineskip")) and data.is_file():
-        check_stream(data, start, header["encoding"], math.prod(map(int, header["sizes"])) * WIDEST)
-    values, header = nrrd.read(str(path))
-    transform = np.eye(4)
-    directions = header.get("space directions")
-    if directions is not None:
-        transform[:3, :3] = np.asarray(directions, dtype=float)[-3:].T  # a row for each axis of the array
-    elif "spacings" in header:
-        transform[:3, :3] = np.diag(header["spacings"][-3:])
-    transform[:3, 3] = header.get("space origin", np.zeros(3))
-    return values, _to_ras(str(header.get("space", ""))) @ transform, _slicer_names(header)
-
-
-def _check_voxels(path: Path, sizes: Iterable[Any]) -> None:
-    """Refuse the sizes in a header that are none, or too large as the 64-bit numbers that labels become."""
-    sides = [int(side) for side in sizes]
-    if min(sides, default=0) < 1:
-        raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
-    check_bytes(path, math.prod(sides) * WIDEST)
-
-
-def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:
-    """Transform to RAS from an anatomical frame, such as left-posterior-superior or LPS; others stay as they are."""
-    words = space.lower().split("-") if "-" in space else list(space.lower())
-    words = [{"l": "left", "r": "right", "p": "posterior", "a": "anterior", "i": "inferior"}.get(w, w) for w in words]
-    negative = [word in ("left", "posterior", "inferior") for word in words[:3]]
-    return np.diag([*(-1.0 if flip else 1.0 for flip in negative), *[1.0] * (4 - len(negative))])
-
-
-def _slicer_names(header: Mapping[str, Any]) -> dict[int, str]:
+def _slicer_names(header: Mapping[str, str]) -> dict[int, str]:
     found = {}
     for key, value in header.items():
         if match := re.fullmatch(r"Segment(\d+)_LabelValue", key):
-            found[int(value)] = str(header.get(f"Segment{match[1]}_Name", f"label_{value}"))
+            found[int(value)] = header.get(f"Segment{match[1]}_Name", f"label_{value}")
     return found
 
 

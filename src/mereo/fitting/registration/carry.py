@@ -1,6 +1,8 @@
 """Carry: what is defined in the rest model comes to where the object is, its inside included.
 
 Attachment -place-> Placed (rest model, scene units) -carry-> Carried (frame and unit of a registration)
+
+Volumes are resampled by ``carry_volumes``.
 """
 
 from collections.abc import Sequence
@@ -9,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from mereo.fitting.registration.carry_volumes import MARGIN, Interpolation, check_overlap, resampled
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.mesh import SegmentedMesh
@@ -16,8 +19,9 @@ from mereo.geometry.procrustes import best_rotations
 from mereo.geometry.solids import Solids
 from mereo.geometry.subdivision import split_long_edges
 from mereo.geometry.transforms import transform_points
-from mereo.io.attachments import Attachment, Content, Surfaces
+from mereo.io.attachments import Attachment, Content, Placeable, Surfaces
 from mereo.io.config import CarryFrame
+from mereo.io.volume_files import Volume
 from mereo.scenes.random_states import with_frame
 from mereo.scenes.source_frame import SourceFrame
 from mereo.scenes.statistical_model import StatisticalModel
@@ -42,7 +46,7 @@ class Placed:
     Attributes:
         name: of its file.
         content: rest pose, scene units; surfaces with edges short enough to bend.
-        shares: of each segment in the motion of each point; rows sum to one.
+        shares: of each segment in the motion of each point; rows sum to one. A volume has no points.
         distance: of each point from the nearest segment, 0 inside; scene units.
     """
 
@@ -68,10 +72,59 @@ class Carried:
     inside: int
     farthest: float
 
+    @property
+    def count(self) -> int:
+        """Number of its points; of a volume, of its voxels."""
+        return self.content.values.size if isinstance(self.content, Volume) else len(self.content.points)
+
+    @property
+    def told(self) -> str:
+        """Phrase on what was carried."""
+        outside = self.count - self.inside
+        away = f"{outside} of them outside, up to {self.farthest:.4g} away" if outside else "all inside"
+        return f"carried {self.name}: {self.count} points, {away}"
+
     def facts(self) -> dict[str, object]:
         """Facts for a result's summary."""
-        count = len(self.content.points)
-        return {"file": self.name, "points": count, "inside": self.inside, "farthest": self.farthest}
+        return {"file": self.name, "points": self.count, "inside": self.inside, "farthest": self.farthest}
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedVolume(Carried):
+    """Volume where the object is.
+
+    Attributes:
+        content: the volume.
+        inside: number of its voxels that lie inside a segment.
+        farthest: width of what is carried around the object, in the registration's unit.
+        within: how many of the voxels inside were within the file's voxels at rest.
+        interpolation: "linear" or "nearest".
+    """
+
+    content: Volume
+    within: int
+    interpolation: Interpolation
+
+    @property
+    def told(self) -> str:
+        """Phrase on what was carried."""
+        sides = " x ".join(map(str, self.content.values.shape))
+        beyond = self.inside - self.within
+        where = f", {beyond} of them beyond the file's" if beyond else ""
+        apart = f"{self.content.spacing.min():.4g} apart"
+        return f"carried {self.name}: {sides} voxels {apart} ({self.interpolation}), {self.inside} inside{where}"
+
+    def facts(self) -> dict[str, object]:
+        """Facts for a result's summary."""
+        return {
+            "file": self.name,
+            "voxels": list(self.content.values.shape),
+            "spacing": float(self.content.spacing.min()),
+            "inside": self.inside,
+            "within": self.within,
+            "interpolation": self.interpolation,
+            "farthest": self.farthest,
+        }
 
 
 def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryFrame = "source") -> tuple[Placed, ...]:
@@ -83,16 +136,29 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
         frame: "source" is that of the object's own files, "scene" that of its scene.
 
     Raises ``ValueError`` where the frame of the object's files is not known, and for an attachment that cannot belong
-    to the object, because most of its points are farther from it than it is long.
+    to the object: most of its points are farther from it than it is long, or none of its voxels is in it.
     """
     T_scene_file = np.eye(4) if frame == "scene" else _source_frame(registrar).T_scene_source
     solids = Solids(registrar.model.rest)
     return tuple(_placed(one, T_scene_file, registrar.model, solids) for one in attachments)
 
 
-def carry(placed: Placed, registration: Registration) -> Carried:
-    """An attachment where the registered object is: points move along with their segments, poses turn as they do."""
+def carry(placed: Placed, registration: Registration, interpolation: Interpolation = "auto") -> Carried:
+    """An attachment where the registered object is: points move along with their segments, poses turn as they do.
+
+    A volume is resampled around the object, with this interpolation (``carry_volumes.resampled``).
+    """
     content = placed.content
+    if isinstance(content, Volume):
+        found, around = resampled(content, registration, interpolation), MARGIN * registration.model.half
+        return CarriedVolume(
+            placed.name,
+            found.volume,
+            found.inside,
+            around * registration.scene_unit,
+            found.within,
+            found.interpolation,
+        )
     points = moved(registration, content.points, placed.shares)
     rotations = None
     if content.rotations is not None:
@@ -149,6 +215,11 @@ def _source_frame(registrar: Registrar) -> SourceFrame:
 def _placed(
     attachment: Attachment, T_scene_file: Float[np.ndarray, "4 4"], model: StatisticalModel, solids: Solids
 ) -> Placed:
+    if isinstance(attachment.content, Volume):
+        volume = attachment.content
+        inside = replace(volume, T_world_index=T_scene_file @ volume.T_world_index)
+        check_overlap(attachment.name, inside, T_scene_file, model, solids)
+        return Placed(attachment.name, inside, np.zeros((0, solids.count)), np.zeros(0))
     content = _transformed(attachment.content, T_scene_file)
     _check_near(attachment.name, _shares(solids, content.points)[1], 2 * model.half)
     if isinstance(content, Surfaces):
@@ -156,7 +227,7 @@ def _placed(
     return Placed(attachment.name, content, *_shares(solids, content.points))
 
 
-def _transformed(content: Content, T: Float[np.ndarray, "4 4"]) -> Content:
+def _transformed(content: Placeable, T: Float[np.ndarray, "4 4"]) -> Placeable:
     """Content after a similarity, which turns orientations and does not scale them."""
     turn = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
     rotations = None if content.rotations is None else turn @ content.rotations

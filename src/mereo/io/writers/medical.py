@@ -102,11 +102,11 @@ def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Co
         unit_m: metres per unit of the input.
     """
     scale = MM_PER_M * unit_m
-    directions = " ".join(_vector(row) for row in np.diag(grid.spacing * scale))
+    directions = " ".join(vector(row) for row in np.diag(grid.spacing * scale))
     header = SLICER_HEADER.format(
         sizes=" ".join(str(n) for n in grid.labels.shape),
         directions=directions,
-        origin=_vector(grid.origin * scale),
+        origin=vector(grid.origin * scale),
         segments="".join(_segment_fields(grid, index, color) for index, color in enumerate(colors)),
     )
     with atomic_file(path) as partial:
@@ -129,5 +129,6 @@ def _segment_fields(grid: LabelGrid, index: int, color: Color) -> str:
     return "".join(f"Segment{index}_{key}:={value}\n" for key, value in values.items())
 
 
-def _vector(values: Float[np.ndarray, "3"]) -> str:
+def vector(values: Float[np.ndarray, "3"]) -> str:
+    """A vector as NRRD writes it."""
     return f"({','.join(repr(float(value)) for value in values)})"
