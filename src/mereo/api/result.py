@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from mereo.api.carry import carry_to
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.mesh import Segment
 from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.atomic_files import atomic_file
-from mereo.io.config import DEFAULT_FILES, FilesConfig, Format
+from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
 from mereo.io.output_folders import new_directory
 from mereo.io.ros_recordings import is_recording
 from mereo.io.writers.formats import chosen_formats
@@ -155,6 +156,11 @@ class Result(Answer):
             return None
         source = self.registered.model.source_frame
         return self.registered.scene_unit * (1.0 if source is None else source.scale)
+
+    def carry(self, what: Any, files: CarryFrame = "source") -> Any:
+        """Carry points, a mesh or a file of the object's own frame and unit to where it is now (``carry_to``)."""
+        with python_words():
+            return carry_to(self, what, files)
 
     def to_trimesh(self) -> "trimesh.Scene":
         """Scene of trimesh with a mesh for each segment that was found, by its name and in its colour."""

@@ -16,6 +16,8 @@ ARGUMENTS = {
     "--drop-invalid": "drop_invalid=True",
     "--keep-all": "isolation=IsolationConfig(keep_all=True)",
     "--frame": "axes",
+    "--carry-frame": "files",
+    "--carry": "carry",
     **{f"--method {name}": f'method="{name}"' for name in get_args(AnswerMethod)},
     "--box": "isolation=IsolationConfig(box=...)",
     "--depth-range": "isolation=IsolationConfig(depth_range=...)",
