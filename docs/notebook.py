@@ -6,6 +6,7 @@ are of, so that a changed cell with old outputs is found without running anythin
 
 import hashlib
 import json
+import os
 import re
 import sys
 import tempfile
@@ -53,7 +54,8 @@ def executed(notebook: Notebook) -> Notebook:
             record_timing=False,
             resources={"metadata": {"path": folder}},
         )
-        client.execute()
+        # tqdm, of which torch makes use where it is installed, asks for widgets
+        client.execute(env={**os.environ, "PYTHONWARNINGS": "ignore:IProgress not found"})
     result: Notebook = json.loads(nbformat.writes(made))
     # what a kernel says of itself differs from one machine to the next
     result["metadata"] = {
