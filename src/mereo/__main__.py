@@ -17,7 +17,7 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo.api.words import SPEAKS_OPTIONS
+from mereo.api.words import option_words
 from mereo.cli import commands, dataset_commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
 from mereo.cli.calibrate import CalibrateCommand
 from mereo.cli.config_file import GivenOptions, defaults_from, read_options
@@ -77,9 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
     warnings.formatwarning = _warning_line
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal that lacks a character gets another one, and no error
         sys.stdout.reconfigure(errors="replace")
-    speaking = SPEAKS_OPTIONS.set(True)
     try:
-        with stop_signals():
+        with option_words(), stop_signals():
             watch = BEGUN if time.monotonic() - BEGUN.at_s < BRIEF_S else FreeCores()
             command = parse(arguments)
             if threads := getattr(command, "threads", 0):
@@ -102,8 +101,6 @@ def main(arguments: list[str] | None = None) -> int:
         if is_foreseen(error):
             return _stop(f"mereo: error: {words_of(error)}", USER_ERROR)
         return _stop(f"mereo: error: {sentence(error, arguments, TRACEBACK_VARIABLE)}", FAULT)
-    finally:
-        SPEAKS_OPTIONS.reset(speaking)
     return 0
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.mesh import Segment
 from mereo.geometry.scanner_axes import camera_axes
@@ -160,6 +161,7 @@ class Result(Answer):
             rest = transform_points(np.linalg.inv(model.source_frame.T_scene_source), rest)
         return fit_rigid(scale * rest[rows], registered.material[rows])
 
+    @python_words()
     def save(
         self,
         path: str | Path | None = None,
@@ -195,6 +197,7 @@ class Result(Answer):
                 write_answer_file(partial, suffix, self, FilesConfig((), millimetres))
         return path
 
+    @python_words()
     def show(self, *, port: int | None = None, host: str = "127.0.0.1", block: bool | None = None) -> "OpenPage":
         """Open the viewer on this result, as `mereo view` does, and print its address.
 

@@ -18,6 +18,7 @@ from typing import Any, cast
 from mereo.api.objects import Object, load_object
 from mereo.api.reconstruct import reconstruct
 from mereo.api.result import Result
+from mereo.api.words import option_words
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar
 from mereo.io.atomic_files import to_json
@@ -180,7 +181,7 @@ class Answerer:
 
     def _answer(self, begun: Begun) -> Reply:
         request, loaded = begun.request, self.loaded[begun.request.weights]
-        with taken_warnings(begun.told, request):
+        with option_words(), taken_warnings(begun.told, request):
             found = reconstruct(
                 begun.observation,
                 loaded.object,
