@@ -26,14 +26,16 @@ import numpy as np
 
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
+from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking.config import TrackConfig
-from mereo.fitting.tracking.tracker import Followed, Tracker
+from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
 from mereo.models.weights import load_model
+from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.synthesis.config import SENSORS, Occluder
@@ -51,7 +53,7 @@ Frames = list[tuple[float, PointCloud]]
 class Run:
     """Tracked answers to frames, and what they took."""
 
-    answers: list[Followed]
+    answers: list[Answer]
     seconds: np.ndarray
     busy_s: np.ndarray
 
@@ -60,7 +62,7 @@ class Run:
         tracker, answers, seconds, busy_s = Tracker(registrar, config), [], [], []
         for time_s, cloud in frames:
             started, worked = time.perf_counter(), time.process_time()
-            answers.append(tracker.follow(cloud, time_s, scene_unit=1.0))
+            answers.append(tracker.follow(observe(cloud), time_s, scene_unit=1.0))
             seconds.append(time.perf_counter() - started)
             busy_s.append(time.process_time() - worked)
         return cls(answers, np.array(seconds), np.array(busy_s))

@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from mereo.fitting.registration.readings import fitted_frame
 
 from mereo.evaluation.calibrate import VIEWS, calibrate
 from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
@@ -36,15 +35,19 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.probability_scaling import ece_of
 from mereo.evaluation.reliability import AskedCells
 from mereo.evaluation.scoring import trained_scene
-from mereo.fitting.registration.recognition import Recognition, recognized
+from mereo.fitting.config import AnswerMethod
+from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.recognition import Recognition
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.io.atomic_files import atomic_file
 from mereo.models.model import Model
 from mereo.models.weights import load_model
+from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
+from mereo.scenes.source_frame import SourceFrame
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.shards import generate
 from mereo.training.config import PRESETS
@@ -86,10 +89,15 @@ def auroc(own: Sequence[float], strange: Sequence[float]) -> float:
     return float((ahead > 0).mean() + 0.5 * (ahead == 0).mean())
 
 
-def said_of(cloud: PointCloud, model: Model, registrar: Registrar, stated: float | None = 1.0) -> Recognition:
-    """What `mereo.answer` says of a cloud of which a scene unit is stated to be so long."""
-    frame = fitted_frame(cloud, model, registrar, stated_unit=stated)
-    return recognized(frame, None if frame.modes is None else registrar.finish(frame.modes), model, stated)
+def said_of(cloud: PointCloud, model: Model, registrar: Registrar, unit_m: float | None = 1.0) -> Recognition:
+    """What `mereo.reconstruct` says of a cloud of this unit; a scene unit is a metre (``registrar_of``)."""
+    return answer_frame(observe(cloud, unit_m=unit_m), model, registrar).recognition
+
+
+def registrar_of(model: Model, method: AnswerMethod, scene: Scene) -> Registrar:
+    """Registrar of an object whose scene unit is said to be a metre, so that the unit of its views is known."""
+    own = Registrar.of(model, method, scene)
+    return replace(own, model=replace(own.model, source_frame=SourceFrame(np.eye(4), 1.0)))
 
 
 def barely_trained(scene: Scene, folder: Path) -> Model:
@@ -106,7 +114,7 @@ def measured(name: str, arguments: argparse.Namespace) -> Found:
     scene = load_scene(arguments.scene or trained_scene(model))
     if model.calibration is None:
         model = replace(model, calibration=calibrate(model, scene, views=arguments.calibration_views, quiet=False))
-    registrar = Registrar.of(model, arguments.fit, scene)
+    registrar, unsized = registrar_of(model, arguments.method, scene), Registrar.of(model, arguments.method, scene)
     found, seed = Found(), arguments.seed
     views = list(own_views(scene, 2 * arguments.views, seed))
     clean = [view for view in views if view.clean]
@@ -116,12 +124,12 @@ def measured(name: str, arguments: argparse.Namespace) -> Found:
         wrong = PointCloud(view.seen.points * FACTORS[index % len(FACTORS)])
         found.strange["wrong unit"].append(said_of(wrong, model, registrar))
     for strange in strange_frames(scene, other_objects(scene), arguments.strangers, seed):
-        found.strange[strange.kind].append(said_of(strange.cloud, model, registrar, stated=None))
+        found.strange[strange.kind].append(said_of(strange.cloud, model, unsized, unit_m=None))
     for strange in frames_beyond(scene, arguments.views, seed):
         found.strange[strange.kind].append(said_of(strange.cloud, model, registrar))
     with TemporaryDirectory() as folder:
         poor = barely_trained(scene, Path(folder))
-        of_poor = Registrar.of(poor, "modes", scene)
+        of_poor = registrar_of(poor, "modes", scene)
         found.strange["ten steps"] = [said_of(view.seen, poor, of_poor) for view in clean]
     found.ece = calibration_error(model, clean)
     return found

@@ -28,12 +28,12 @@ from typing import Any
 
 import numpy as np
 
-from mereo.evaluation.sample_views import load_frame
+from mereo.api.frames import load_frame
 from mereo.io.atomic_files import check_file_place, write_json
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
-from mereo.serving.messages import JSON, Begin, Finish, FrameRequest, Reply, Served, Setup
+from mereo.serving.messages import JSON, FrameRequest, Served, Setup
 from mereo.serving.workers import WorkerProcess
 
 HEADERS = {"Content-Type": "application/x-npy"}
@@ -69,11 +69,11 @@ def figures(content: bytes) -> dict[str, Any]:
 
 
 def one_after_the_other(
-    frames: Sequence[Frame], fit: Any, resolution: int, folder: Path
+    frames: Sequence[Frame], method: Any, resolution: int, folder: Path
 ) -> tuple[list[Frame], list[tuple[float, float]]]:
     """The frames with their answers, and seconds and processor seconds of each, in a process like the server's."""
     names = tuple(dict.fromkeys(frame.weights for frame in frames))
-    setup = Setup(tuple(Served(name, name) for name in names), fit, InferenceConfig(precision="float32"))
+    setup = Setup(tuple(Served(name, name) for name in names), method, InferenceConfig(precision="float32"))
     worker, answered, seconds = WorkerProcess(setup), list[Frame](), list[tuple[float, float]]()
     worker.wait_until_ready()
     try:
@@ -82,8 +82,7 @@ def one_after_the_other(
             reading, isolation = InputConfig(), IsolationConfig()
             request = FrameRequest(frame.weights, folder, "frame.npy", reading, isolation, resolution, JSON)
             start, had = time.perf_counter(), processor_s(worker.process.pid)
-            refused = worker.ask(Begin((request,)))[0]
-            reply: Reply = refused or worker.ask(Finish(0))
+            reply = worker.ask(request)
             seconds.append((time.perf_counter() - start, processor_s(worker.process.pid) - had))
             assert reply.status == 200, reply.body
             answered.append(Frame(frame.weights, frame.content, figures(reply.body)))
@@ -194,10 +193,10 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         frames = frames_of(options.weights, options.frames, folder)
-        answered, alone = one_after_the_other(frames, options.fit, options.resolution, folder)
+        answered, alone = one_after_the_other(frames, options.method, options.resolution, folder)
         alone_s, alone_processor_s = map(np.array, zip(*alone, strict=True))
         weights = [word for one in options.weights for word in ("--weights", one)]
-        more = ("--method", options.fit, "--workers", str(options.workers), "--batch", str(options.batch))
+        more = ("--method", options.method, "--workers", str(options.workers))
         memory: list[tuple[float, float]] = []
         with served(*weights, *more, "--resolution", str(options.resolution), scratch=folder) as (process, port):
             address = "/v1/{weights}/reconstruct"
@@ -265,10 +264,9 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=2.0)
     parser.add_argument("--weights", nargs="+", default=["bunny", "liver"], help="shipped ones that come with a frame")
     parser.add_argument("--frames", type=int, default=12, help="different ones of each weights")
-    parser.add_argument("--method", choices=("off", "auto", "modes", "full"), default="modes")
+    parser.add_argument("--method", choices=("network", "auto", "modes", "full"), default="modes")
     parser.add_argument("--resolution", type=int, default=128)
     parser.add_argument("--workers", type=int, default=0)
-    parser.add_argument("--batch", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("out/serving"), help="folder for serving.json")
     parser.add_argument("--force", action="store_true", help="replace that file")
     options = parser.parse_args()

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
+from mereo.api.reconstruct import reconstruct
 from mereo.deformation.maps import turn
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.manifold import mesh_of, solid_of
@@ -26,7 +27,6 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model
-from mereo.reconstruction.pipeline import reconstruct
 from mereo.scenes.draw_recorder import Recorder
 from mereo.scenes.parameters import Played, play, random_state, turned
 from mereo.scenes.registry import load_scene
@@ -224,7 +224,7 @@ class Loop:
 
     @cache  # noqa: B019
     def surfaces(self, turn: float) -> SegmentedMesh:
-        return reconstruct(self.moment(turn).depth.to_points(), self.model, RESOLUTION).surfaces
+        return reconstruct(self.moment(turn).depth, self.model, "network", resolution=RESOLUTION).surfaces
 
     def inferred(self, time: float) -> Picture:
         """The segments, up to the depth to which they have filled the cloud, and the rest of the cloud."""

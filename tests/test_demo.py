@@ -8,8 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mereo.api.frames import load_frame
+from mereo.api.objects import Object
 from mereo.cli import demo
-from mereo.evaluation.sample_views import load_view
+from mereo.evaluation.sample_views import GUESSED_UNIT_M
 from mereo.fitting.registration.state import load_state
 from mereo.fitting.registration.state_file import STATE
 from mereo.geometry.solids import Solids
@@ -40,24 +42,24 @@ def test_weights_with_a_statistical_model_show_the_fit_and_write_it(
 ) -> None:
     assert rope.statistical_model is not None
     modes = QuickRegistrar(rope, rope.statistical_model)  # the scene's draws would take long
-    monkeypatch.setattr(demo, "load_model", lambda _: rope)
-    monkeypatch.setattr(demo, "registrar_for", lambda *_: modes)
+    monkeypatch.setattr(demo, "load_object", lambda _: Object(rope, None, {"auto": modes}))
     demo.main(tmp_path)
     out = capsys.readouterr().out
     (scores,) = (line.split("│")[2:4] for line in out.splitlines() if "(mIoU)" in line)
     network, fit = (float(score) for score in scores)
     assert fit > network and "network" in out and "fit" in out
     assert f"mereo view {tmp_path / 'rope'}" in out
-    assert "the registered model explains" in out and len(shown) == 1
+    assert "the registered model explains" in out
+    assert len(shown) == 2, "each answer is timed from the frame on"
     again = load_state(tmp_path / "rope", rope.statistical_model)
-    seen = load_view("rope").depth.to_points().points
-    assert np.median(Solids(again.mesh).nearest(seen).distance) < 0.3
+    seen = load_frame("rope").cloud.points
+    assert np.median(Solids(again.mesh).nearest(seen).distance) < 0.3 * GUESSED_UNIT_M
 
 
 def test_weights_without_one_show_the_network_alone_and_say_so(
     shown: list[EncodedCloud], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(demo, "load_model", lambda name: replace(load_model(name), statistical_model=None))
+    monkeypatch.setattr(demo, "load_object", lambda name: Object(replace(load_model(name), statistical_model=None)))
     demo.main(tmp_path)
     out = capsys.readouterr().out
     assert out.count("the network's answer: the weights 'rope' carry no statistical model") == 1
@@ -70,13 +72,12 @@ def test_the_result_of_an_earlier_version_is_kept_and_stops_no_demo(
 ) -> None:
     """It has no list of its files, so nobody can tell it from somebody's own."""
 
-    def show(_case: object, _model: object, folder: Path, _console: object) -> None:
+    def show(_case: object, folder: Path, _console: object) -> None:
         with new_directory(folder, force=True) as directory:
             (directory / "summary.json").write_text("new")
 
-    case = SimpleNamespace(name="rope", weights="rope")
+    case = SimpleNamespace(name="rope")
     monkeypatch.setattr(demo, "_inputs", lambda: iter([lambda: case]))
-    monkeypatch.setattr(demo, "load_model", lambda _: None)
     monkeypatch.setattr(demo, "_show", show)
     (tmp_path / "rope").mkdir()
     (tmp_path / "rope/summary.json").write_text("old")

@@ -4,19 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mereo.visualization.answering import answer
+from answers import answer_to, reconstruct
 
-from mereo.cli import demo
+import mereo
 from mereo.evaluation.sample_views import load_view
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import EncodedCloud, Model
 from mereo.models.weights import load_model
-from mereo.reconstruction.pipeline import reconstruct
 from mereo.scenes.parameters import random_state
 from mereo.scenes.registry import load_scene
-from mereo.visualization.result_files import write_reconstruction
 from mereo.visualization.vertex_colors import confidence
 from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.probe import Inspection
@@ -47,30 +45,17 @@ def test_a_trial_of_the_laboratory(encoded: list[np.ndarray]) -> None:
 
 def test_a_result_that_is_written(encoded: list[np.ndarray], tmp_path: Path) -> None:
     cloud = load_view("rope").depth.to_points()
-    write_reconstruction(reconstruct(cloud, load_model("rope"), 16), cloud, tmp_path / "result")
+    mereo.reconstruct(cloud, load_model("rope"), "network", resolution=16).save(tmp_path / "result")
     assert len(encoded) == 1
 
 
 def test_a_page_of_a_frame(encoded: list[np.ndarray]) -> None:
     cloud = load_view("rope").depth.to_points()
     model = load_model("rope")
-    inspection = Inspection.of_answer(answer(cloud, model, "off", 16), model, None)
+    inspection = Inspection.of_answer(answer_to(cloud, model, None, 16))
     inspection.ask(cloud.points[:5])
     confidence(inspection.surfaces, inspection.network)
     assert len(encoded) == 1
-
-
-@pytest.mark.slow
-def test_a_case_of_the_demo(
-    encoded: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    frame = load_view("rope")
-    case = demo.Case("rope", "a rope", "rope", frame.depth.to_points(), "camera", frame.truth)
-    monkeypatch.setattr(demo, "_inputs", lambda: iter([lambda: case]))
-    monkeypatch.setattr(demo, "RESOLUTION", 16)
-    demo.main(tmp_path)
-    assert len(encoded) == 1
-    assert "IoU" in capsys.readouterr().out
 
 
 def test_the_code_answers_in_the_camera_frame() -> None:

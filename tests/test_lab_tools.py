@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import until
-from mereo.visualization.answering import answer
 from PIL import Image
 from shapes import ball, box
 from toy_scene import toy_scene
 
+import mereo
 from mereo.fitting.registration.state_file import STATE
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
@@ -158,7 +158,7 @@ def test_a_saved_result_is_what_reconstruct_writes(tmp_path: Path) -> None:
     result = laboratory.answer(view, 16)
     folder = unpacked(result_archive(scene, result), tmp_path)
     assert folder.name == "rope-result" and not strangers(folder)
-    plain = answer(view.depth, replace(model, statistical_model=None), "off", 16)
+    plain = mereo.reconstruct(view.depth, replace(model, statistical_model=None), "network", resolution=16)
     plain.save(tmp_path / "plain")
     names = {file.name for file in (tmp_path / "plain").iterdir()}
     assert {file.name for file in folder.iterdir()} == names and STATE not in names

@@ -15,6 +15,7 @@ from scene_files import write_bar
 
 from mereo.evaluation import calibrate as calibration
 from mereo.fitting.draws.playback import DrawnStates
+from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.learning import learn as learning
 from mereo.learning import outcome, probe, schedule
@@ -147,13 +148,13 @@ def test_the_example_frame_is_as_long_as_the_object(tmp_path: Path) -> None:
     scene = load_scene(write_bar(tmp_path))
     text = write_example_frame(scene, tmp_path / "frame.ply")
     assert "in metres" in text and b"comment unit: metres" in (tmp_path / "frame.ply").read_bytes()
-    seen = find_object(read_frame(tmp_path / "frame.ply"), IsolationConfig())
+    seen = find_object(read_frame(tmp_path / "frame.ply", InputConfig(unit_m=1.0)), IsolationConfig())
     assert 0.01 < max(seen.size_m) < 0.06  # 40 mm at rest
     assert size_warning(seen, {"visible_m": [0.02, 0.05]}) is None
-    # in scene units, as the documented first try once had it, the same frame is called too long
+    # in scene units that are called metres, as the documented first try once had it, the same frame is too long
     cloud = seen.cloud.points / scene.unit_m
     np.save(tmp_path / "frame.npy", cloud)
-    far = find_object(read_frame(tmp_path / "frame.npy"), IsolationConfig())
+    far = find_object(read_frame(tmp_path / "frame.npy", InputConfig(unit_m=1.0)), IsolationConfig())
     warning = size_warning(far, {"visible_m": [0.02, 0.05]})
     assert warning is not None and "its unit is wrong" in warning
 

@@ -10,6 +10,7 @@ import pytest
 import safetensors.torch
 from analytic import AnalyticModel, logits_of, untrained
 from analytic import ball as distance_to_ball
+from answers import answer_to
 from overlapping import check_overlap
 from PIL import Image
 from safetensors import safe_open
@@ -18,14 +19,15 @@ from test_report import page_data
 from test_training import SMALL
 from toy_data import write_toy_dataset
 
+from mereo.fitting.registration.answer import Answer
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.solids import Solids
 from mereo.io.writers.glb import OUTER_OPACITY
 from mereo.models.weights import load_model, save_model
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.reconstruction.pipeline import Reconstruction
 from mereo.training.trainer import train
 from mereo.visualization.previews import render_cloud_and_segments
-from mereo.visualization.result_files import write_reconstruction
+from mereo.visualization.result_files import write_answer
 
 NESTED = (("core", "organ"),)
 CENTER, RADIUS = (0.0, 0.0, 5.0), 1.0
@@ -36,12 +38,17 @@ CLOUD = front(CENTER, RADIUS, -1.0)
 
 
 @pytest.fixture(scope="module")
-def result() -> Reconstruction:
+def answer() -> Answer:
     core, organ = distance_to_ball(CORE_CENTER, CORE_RADIUS), distance_to_ball(CENTER, RADIUS)
     base = untrained(("core", "organ"))
     field = logits_of(core, lambda points: np.maximum(organ(points), -core(points)), sharpness=4.0)
     model = AnalyticModel(base.network, base.names, base.colors, nested=NESTED, field=field)
-    return reconstruct(CLOUD, model, resolution=40)
+    return answer_to(CLOUD, model, resolution=40)
+
+
+@pytest.fixture(scope="module")
+def result(answer: Answer) -> Reconstruction:
+    return answer.reconstruction
 
 
 def test_a_reconstruction_is_nested_as_the_model_is(result: Reconstruction) -> None:
@@ -61,8 +68,11 @@ def test_the_inner_segment_owns_its_voxels(result: Reconstruction) -> None:
     assert np.array_equal(solids.label(places), np.ones(len(places), dtype=np.uint8))
 
 
-def test_files_show_the_inner_segment_through_the_outer_one(result: Reconstruction, tmp_path: Path) -> None:
-    write_reconstruction(result, PointCloud(CLOUD), tmp_path / "out")
+def test_files_show_the_inner_segment_through_the_outer_one(
+    answer: Answer, result: Reconstruction, tmp_path: Path
+) -> None:
+    (tmp_path / "out").mkdir()
+    write_answer(tmp_path / "out", answer)
     glb = (tmp_path / "out" / "segments.glb").read_bytes()
     document = json.loads(glb[20 : 20 + struct.unpack("<I", glb[12:16])[0]])
     inner, outer = document["materials"]

@@ -118,10 +118,12 @@ def test_the_unit_of_a_cloud(tmp_path: Path) -> None:
 
 def test_size_against_training(tmp_path: Path) -> None:
     np.save(tmp_path / "c.npy", np.random.default_rng(0).uniform((0, 0, 1), (0.1, 0.05, 1.1), (400, 3)))
-    seen = find_object(read_frame(tmp_path / "c.npy"))
+    seen = find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=1.0)))
+    unknown = find_object(read_frame(tmp_path / "c.npy"))
     for visible_m, fits in (([0.08, 0.2], True), ([0.15, 0.3], True), ([0.25, 0.5], False), ([0.01, 0.04], False)):
         text = size_warning(seen, {"visible_m": visible_m})
         assert (text is None) == fits, visible_m
+        assert size_warning(unknown, {"visible_m": visible_m}) is None, "what has no unit may be of any size"
         assert fits or (text and "m in training: other things are in the cloud" in text and "--unit-m 0.001" in text)
     assert size_warning(seen, {"scene": "bunny"}) is None and size_warning(seen, {"visible_m": None}) is None
 
@@ -130,7 +132,7 @@ def test_shipped_bunny_weights_know_the_bunny_size(tmp_path: Path) -> None:
     """The Stanford Bunny is 15 cm long; the same cloud read as millimetres cannot be it."""
     np.save(tmp_path / "c.npy", np.random.default_rng(0).uniform((0, 0, 1), (0.15, 0.15, 1.1), (400, 3)))
     provenance = load_model("bunny").provenance
-    assert size_warning(find_object(read_frame(tmp_path / "c.npy")), provenance) is None
+    assert size_warning(find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=1.0))), provenance) is None
     text = size_warning(find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=0.001))), provenance)
     assert text is not None and "m long, but 0.12 to 0.254 m in training" in text
 

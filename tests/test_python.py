@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 from analytic import AnalyticModel, ball, logits_of, untrained
-from mereo.visualization.result import SINGLE, Result
 from PIL import Image
 from toy_scene import toy_scene
 
 import mereo
+from mereo.api import reconstruct
+from mereo.api.result import SINGLE, Result
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.evaluation.results import Evaluation
 from mereo.fitting.registration.registration import Located
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.output_folders import MARKER
-from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
 from mereo.visualization.units import Unit
@@ -57,7 +57,7 @@ def seen() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def result() -> Result:
-    return mereo.answer(seen(), MODEL, resolution=24, unit_m=1.0, label_points=True)
+    return mereo.reconstruct(seen(), MODEL, resolution=24, unit_m=1.0, label_points=True)
 
 
 # --- saving -----------------------------------------------------------------------------------------------------------
@@ -79,9 +79,9 @@ def contents(folder: Path) -> dict[str, Any]:
 
 def test_a_result_is_saved_as_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
-    monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: MODEL)
+    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: MODEL)
     reconstruct_file(tmp_path / "cloud.npy", tmp_path / "command", FrameJob("any", 24))
-    found = mereo.answer(tmp_path / "cloud.npy", MODEL, resolution=24)
+    found = mereo.reconstruct(tmp_path / "cloud.npy", MODEL, resolution=24)
     assert found.save(tmp_path / "python") == tmp_path / "python"
     ours, theirs = contents(tmp_path / "python"), contents(tmp_path / "command")
     assert ours == theirs and len(ours) == 5 and (tmp_path / "python" / MARKER).is_file()
@@ -108,13 +108,13 @@ def test_nobodys_files_are_replaced(result: Result, tmp_path: Path) -> None:
         with pytest.raises(FileExistsError, match="not overwritten"):
             result.save(tmp_path / place)
     with pytest.raises(FileExistsError, match="its content is not mereo's"):
-        result.save(tmp_path / "out", force=True)
+        result.save(tmp_path / "out", overwrite=True)
     assert (tmp_path / "out/mine.txt").read_text() == (tmp_path / "one.glb").read_text() == "keep"
-    result.save(tmp_path / "one.glb", force=True)
+    result.save(tmp_path / "one.glb", overwrite=True)
     assert (tmp_path / "one.glb").read_bytes()[:4] == b"glTF"
     np.savez(tmp_path / "frame.npz", points=seen())
     with pytest.raises(FileExistsError, match="frame.npz"):
-        mereo.answer(tmp_path / "frame.npz", MODEL, resolution=8).save(tmp_path / "frame.npz", force=True)
+        mereo.reconstruct(tmp_path / "frame.npz", MODEL, resolution=8).save(tmp_path / "frame.npz", overwrite=True)
 
 
 def test_other_names_are_refused(result: Result, tmp_path: Path) -> None:
@@ -182,10 +182,10 @@ def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
 
 def test_a_cloud_has_metres_only_where_somebody_says_so(tmp_path: Path) -> None:
     np.save(tmp_path / "cloud.npy", seen())
-    assumed = mereo.answer(mereo.load_frame(tmp_path / "cloud.npy"), MODEL, resolution=16)
-    assert assumed.seen.frame.unit_m == 1.0 and assumed.unit == Unit(None)
-    told = mereo.answer(mereo.load_frame(tmp_path / "cloud.npy", unit_m=1.0), MODEL, resolution=16)
-    assert told.unit == Unit(1.0)
+    assumed = mereo.reconstruct(mereo.load_frame(tmp_path / "cloud.npy"), MODEL, resolution=16)
+    assert assumed.seen.frame.unit_m is None and assumed.unit_m is None
+    told = mereo.reconstruct(mereo.load_frame(tmp_path / "cloud.npy", unit_m=1.0), MODEL, resolution=16)
+    assert told.unit_m == 1.0
     assumed.save(tmp_path / "assumed.html")
     told.save(tmp_path / "told.html")
     assert "volume (units³)" in (tmp_path / "assumed.html").read_text(encoding="utf-8")
@@ -197,10 +197,9 @@ def images(page: str) -> list[str]:
 
 
 def test_lengths_are_in_units_where_no_unit_is_known() -> None:
-    result = mereo.answer(
-        PointCloud(1000 * seen()), replace(MODEL, field=lambda p: MODEL.field(p / 1000)), resolution=16
-    )
-    assert result.unit == Unit(None) and "volume, units³" in result._repr_html_()
+    model = replace(MODEL, field=lambda p: MODEL.field(p / 1000))
+    result = mereo.reconstruct(PointCloud(1000 * seen()), model, resolution=16)
+    assert result.unit_m is None and "volume, units³" in result._repr_html_()
     assert Unit(None).volume(12345.6) == "12,346" and Unit(0.01).volume(2.0) == "2"
     assert Unit(0.01).place(np.array([1.0, -0.5, 0.0])) == "10 -5 0"
 
@@ -208,45 +207,47 @@ def test_lengths_are_in_units_where_no_unit_is_known() -> None:
 # --- frames -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_frame_may_be_many_things(result: Result, tmp_path: Path) -> None:
+def test_a_frame_may_be_many_things(result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
     frame = mereo.load_frame(tmp_path / "cloud.npy", unit_m=0.5)
     assert frame.unit_m == 0.5 and result.seen.frame.unit_m == 1.0
     grid = result.reconstruction.labels.labels
     for one in (tmp_path / "cloud.npy", frame, result.seen, PointCloud(seen()), seen().tolist()):
-        found = mereo.answer(np.array(one) if isinstance(one, list) else one, MODEL, "off", 24)
+        found = mereo.reconstruct(one, MODEL, "network", resolution=24)
         np.testing.assert_array_equal(found.reconstruction.labels.labels, grid)
     known = replace(MODEL, provenance={"visible_m": [2, 3]})
-    with pytest.warns(SizeWarning, match="the visible part is 0.18 m long, but 2 to 3 m in training"):
-        mereo.answer(tmp_path / "cloud.npy", known, resolution=8)
-    mereo.answer(seen(), known, resolution=8)  # of no stated unit, so that there is nothing to warn of
+    monkeypatch.setattr(reconstruct, "_reconstruct", unchecked(reconstruct._reconstruct))
+    for one in (tmp_path / "cloud.npy", seen(), [seen()]):
+        with pytest.warns(SizeWarning, match="the visible part is 0.18 m long, but 2 to 3 m in training") as warned:
+            unchecked(mereo.reconstruct)(one, known, resolution=8, unit_m=1.0)
+        assert warned[0].filename == __file__ and "--" not in str(warned[0].message)
+        mereo.reconstruct(one, known, resolution=8)  # of no stated unit, so that there is nothing to warn of
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     frame = mereo.load_frame("rope")
-    with pytest.raises(ValueError, match="for a frame that states its own; give them where it is read"):
-        mereo.answer(frame, MODEL, axes="scanner")
-    with pytest.raises(ValueError, match="fit is 'fulll'; it must be one of .*: correct the spelling"):
-        unchecked(mereo.answer)(seen(), MODEL, "fulll")
-    with pytest.raises(ValueError, match="the unit of the points is not known: give unit_m"):
-        mereo.answer(seen(), MODEL, isolation=IsolationConfig(largest_cluster=True))
+    with pytest.raises(ValueError, match="axes is given for a frame that is read already: give it where"):
+        mereo.reconstruct(frame, MODEL, axes="scanner")
+    with pytest.raises(ValueError, match="the method is 'fulll'; it must be one of .*: correct the spelling"):
+        unchecked(mereo.Object.registrar)(mereo.Object(MODEL), "fulll")
     with pytest.raises(ValueError, match="the unit is -1 m; it must be positive"):
-        mereo.answer(seen(), MODEL, unit_m=-1)
+        mereo.reconstruct(seen(), MODEL, unit_m=-1)
     with pytest.raises(
-        FileNotFoundError, match="there is no frame 'bunnny'; give a file or one of the shipped: bunny,"
+        FileNotFoundError, match="there is no frame 'bunnny'; give a file or one of the shipped: bun000, bunny,"
     ):
         mereo.load_frame("bunnny")
     with pytest.raises(ValueError, match="the shipped frame 'rope' is in metres and needs no options"):
         mereo.load_frame("rope", unit_m=0.001)
-    with pytest.raises(ValueError, match="both a reading and mask are given"):
-        mereo.load_frame("rope", mereo.InputConfig(), mask=tmp_path / "mask.png")
+    with pytest.raises(ValueError, match="mask is given for a frame that is no file's: leave it out, or name the file"):
+        mereo.load_frame(seen(), mask=tmp_path / "mask.png")
     with pytest.raises(TypeError, match="unit"):
         mereo.load_frame(tmp_path / "x.ply", unit=1.0)
 
 
 def test_shipped_frames_are_in_metres() -> None:
-    sizes = {name: float(np.ptp(mereo.load_frame(name).cloud.points, axis=0).max()) for name in ("bunny", "liver")}
-    assert 0.1 < sizes["bunny"] < 0.2 and 0.16 < sizes["liver"] < 0.3, sizes
+    names = ("bun000", "bunny", "liver")
+    sizes = {name: float(np.ptp(mereo.load_frame(name).cloud.points, axis=0).max()) for name in names}
+    assert 0.1 < sizes["bun000"] < 0.2 and 0.1 < sizes["bunny"] < 0.2 and 0.16 < sizes["liver"] < 0.3, sizes
 
 
 # --- the viewer -------------------------------------------------------------------------------------------------------

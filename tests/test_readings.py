@@ -1,10 +1,11 @@
 """What belongs to the object is told by what a fit explains, and how noisy a frame is by what a fit leaves over."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from mereo.fitting.registration.readings import FittedFrame, fitted_frame
+from answers import answer_to
 
 from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import SCANS, scan_in_camera
@@ -12,11 +13,14 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.noise import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, noise_of, shared
 from mereo.fitting.problem.residuals import Surface
-from mereo.fitting.registration.answer import answer
+from mereo.fitting.registration.answer import Candidate
+from mereo.fitting.registration.answer_frame import fit_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.weights import load_model
+from mereo.reconstruction.observation import observe
+from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.reconstruction.strays import Reading, readings
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.registry import load_scene
@@ -55,20 +59,27 @@ def with_rim(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.column_stack([rim, np.ones(len(rim))]) * (1.4 * points[:, 2].max())])
 
 
-def frame(model: Model, registrar: Registrar, points: np.ndarray, **options: bool) -> FittedFrame:
-    return fitted_frame(PointCloud(points), model, registrar, scene_unit=1.0, **options)
+def candidates(
+    model: Model, registrar: Registrar | None, points: np.ndarray, keep_all: bool = False, unit: float | None = 1.0
+) -> tuple[Candidate, EncodedFrame]:
+    """The best fit, and what the network alone answers from."""
+    return fit_hypotheses(observe(PointCloud(points)), model, registrar, keep_all, unit)
+
+
+def fitted(model: Model, registrar: Registrar, points: np.ndarray, **options: Any) -> Candidate:
+    return candidates(model, registrar, points, **options)[0]
 
 
 @pytest.mark.usefixtures("without_turns")
 def test_strays_are_left_out_and_all_else_is_kept(model: Model, registrar: Registrar, points: np.ndarray) -> None:
-    clean, found = frame(model, registrar, points), frame(model, registrar, with_rim(points))
-    assert clean.reading.dropped == 0 and clean.seen is clean.unaided
-    assert not found.reading.keep[len(points) :].any() and found.reading.keep[: len(points)].mean() > 0.99
+    (clean, likelier), found = candidates(model, registrar, points), fitted(model, registrar, with_rim(points))
+    assert clean.hypothesis.dropped == 0 and clean.encoded is likelier
+    assert not found.hypothesis.keep[len(points) :].any() and found.hypothesis.keep[: len(points)].mean() > 0.99
     assert found.modes is not None and clean.modes is not None
     moved = np.linalg.norm(found.modes.registration().material - clean.modes.registration().material, axis=1)
     assert np.median(moved) < 0.2
-    asked = frame(model, registrar, with_rim(points), keep_all=True)
-    assert asked.reading.dropped == 0
+    asked = fitted(model, registrar, with_rim(points), keep_all=True)
+    assert asked.hypothesis.dropped == 0
 
 
 def test_a_part_that_looks_like_strays_is_given_back(
@@ -80,9 +91,9 @@ def test_a_part_that_looks_like_strays_is_given_back(
         keep = cloud.points[:, 0] < np.quantile(cloud.points[:, 0], 0.9)
         return Reading(cloud, keep), Reading.of_all(cloud)
 
-    monkeypatch.setattr("mereo.fitting.registration.readings.readings", wrong)
-    found = frame(model, registrar, points)
-    assert found.reading.dropped == 0 and found.unaided.reading.dropped > 0
+    monkeypatch.setattr("mereo.fitting.registration.answer_frame.readings", wrong)
+    found, likelier = candidates(model, registrar, points)
+    assert found.hypothesis.dropped == 0 and likelier.reading.dropped > 0
 
 
 def test_points_that_a_fit_explains_are_given_back_beside_strays(
@@ -96,21 +107,23 @@ def test_points_that_a_fit_explains_are_given_back_beside_strays(
         keep[lost] = False
         return Reading(cloud, keep), Reading.of_all(cloud)
 
-    monkeypatch.setattr("mereo.fitting.registration.readings.readings", hasty)
-    keep = frame(model, registrar, contaminated).reading.keep
+    monkeypatch.setattr("mereo.fitting.registration.answer_frame.readings", hasty)
+    keep = fitted(model, registrar, contaminated).hypothesis.keep
     assert keep[lost].all() and not keep[len(points) :].any()
 
 
 def test_without_a_fit_the_likely_reading_is_taken(model: Model, points: np.ndarray) -> None:
-    contaminated = PointCloud(with_rim(points))
-    found = fitted_frame(contaminated, model, None)
-    assert found.modes is None and found.reading.dropped == readings(contaminated)[0].dropped
+    contaminated = with_rim(points)
+    found, likelier = candidates(model, None, contaminated)
+    assert found.modes is None and found.encoded is likelier
+    assert found.hypothesis.dropped == readings(PointCloud(contaminated))[0].dropped
 
 
 def test_an_answer_says_which_points_it_is_of(model: Model, registrar: Registrar, points: np.ndarray) -> None:
-    found = answer(with_rim(points), model, registrar, 24, label_points=True, scene_unit=1.0)
+    found = answer_to(with_rim(points), model, registrar, 24, label_points=True, scene_unit=1.0)
     assert found.taken and found.reconstruction.observed is not None
     assert len(found.reconstruction.observed.labels) == len(found.reconstruction.reading.cloud) < len(with_rim(points))
+    assert found.seen.cloud is found.reconstruction.reading.cloud and found.seen.steps[-1].name == "strays"
 
 
 def noisy(points: np.ndarray, std: float) -> np.ndarray:
@@ -122,14 +135,14 @@ def noisy(points: np.ndarray, std: float) -> np.ndarray:
 @pytest.mark.slow
 def test_a_noisy_frame_is_fitted_by_its_own_noise(model: Model, registrar: Registrar, points: np.ndarray) -> None:
     """Seen in the constants, in what is believed, and in any unit."""
-    clean, found = frame(model, registrar, points).modes, frame(model, registrar, noisy(points, 0.4)).modes
+    clean, found = (fitted(model, registrar, cloud).modes for cloud in (points, noisy(points, 0.4)))
     assert clean is not None and found is not None
     assert clean.problem.config == FitConfig()
     config = found.problem.config
     assert 0.3 < config.cloud_sigma <= LARGEST and config.tolerance == pytest.approx(4.5 * config.cloud_sigma, rel=0.5)
     assert len(found.problem.evidence.partners) > len(clean.problem.evidence.partners)
     assert found.registration().accepted
-    metres = fitted_frame(PointCloud(noisy(points, 0.4) * 0.005), model, registrar, scene_unit=0.005).modes
+    metres = fitted(model, registrar, noisy(points, 0.4) * 0.005, unit=0.005).modes
     assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=0.02)
 
 
@@ -150,12 +163,12 @@ def test_a_noisy_cloud_is_explained_where_only_noise_is_left(
     model: Model, registrar: Registrar, points: np.ndarray
 ) -> None:
     """Whatever the misfit is; that of a clean one is what counts."""
-    fitted = frame(model, registrar, noisy(points, 0.4)).modes
-    assert fitted is not None and fitted.problem.noisy
-    problem, aside = fitted.problem, fitted.surface.material + np.array([0.0, 0.0, 1.0])
-    assert problem.explained(9.0, fitted.surface, 0.1)
+    found = fitted(model, registrar, noisy(points, 0.4)).modes
+    assert found is not None and found.problem.noisy
+    problem, aside = found.problem, found.surface.material + np.array([0.0, 0.0, 1.0])
+    assert problem.explained(9.0, found.surface, 0.1)
     assert not problem.explained(9.0, Surface.through(problem.model, aside), 0.1)
-    assert not replace(problem, noisy=False).explained(9.0, fitted.surface, 0.1)
+    assert not replace(problem, noisy=False).explained(9.0, found.surface, 0.1)
 
 
 def test_constants_follow_the_noise_and_end() -> None:
@@ -196,7 +209,7 @@ def test_clean_views_lose_nothing(name: str) -> None:
         seen = sample_view(scene, GenerateConfig(), example_rng(CLEAN_SEED, index)).depth.to_points()
         found = readings(seen)
         if len(found) > 1:
-            assert fitted_frame(seen, network, modes, scene_unit=1.0).reading.dropped == 0, index
+            assert fitted(network, modes, seen.points).hypothesis.dropped == 0, index
         else:
             assert found[0].cloud is seen, index
 
@@ -209,4 +222,4 @@ def test_real_scans_lose_nothing(name: str) -> None:
     except AssetUnavailable as error:
         pytest.skip(str(error))
     network = load_model("bunny")
-    assert fitted_frame(seen, network, Registrar.of(network, "modes")).reading.dropped == 0
+    assert fitted(network, Registrar.of(network, "modes"), seen.points, unit=None).hypothesis.dropped == 0

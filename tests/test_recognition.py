@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from answers import answer_to
 from toy_scene import Shear, toy_scene
 
 from mereo.evaluation.calibration_views import (
@@ -18,7 +19,6 @@ from mereo.evaluation.recognition_gauge import RecognitionGauge, usual_of
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem.correspondences import CLIPPED
 from mereo.fitting.problem.noise import ACCEPTED
-from mereo.fitting.registration.answer import answer
 from mereo.fitting.registration.recognition import (
     CONSERVATIVE,
     MOST,
@@ -38,6 +38,7 @@ from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
+from mereo.scenes.source_frame import SourceFrame
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 
@@ -67,7 +68,7 @@ def registration() -> Registration:
 
 
 def test_the_object_in_a_learned_state_is_known(registration: Registration) -> None:
-    said = recognize(registration, displaced=0.03, stated_unit=1.01)
+    said = recognize(registration, displaced=0.03, stated_scene_unit=1.01)
     assert said.known is True and said.reason is None and said.told is None and not said.calibrated
     assert said.strangeness < 1.0
 
@@ -80,8 +81,8 @@ def test_the_object_in_a_learned_state_is_known(registration: Registration) -> N
         ({"ruled_out": 0.4}, {}, "40% of the model's surface lies where the frame shows none of it"),
         ({"z": 10.0}, {}, "scene units outside those that were learned, and rigid parts may be bent"),
         ({}, {"displaced": 0.9}, "have the same places of the object 90% of half its length apart"),
-        ({}, {"stated_unit": 25.4}, "its size differs by a factor of 25.4 from the object's in the frame's unit"),
-        ({}, {"stated_unit": 0.001}, "a factor of 1e+03 "),
+        ({}, {"stated_scene_unit": 25.4}, "its size differs by a factor of 25.4 from the object's in the frame's unit"),
+        ({}, {"stated_scene_unit": 0.001}, "a factor of 1e+03 "),
     ],
 )
 def test_each_sign_has_its_say(
@@ -144,7 +145,7 @@ def test_a_size_off_by_a_factor_of_two_is_never_the_objects(
 ) -> None:
     """Not even by weights whose other signs vary so much that their limits are wide."""
     wide = Calibration(seed=1, views=8, recognizing=CONSERVATIVE.model_copy(update={"unsure": 90.0, "refused": 99.0}))
-    said = recognize(registration, wide, stated_unit=unit)
+    said = recognize(registration, wide, stated_scene_unit=unit)
     assert said.known is known and (known or "its size differs by a factor of" in str(said.reason))
 
 
@@ -261,11 +262,14 @@ def test_shipped_weights_tell_their_object_from_another_and_from_a_wrong_unit() 
     rope = load_model("rope")
     own = load_view("rope").depth.to_points()
     other = sample_view(load_scene("robot"), GenerateConfig(), example_rng(5, 0)).depth.to_points()
-    registrar = Registrar.of(rope, "modes")
-    assert answer(own, rope, registrar, 24, stated_unit=1.0).recognition.known is True
-    found = answer(other, rope, "auto", 24)
+    assert rope.statistical_model is not None
+    sized = replace(rope.statistical_model, source_frame=SourceFrame(np.eye(4), 0.01))  # of a known true size
+    registrar = Registrar(rope, sized, "modes")
+    assert answer_to(own, rope, registrar, 24, unit_m=0.01).recognition.known is True
+    found = answer_to(other, rope, Registrar.of(rope), 24)
     assert found.recognition.known is False and not found.taken
-    inches = answer(PointCloud(own.points / 25.4), rope, registrar, 24, stated_unit=1.0).recognition
+    inches = answer_to(PointCloud(own.points / 25.4), rope, registrar, 24, unit_m=0.01).recognition
     assert inches.known is False and inches.reason is not None and "a factor of" in inches.reason
-    assumed = answer(PointCloud(own.points / 25.4), rope, registrar, 24, stated_unit=1.0, unit_assumed=True)
-    assert assumed.recognition.known is True
+    unknown = answer_to(PointCloud(own.points / 25.4), rope, registrar, 24)
+    assert unknown.recognition.known is True
+    assert unknown.seen.frame.unit_m == pytest.approx(0.254, rel=0.05), "found by the object's true size"

@@ -12,19 +12,22 @@ import numpy as np
 import pytest
 import trimesh
 from analytic import AnalyticModel, ball, logits_of, union, untrained
+from answers import answer_to, reconstruct
 
 import mereo
+from mereo.api.result import Result
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.cli.stream import stream_reconstructions
-from mereo.geometry.camera import PointCloud
+from mereo.fitting.registration.answer import Answer
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.scanner_axes import scanner_to_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.io.config import InputConfig
 from mereo.models.weights import save_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct
-from mereo.visualization.result_files import summarize, write_reconstruction
+from mereo.reconstruction.pipeline import Reconstruction
+from mereo.visualization.result_files import summary_of, write_answer
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 
@@ -55,24 +58,27 @@ def scene(frame: CloudAxes) -> tuple[np.ndarray, AnalyticModel]:
 
 
 @pytest.fixture(scope="module", params=["camera", "scanner"])
-def found(request: pytest.FixtureRequest) -> tuple[CloudAxes, np.ndarray, Reconstruction]:
+def answer(request: pytest.FixtureRequest) -> Answer:
     cloud, model = scene(request.param)
-    return request.param, cloud, reconstruct(cloud, model, resolution=48, frame=request.param)
+    return answer_to(cloud, model, resolution=48, axes=request.param)
 
 
-def test_labels_are_the_fields_at_their_positions(found: tuple[CloudAxes, np.ndarray, Reconstruction]) -> None:
+@pytest.fixture(scope="module")
+def found(answer: Answer) -> Reconstruction:
+    return answer.reconstruction
+
+
+def test_labels_are_the_fields_at_their_positions(found: Reconstruction) -> None:
     """Grid, origin and spacing are in the input's frame: every voxel has the label of its own place."""
-    grid = found[2].labels
+    grid = found.labels
     index = np.indices(grid.labels.shape).reshape(3, -1).T
     expected = two_balls(grid.positions(index)).argmax(axis=1)
     assert (grid.labels.ravel() != expected).mean() < 1e-4, "rounding on the surface"
-    assert grid.names == NAMES and not found[2].clipped
+    assert grid.names == NAMES and not found.clipped
 
 
-def test_segments_are_where_they_are(found: tuple[CloudAxes, np.ndarray, Reconstruction]) -> None:
-    for segment, surface, (center, radius) in zip(
-        found[2].segments, found[2].surfaces.segments, (BIG, SMALL), strict=False
-    ):
+def test_segments_are_where_they_are(found: Reconstruction) -> None:
+    for segment, surface, (center, radius) in zip(found.segments, found.surfaces.segments, (BIG, SMALL), strict=False):
         np.testing.assert_allclose(segment.centroid, center, atol=0.001)
         np.testing.assert_allclose(segment.box, np.add(center, [[-radius] * 3, [radius] * 3]), atol=0.0005)
         assert segment.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.02)
@@ -82,11 +88,11 @@ def test_segments_are_where_they_are(found: tuple[CloudAxes, np.ndarray, Reconst
         np.testing.assert_allclose(surface.bounds, segment.box, atol=1e-9)
 
 
-def test_an_absent_segment_is_listed(found: tuple[CloudAxes, np.ndarray, Reconstruction]) -> None:
-    absent = found[2].segments[2]
+def test_an_absent_segment_is_listed(found: Reconstruction) -> None:
+    absent = found.segments[2]
     assert (absent.name, absent.volume, absent.voxels, absent.components) == ("absent", 0.0, 0, 0)
     assert np.isnan(absent.confidence) and np.isnan(absent.box).all()
-    assert len(found[2].surfaces.segments[2].faces) == 0
+    assert len(found.surfaces.segments[2].faces) == 0
 
 
 def test_components_are_counted_and_nothing_is_removed() -> None:
@@ -118,9 +124,10 @@ def test_the_unit_of_the_cloud_does_not_matter() -> None:
         assert 1024.0**3 * a.volume == pytest.approx(b.volume, rel=1e-9)
 
 
-def test_files(found: tuple[CloudAxes, np.ndarray, Reconstruction], tmp_path: Path) -> None:
-    frame, cloud, result = found
-    write_reconstruction(result, PointCloud(cloud), tmp_path / "out", frame=frame, title="two balls")
+def test_files(answer: Answer, tmp_path: Path) -> None:
+    frame, result = answer.seen.frame.axes, answer.reconstruction
+    (tmp_path / "out").mkdir()
+    write_answer(tmp_path / "out", answer)
     assert sorted(p.name for p in (tmp_path / "out").glob("[!.]*")) == [
         "labels.npz",
         "preview.png",
@@ -144,11 +151,11 @@ def test_files(found: tuple[CloudAxes, np.ndarray, Reconstruction], tmp_path: Pa
     np.testing.assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
 
 
-def test_an_existing_result_is_kept(found: tuple[CloudAxes, np.ndarray, Reconstruction], tmp_path: Path) -> None:
+def test_an_existing_result_is_kept(answer: Answer, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/mine.txt").write_text("keep")
     with pytest.raises(FileExistsError, match="choose another --output or pass --force"):
-        write_reconstruction(found[2], PointCloud(found[1]), tmp_path / "out")
+        Result.of(answer).save(tmp_path / "out")
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "mine.txt"]
 
 
@@ -156,10 +163,10 @@ def test_from_file_to_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cloud, model = scene("camera")
-    monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: model)
     np.save(tmp_path / "cloud.npy", cloud)
     found = reconstruct_file(tmp_path / "cloud.npy", tmp_path / "out", FrameJob("any", 16))
-    assert summarize(found.reconstruction)["segments"][0]["name"] == "big"
+    assert summary_of(found)["segments"][0]["name"] == "big"
     assert (tmp_path / "out/report.html").is_file()
     assert "wrote" in capsys.readouterr().out
     with pytest.raises(FileExistsError):
@@ -172,9 +179,9 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     """Something else beside the object is left out when asked; the summary says so."""
     cloud, model = scene("camera")
     np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
-    monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
+    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
     read = partial(reconstruct_file, tmp_path / "cloud.npy")
-    job = FrameJob("any", 16)
+    job = FrameJob("any", 16, InputConfig(unit_m=1.0))
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
         read(tmp_path / "crowded", job)
     assert "strays:" not in capsys.readouterr().out, "it is a surface: nothing says that it is not the object"
@@ -200,11 +207,10 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     """The answer is that to the object's own points, bit for bit."""
     cloud, own, model = with_strays()
     np.save(tmp_path / "cloud.npy", cloud)
-    monkeypatch.setattr(
-        "mereo.cli.reconstruct.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]})
-    )
+    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]}))
     read = partial(reconstruct_file, tmp_path / "cloud.npy")
-    result = read(tmp_path / "out", FrameJob("any", 16)).reconstruction
+    job = FrameJob("any", 16, InputConfig(unit_m=1.0))
+    result = read(tmp_path / "out", job).reconstruction
     said = capsys.readouterr().out
     assert "strays: 30 of 1230 points dropped, the longest side was" in said and "(--keep-all keeps them)" in said
     summary = json.loads((tmp_path / "out/summary.json").read_text())
@@ -213,7 +219,7 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     assert (step["name"], step["before"], step["kept"]) == ("strays", 1230, 1200)
     np.testing.assert_array_equal(result.labels.labels, reconstruct(own, model, resolution=16).labels.labels)
     with pytest.warns(SizeWarning, match="the visible part is 0.[5-9][0-9]* m long"):
-        read(tmp_path / "all", FrameJob("any", 16, isolation=IsolationConfig(keep_all=True)))
+        read(tmp_path / "all", replace(job, isolation=IsolationConfig(keep_all=True)))
     assert "strays:" not in capsys.readouterr().out
     assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
 

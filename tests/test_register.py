@@ -7,15 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import untrained
+from answers import answer_to, reconstruct
 from trimesh.remesh import subdivide
 
+import mereo
 from mereo import __main__ as command_line
+from mereo.api.objects import Object
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.evaluation.sample_views import SampleView, load_view
 from mereo.evaluation.scoring import evaluate
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration import register
-from mereo.fitting.registration.answer import Answer, answer
+from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
 from mereo.fitting.registration.registration import Registration
@@ -25,7 +28,7 @@ from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.solids import Solids
 from mereo.models.model import Model
 from mereo.models.weights import save_model
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
@@ -48,7 +51,7 @@ def network(model: Model, view: SampleView) -> Reconstruction:
 
 @pytest.fixture(scope="module")
 def found(model: Model, view: SampleView) -> Answer:
-    return answer(view.depth.to_points(), model, Registrar.of(model, "modes"), 48, label_points=True)
+    return answer_to(view.depth.to_points(), model, Registrar.of(model, "modes"), 48, label_points=True)
 
 
 def iou(view: SampleView, result: Reconstruction) -> float:
@@ -80,7 +83,7 @@ def test_labels_are_those_of_the_segments(network: Reconstruction, found: Answer
 
 def test_a_scanners_frame_gets_its_answer_in_that_frame(model: Model, view: SampleView) -> None:
     points = view.depth.to_points().points @ SCANNER_TO_CAMERA.T
-    result = answer(PointCloud(points), model, Registrar.of(model, "modes"), 48, "scanner").reconstruction
+    result = answer_to(PointCloud(points), model, Registrar.of(model, "modes"), 48, "scanner").reconstruction
     assert np.median(Solids(result.surfaces).nearest(points).distance) < 0.02 * np.ptp(points, axis=0).max()
     for one in result.segments:
         inside = result.labels.positions(np.argwhere(result.labels.labels == one.label)).mean(axis=0)
@@ -134,9 +137,9 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
             Registrar.of(model, "full", given)
     with pytest.raises(ValueError, match=f"{said}, so its draws"):  # named as that of other weights
         assert Registrar.of(replace(model, provenance={"scene": "mine"}), scene=changed).at_hand
-    for choice in ("auto", "modes", "full"):
+    for method in ("auto", "modes", "full"):
         with pytest.raises(ValueError, match=f"{said}, so places cannot be compared: .* with --method network"):
-            evaluate(model, changed, examples=1, method=choice)
+            evaluate(model, changed, examples=1, method=method)
     assert evaluate(model, changed, examples=1, cells=12, method="network").sources == ("network",)
 
 
@@ -183,19 +186,20 @@ def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> N
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
     stretched = view.depth.to_points().points * np.array([1.0, 2.5, 1.0])
     without_scene = replace(model, provenance={"scene": "mine"})
-    found = answer(stretched, model, Registrar.of(without_scene), 32)
+    found = answer_to(stretched, model, Registrar.of(without_scene), 32)
     assert found.registration is not None and not found.registration.accepted and not found.taken
-    forced = answer(stretched, model, Registrar.of(model, "modes"), 32)
+    forced = answer_to(stretched, model, Registrar.of(model, "modes"), 32)
     assert forced.taken and forced.registration is not None and not forced.registration.accepted
 
 
 def test_where_no_registration_is_found_auto_says_why(model: Model, view: SampleView) -> None:
     other = replace(model, names=tuple(f"other_{i}" for i in range(len(model.names))))
     registrar = Registrar(other, statistical_model_of(model))
-    found = answer(view.depth.to_points(), other, registrar, 32)
+    found = answer_to(view.depth.to_points(), other, registrar, 32)
     assert not found.taken and found.registration is None and "they must be of one object" in str(found.refusal)
+    known = Object(other, None, {"modes": replace(registrar, method="modes")})
     with pytest.raises(ValueError, match="they must be of one object"):
-        answer(view.depth.to_points(), other, replace(registrar, method="modes"), 32)
+        mereo.reconstruct(view.depth.to_points(), known, "modes", resolution=32)
 
 
 def test_points_may_be_plain_lists(found: Answer) -> None:

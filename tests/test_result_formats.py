@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 import trimesh
 from analytic import AnalyticModel, ball, logits_of
+from answers import answer_to
 
 from mereo.__main__ import main, parse
+from mereo.api.result import Result
 from mereo.cli.reconstruct_command import ReconstructCommand
-from mereo.geometry.camera import PointCloud
+from mereo.fitting.registration.answer import Answer
 from mereo.geometry.mesh import PALETTE
 from mereo.io.config import FilesConfig
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
-from mereo.reconstruction.pipeline import Reconstruction, reconstruct
+from mereo.reconstruction.pipeline import Reconstruction
 from mereo.reconstruction.segment_statistics import segment_points
-from mereo.visualization.result_files import write_reconstruction
+from mereo.visualization.result_files import write_answer
 
 NAMES = ("big", "small")
 BIG, SMALL = ((0.1, 0.2, 0.5), 0.06), ((0.1, 0.2905, 0.5), 0.03)
@@ -39,17 +41,23 @@ def view() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def found() -> Reconstruction:
-    return reconstruct(view(), model(), resolution=24, label_points=True)
+def answer() -> Answer:
+    return answer_to(view(), model(), resolution=24, unit_m=0.01, label_points=True)
+
+
+@pytest.fixture(scope="module")
+def found(answer: Answer) -> Reconstruction:
+    return answer.reconstruction
 
 
 def results(found: Reconstruction, files: FilesConfig, unit_m: float = 1.0) -> Results:
     return Results.of(found.surfaces, found.labels, found.observed, GLTF_CAMERA_ROTATION, files, unit_m)
 
 
-def test_every_format_is_written_where_the_table_says(found: Reconstruction, tmp_path: Path) -> None:
+def test_every_format_is_written_where_the_table_says(answer: Answer, tmp_path: Path) -> None:
     pytest.importorskip("nibabel", reason="nibabel is not installed: pip install 'mereo[medical]'")
-    write_reconstruction(found, PointCloud(view()), tmp_path / "all", files=FilesConfig(("all",)), unit_m=0.01)
+    (tmp_path / "all").mkdir()
+    write_answer(tmp_path / "all", answer, FilesConfig(("all",)))
     names = {path.name for path in (tmp_path / "all").glob("[!.]*")}
     second = {"segments.mtl", "points.npz"}
     assert names == {writer.file for writer in WRITERS.values()} | second | {"preview.png", "report.html"}
@@ -108,9 +116,9 @@ def test_confidence_is_among_segments_and_occupancy_against_empty_space() -> Non
 
 
 def test_points_without_labels_are_refused(tmp_path: Path) -> None:
-    plain = reconstruct(view(), model(), resolution=16)
+    plain = Result.of(answer_to(view(), model(), resolution=16))
     with pytest.raises(ValueError, match="the format 'points' needs them: pass label_points=True"):
-        write_reconstruction(plain, PointCloud(view()), tmp_path / "out", files=FilesConfig(("ply", "points")))
+        plain.save(tmp_path / "out", formats=("ply", "points"))
     assert list(tmp_path.iterdir()) == [], "the PLY that was already written neither"
 
 

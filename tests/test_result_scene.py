@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from analytic import untrained
-from mereo.visualization.answering import answer
+from answers import answer_to
 from scene_files import write_bar
 
 from mereo.__main__ import main
+from mereo.api.result import Result
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.draws.playback import Drawn, material_moved
 from mereo.fitting.registration.register import Registrar
@@ -24,6 +25,7 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
+from mereo.visualization.result_files import summary_of
 from mereo.visualization.result_scene import scene_facts, scene_of_result
 from mereo.visualization.viewer import serve
 
@@ -84,13 +86,13 @@ def test_a_result_names_the_file_as_it_was_given(
 ) -> None:
     monkeypatch.chdir(made)
     given = load_scene("bar.yaml")
-    found = answer(load_view("rope").depth.to_points(), rope, None, 16)
+    found = answer_to(load_view("rope").depth.to_points(), rope, None, 16)
     assert rope.statistical_model is not None
     registrar = Registrar(rope, rope.statistical_model, "modes", given)
-    replace(found, registrar=registrar).save(tmp_path / "own", formats=["json"])
+    Result.of(replace(found, registrar=registrar)).save(tmp_path / "own", formats=["json"])
     told = json.loads((tmp_path / "own/summary.json").read_text())["scene_file"]
     assert told == scene_facts(given)["scene_file"] and told["path"] == "bar.yaml" and len(told["sha256"]) == 64
-    assert "scene_file" not in found.facts()
+    assert "scene_file" not in summary_of(found)
     assert scene_facts(load_scene("rope")) == {} == scene_facts(None)
     opened = scene_of_result(tmp_path / "own")
     assert opened is not None and opened.definition == given.definition

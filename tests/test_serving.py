@@ -15,10 +15,10 @@ pytest.importorskip("fastapi", reason="fastapi (extra `serve`) is not installed"
 pytest.importorskip("python_multipart", reason="python-multipart (extra `serve`) is not installed")
 
 from camera_files import write_camera
-from mereo.visualization.answering import answer
 from PIL import Image
 from serving_parts import ADDRESS, CLOUD, NPY, balls, figures, npy, run, running
 
+import mereo
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.evaluation.sample_views import load_view
 from mereo.io.config import InputConfig
@@ -26,7 +26,6 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
-from mereo.serving.config import ServeConfig
 from mereo.serving.messages import GLB, Served, Setup
 
 EXACT = InferenceConfig(precision="float32")
@@ -43,7 +42,7 @@ def rope_only(rope: Model, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.cli.reconstruct.load_for", lambda *_: replace(balls(), name="balls"))
+    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: replace(balls(), name="balls"))
     np.save(tmp_path / "frame.npy", CLOUD)
     reconstruct_file(tmp_path / "frame.npy", tmp_path / "out", FrameJob("any", 12, inference=EXACT, method="network"))
     expected = figures((tmp_path / "out/summary.json").read_bytes())
@@ -64,6 +63,21 @@ def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.M
     assert not list((tmp_path / "s").iterdir()), "what requests brought is removed"
 
 
+def test_what_is_told_is_in_the_words_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whose options are the parameters of the address."""
+    large = replace(balls(), provenance={"visible_m": [2, 3]})
+    monkeypatch.setattr("mereo.serving.answering.load_for", lambda *_: large)
+
+    async def ask() -> None:
+        async with running(tmp_path) as server:
+            assert figures(await server.post(npy()))["warnings"] == [], "of no unit that anybody has said"
+            (told,) = figures(await server.post(npy(), f"{ADDRESS}?unit-m=1"))["warnings"]
+            assert "the visible part is 0.18 m long, but 2 to 3 m in training" in told
+            assert "--unit-m 0.001" in told and "--box" in told
+
+    run(ask())
+
+
 def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model, rope_only: None) -> None:
     """Intrinsics as a part and in the address, and a mask; surfaces with how sure they are."""
     view = load_view("rope")
@@ -72,7 +86,7 @@ def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model, rope_
     Image.fromarray((view.depth.depth > 0).astype(np.uint8) * 255).save(mask)
     write_camera(camera, view.depth.camera)
     reading = InputConfig(intrinsics=camera, mask=mask, depth_scale=20_000)
-    alone = answer(read_frame(frame, reading), rope, "modes", 12)
+    alone = mereo.reconstruct(read_frame(frame, reading), rope, "modes", resolution=12)
     expected = figures(alone.save(tmp_path / "summary.json").read_bytes())
     files = {name: (path.name, path.read_bytes()) for name, path in (("frame", frame), ("mask", mask))}
     address = f"{ADDRESS}?depth-scale=20000"
@@ -113,55 +127,23 @@ def clouds(count: int) -> Iterator[np.ndarray]:
         yield CLOUD[kept] * (1 + 0.1 * number) + [0.01 * number, 0.0, 0.02 * number]
 
 
-@pytest.mark.parametrize("workers, batch", [(2, 0), (1, 4)])
-def test_every_client_gets_the_answer_to_its_own_frame(workers: int, batch: int, tmp_path: Path) -> None:
-    """One at a time and bit by bit; or encoded together, up to the rounding of the network's products."""
+@pytest.mark.parametrize("workers", [1, 2])
+def test_every_client_gets_the_answer_to_its_own_frame(workers: int, tmp_path: Path) -> None:
+    """Bit by bit, whether it comes alone or with others."""
     count = 8
 
     async def ask() -> None:
-        config = ServeConfig(batch=batch, batch_wait_ms=20)
         async with running(tmp_path) as alone:
             single = [figures(await alone.post(npy(points))) for points in clouds(count)]
-        async with running(tmp_path, config, workers) as server:
+        async with running(tmp_path, workers=workers) as server:
             answers = await asyncio.gather(*(server.post(npy(points)) for points in clouds(count)))
             for found, expected in zip(answers, single, strict=True):
                 assert figures(found) == expected, "the analytic model answers from the cloud's own box"
-            sizes = [size for worker in server.workers for size in worker.batches()]
-            assert sum(sizes) == count and max(sizes) == (batch or 1)
+            assert sum(len(worker.asked) for worker in server.workers) == count
             places = [tuple(found["segments"][0]["centroid"]) for found in map(figures, answers)]
             assert len(set(places)) == count, "no two clouds have the same answer"
 
     run(ask())
-
-
-def test_a_batch_leaves_others_their_share(tmp_path: Path) -> None:
-    async def ask() -> None:
-        async with running(tmp_path, ServeConfig(batch=8, batch_wait_ms=30), workers=2) as server:
-            await asyncio.gather(*(server.post(npy(points)) for points in clouds(4)))
-            sizes = [worker.batches() for worker in server.workers]
-            assert all(sizes) and max(map(max, sizes)) < 4, "neither process idles while the other has them all"
-
-    run(ask())
-
-
-def test_frames_encoded_together_are_those_encoded_alone(rope: Model) -> None:
-    """The network's own side: codes of one call, split, against a call each."""
-    from mereo.models.joint_encoding import encode_all
-
-    from mereo.geometry.camera import PointCloud
-
-    points = load_view("rope").depth.to_points().points
-    sparse = points[np.random.default_rng(0).permutation(len(points))[:300]]
-    found = encode_all(rope, [PointCloud(points), PointCloud(sparse)])
-    assert encode_all(rope, []) == []
-    for cloud, code in zip((points, sparse), found, strict=True):
-        alone = rope.encode(cloud)
-        np.testing.assert_array_equal(code.cloud, alone.cloud)
-        together, single = (rope.query(one, points[::7]) for one in (code, alone))
-        np.testing.assert_allclose(together.probability, single.probability, atol=2e-4)
-        assert (together.label == single.label).mean() > 0.99
-    with pytest.raises(ValueError, match="at least 32"):
-        encode_all(rope, [PointCloud(points), PointCloud(points[:3])])
 
 
 def test_weights_health_and_the_page_are_there(tmp_path: Path) -> None:
@@ -169,7 +151,7 @@ def test_weights_health_and_the_page_are_there(tmp_path: Path) -> None:
         async with running(tmp_path) as server:
             (told,) = (await server.client.get("/v1/weights")).json()["weights"]
             assert [one["name"] for one in told["segments"]] == ["big", "small", "absent"]
-            assert (told["name"], told["fit"], told["calibrated"]) == ("balls", "off", False)
+            assert (told["name"], told["method"], told["calibrated"]) == ("balls", "network", False)
             assert (await server.client.get("/healthz")).json() == {"status": "ok"}
             assert (await server.client.get("/readyz")).status_code == 200
             described = (await server.client.get("/openapi.json")).json()
@@ -201,7 +183,6 @@ def test_numbers_for_prometheus_count(tmp_path: Path) -> None:
             f"mereo_request_seconds_count{{{endpoint}}} 2.0",
             'mereo_stage_seconds_count{stage="encode"} 1.0',
             'mereo_stage_seconds_count{stage="wait"} 2.0',
-            "mereo_batch_frames_count 2.0",
             "mereo_waiting_frames 0.0",
             "mereo_processes 1.0",
         ):

@@ -26,7 +26,7 @@ from serving_parts import ADDRESS, CLOUD, Server, ThreadWorker, balls, figures, 
 from mereo.cli.serve_command import ServeCommand
 from mereo.serving.answering import Answerer
 from mereo.serving.config import ServeConfig
-from mereo.serving.messages import Begin, Finish, Served
+from mereo.serving.messages import Served
 from mereo.serving.names import served_weights
 from mereo.visualization.viewer.guard import bound_socket
 
@@ -85,7 +85,7 @@ def test_impatience_leaves_no_work_behind(tmp_path: Path, monkeypatch: pytest.Mo
             await until(lambda: not list(tmp_path.iterdir()))
             object.__setattr__(server.service, "config", ServeConfig())  # now there is time
             assert (await server.post(npy())).status_code == 200
-            assert worker.batches() == [1, 1]
+            assert len(worker.asked) == 2
             text = (await server.client.get("/metrics")).text
             assert 'mereo_dropped_frames_total{reason="timeout"} 2.0' in text
 
@@ -127,29 +127,21 @@ def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> None:
             assert server.dispatcher.held == 0 and sent[0]["status"] == 499
             worker.go.set()
             assert (await first).status_code == 200
-            assert worker.batches() == [1], "only the first was ever begun"
+            assert len(worker.asked) == 1, "only the first was ever begun"
             assert not list(tmp_path.iterdir())
 
     run(ask())
 
 
-@pytest.mark.parametrize("kind", [Begin, Finish])
-def test_a_frame_that_ends_its_process_costs_no_other(
-    kind: type, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Batches of four, one of them deadly: it alone is refused, and the process is started again."""
+def test_a_frame_that_ends_its_process_costs_no_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """One of four that wait is deadly: it alone is refused, and the process is started again."""
     deadly = npy(np.full((40, 3), 0.6))
 
     async def ask() -> None:
-        async with running(tmp_path, ServeConfig(batch=4, batch_wait_ms=30)) as server:
+        async with running(tmp_path) as server:
             (worker,) = server.workers
 
-            def dies(message: Begin | Finish) -> bool:
-                begun = [m for m in worker.asked if isinstance(m, Begin)][-1].frames
-                frames = begun if isinstance(message, Begin) else begun[message.number : message.number + 1]
-                return isinstance(message, kind) and any(frame.path.read_bytes() == deadly for frame in frames)
-
-            worker.dies = dies
+            worker.dies = lambda frame: frame.path.read_bytes() == deadly
             worker.go.clear()
             first = asyncio.create_task(server.post(npy()))
             await until(worker.begun.is_set)
@@ -162,7 +154,7 @@ def test_a_frame_that_ends_its_process_costs_no_other(
             assert "has ended over it" in answers[2].json()["error"]
             depths = [figures(answer)["segments"][0]["centroid"][2] for answer in answers if answer.status_code == 200]
             np.testing.assert_allclose(np.diff(depths), 1.0, atol=0.01)
-            assert worker.restarts == (2 if kind is Begin else 1)
+            assert worker.restarts == 1
             assert server.dispatcher.ready and not list(tmp_path.iterdir())
 
     run(ask())

@@ -12,7 +12,7 @@ import pytest
 from analytic import untrained
 
 import mereo
-from mereo.learning import steps
+from mereo.api import steps
 from mereo.scenes.registry import load_scene
 from mereo.synthesis.config import GenerateConfig
 from mereo.training.config import PRESETS, TrainConfig

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from answers import answer_to
 from scipy.spatial import cKDTree
 
 from mereo.cli.explain import explain, wish_of
@@ -19,7 +20,7 @@ from mereo.cli.reconstruct import FrameJob
 from mereo.cli.stream import line
 from mereo.cli.stream_answers import FrameAnswer
 from mereo.evaluation.sample_views import load_view
-from mereo.fitting.registration.answer import Answer, answer
+from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.camera import PointCloud
@@ -27,8 +28,9 @@ from mereo.io.config import FilesConfig
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model
 from mereo.models.weights import load_model
+from mereo.reconstruction.observation import observe
 from mereo.reconstruction.stream import Outcome
-from mereo.visualization.result_files import write_files, write_one
+from mereo.visualization.result_files import write_answer, write_answer_file
 from mereo.visualization.sure_colors import MOST, UNEXPLAINED, point_marks, sure_colors
 from mereo.visualization.units import Unit
 
@@ -47,18 +49,17 @@ def cloud() -> PointCloud:
 
 @pytest.fixture(scope="module")
 def found(model: Model, cloud: PointCloud) -> Answer:
-    result = answer(cloud, model, Registrar.of(model, "modes"), 24)
+    result = answer_to(cloud, model, Registrar.of(model, "modes"), 24)
     assert result.registered is not None and result.registered.uncertainty is not None
     return result
 
 
 @pytest.fixture(scope="module")
-def folder(found: Answer, cloud: PointCloud, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(found: Answer, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sure")
     files = FilesConfig(("glb", "ply", "npz", "vti", "json"), millimetres=True)
-    write_files(
-        path, found.reconstruction, cloud, "camera", files, 0.5, {}, unit=Unit(0.5), registered=found.registered
-    )
+    said = replace(found.seen, frame=replace(found.seen.frame, unit_m=0.5))
+    write_answer(path, replace(found, seen=said), files)
     return path
 
 
@@ -175,9 +176,10 @@ def test_the_report_says_and_shows_it(found: Answer, folder: Path, cloud: PointC
     assert [one["name"] for one in data["sure"]["centroids"]] == [one["name"] for one in data["segments"]]
 
 
-def test_results_of_the_network_say_nothing_of_it(found: Answer, cloud: PointCloud, tmp_path: Path) -> None:
-    assert replace(found, taken=False).registered is None
-    write_one(tmp_path / "r.html", ".html", found.reconstruction, cloud, "camera", FilesConfig(), 1.0, {})
+def test_results_of_the_network_say_nothing_of_it(found: Answer, tmp_path: Path) -> None:
+    alone = replace(found, taken=False, resolution=16)
+    assert alone.registered is None
+    write_answer_file(tmp_path / "r.html", ".html", alone, FilesConfig())
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert '"sure": null' in page and "±" not in page.split("</script>")[0].split("const DATA")[1].split("\n")[0]
 
@@ -187,7 +189,7 @@ def test_points_that_the_model_does_not_explain_are_red(model: Model, cloud: Poi
     """A lump beside the object, taken for it."""
     lump = cloud.points[:40] - [0.0, 0.0, 3.0 * load_unit(model, cloud)]
     points = np.concatenate([cloud.points, lump])
-    registration = answer(points, model, Registrar.of(model, "modes"), 16, keep_all=True).registered
+    registration = answer_to(points, model, Registrar.of(model, "modes"), 16, keep_all=True).registered
     assert registration is not None
     one = registration.explain("liver")
     assert one is not None and len(one.unexplained)
@@ -204,7 +206,7 @@ def load_unit(model: Model, cloud: PointCloud) -> float:
 
 def test_a_stream_says_it_where_it_is_asked_to(model: Model, cloud: PointCloud) -> None:
     tracker = Tracker.of(model, "modes")
-    followed = [tracker.follow(cloud, 0.05 * number) for number in range(2)]
+    followed = [tracker.follow(observe(cloud), 0.05 * number) for number in range(2)]
     assert followed[1].tracked
     silent, told = FrameAnswer.of_registration(followed[1]), FrameAnswer.of_registration(followed[1], True)
     words = line(Outcome("frame", 0.0, told, "", 0.0, 0.0, 0))
@@ -222,7 +224,7 @@ def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -
     registration = registrar.fit_modes(cloud).registration()
     assert registration.uncertainty is not None and registration.uncertainty.scale == 2.5
     tracker = Tracker(registrar)
-    followed = [tracker.follow(cloud, 0.05 * number).registration for number in range(2)]
+    followed = [tracker.follow(observe(cloud), 0.05 * number).registration for number in range(2)]
     assert all(one is not None and one.radius_scale == 2.5 for one in followed)
 
 
@@ -233,7 +235,7 @@ def test_the_viewer_colours_it_and_says_it_of_a_place_and_shows_why(
     from mereo.visualization.viewer.frame_page import SURE, FramePage
     from mereo.visualization.viewer.probe import Inspection
 
-    page = FramePage(server, Inspection.of_answer(found, model, None), "liver", "", Unit(1.0))
+    page = FramePage(server, Inspection.of_answer(found), "liver", "", Unit(1.0))
     assert SURE in page.coloring.options and page.why is not None
     colors, legend = page._colors(SURE)
     assert [len(part) for part in colors] == [len(s.vertices) for s in page.mesh.segments] and "mm" in legend

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from answers import answer_to
 from browser import BROWSER, Page, pixels_of, until
-from mereo.visualization.answering import answer
 from toy_scene import toy_scene
 
 from mereo.evaluation.sample_views import load_view
@@ -61,7 +61,7 @@ def registrar(model: Model, states: StatisticalModel) -> Registrar:
 def inspected(
     cloud: PointCloud, model: Model, registrar: Registrar | None, resolution: int = 24, axes: CloudAxes = "camera"
 ) -> Inspection:
-    return Inspection.of_answer(answer(cloud, model, registrar, resolution, axes=axes), model, registrar)
+    return Inspection.of_answer(answer_to(cloud, model, registrar, resolution, axes))
 
 
 @pytest.fixture(scope="module")

@@ -93,7 +93,7 @@ def test_watching_ends_with_ctrl_c(
         raise KeyboardInterrupt
 
     np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 2, (500, 3)))
-    monkeypatch.setattr("mereo.cli.stream_answers.reconstruct", interrupted)
+    monkeypatch.setattr("mereo.cli.stream_answers.answer_frame", interrupted)
     assert stream_reconstructions(str(tmp_path), "rope", watch=True, method="network").answered == 0
     assert capsys.readouterr().err.startswith("stopped\n0 frames answered")
 

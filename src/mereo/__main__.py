@@ -17,7 +17,7 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
-from mereo.api.words import SPEAKS_OPTIONS
+from mereo.api.words import option_words
 from mereo.cli import commands, dataset_commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
 from mereo.cli.calibrate import CalibrateCommand
 from mereo.cli.config_file import GivenOptions, defaults_from, read_options
@@ -80,7 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal that lacks a character gets another one, and no error
         sys.stdout.reconfigure(errors="replace")
     try:
-        with stop_signals():
+        with option_words(), stop_signals():
             watch = BEGUN if time.monotonic() - BEGUN.at_s < BRIEF_S else FreeCores()
             command = parse(arguments)
             if threads := getattr(command, "threads", 0):
@@ -107,16 +107,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(command: Command) -> int:
-    """Run a command and return its exit status; with ``--json`` standard output gets one object, all else goes beside.
-
-    Messages name options, not arguments of functions.
-    """
-    as_json, speaking = getattr(command, "json", False), SPEAKS_OPTIONS.set(True)
-    try:
-        with redirect_stdout(sys.stderr) if as_json else nullcontext():
-            outcome = command.run()
-    finally:
-        SPEAKS_OPTIONS.reset(speaking)
+    """Run a command, and return its exit status; with ``--json`` standard output gets one object and nothing else."""
+    as_json = getattr(command, "json", False)
+    with redirect_stdout(sys.stderr) if as_json else nullcontext():
+        outcome = command.run()
     if outcome is None:
         return 0
     if as_json:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Num
 
+from mereo.api.words import python_words
 from mereo.evaluation.sample_views import shipped_frame, shipped_frames
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import CloudAxes
@@ -23,6 +24,7 @@ DEPTH = Path("depth image")
 """Name of a depth image that comes from no file."""
 
 
+@python_words()
 def load_frame(
     source: object,
     *,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import get_args
 
+from mereo.api.words import python_words
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, registrar_for, statistical_model_of
 from mereo.learning.object_files import SCENE
@@ -63,6 +64,7 @@ class Object:
         return Object(model, self.scene, moved)
 
 
+@python_words()
 def load_object(
     weights: str | Path | Model,
     scene: Scene | str | Path | None = None,

@@ -4,7 +4,7 @@ frame -load_frame-> SensorFrame -find_object-> Observation -answer_frame-> Answe
 """
 
 import warnings
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, overload
 
@@ -23,7 +23,7 @@ from mereo.reconstruction.observation import Observation, SizeWarning, find_obje
 
 @overload
 def reconstruct(
-    frame: Sequence[Any],
+    frame: list[Any] | tuple[Any, ...],
     object: Object | Model | str | Path,
     method: AnswerMethod = ...,
     *,
@@ -74,10 +74,22 @@ def reconstruct(
     where nothing is found, and for methods other than "auto" where the model cannot be registered.
     """
     with python_words():
-        known = object_of(object)
-        if is_frame_list(frame):
-            return [_reconstruct(one, known, method, resolution, isolation, label_points, reading) for one in frame]
-        return _reconstruct(frame, known, method, resolution, isolation, label_points, reading)
+        one = partial(
+            _reconstruct,
+            object=object_of(object),
+            method=method,
+            resolution=resolution,
+            isolation=isolation or IsolationConfig(),
+            label_points=label_points,
+            reading=reading,
+        )
+        return list(map(one, frame)) if _are_many(frame) else one(frame)  # a warning names the caller's line
+
+
+def _are_many(frame: Any) -> bool:
+    """Whether this is a list of frames; those that are read already count as such."""
+    read = SensorFrame | Observation
+    return is_frame_list(frame) or (isinstance(frame, list | tuple) and any(isinstance(one, read) for one in frame))
 
 
 def _reconstruct(
@@ -85,11 +97,11 @@ def _reconstruct(
     object: Object,
     method: AnswerMethod,
     resolution: int,
-    isolation: IsolationConfig | None,
+    isolation: IsolationConfig,
     label_points: bool,
     reading: dict[str, Any],
 ) -> Result:
-    registrar, isolation = object.registrar(method), isolation or IsolationConfig()
+    registrar = object.registrar(method)
     seen = observation_of(frame, isolation, reading)
     answer = answer_frame(
         seen,

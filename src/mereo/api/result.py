@@ -207,6 +207,7 @@ class Result(Answer):
             rest = transform_points(np.linalg.inv(model.source_frame.T_scene_source), rest)
         return fit_rigid(scale * rest[rows], registered.material[rows])
 
+    @python_words()
     def save(
         self,
         path: str | Path | None = None,
@@ -243,6 +244,7 @@ class Result(Answer):
                     write_answer_file(partial, suffix, self, FilesConfig((), millimetres))
         return path
 
+    @python_words()
     def show(self, *, port: int | None = None, host: str = "127.0.0.1", block: bool | None = None) -> "OpenPage":
         """Open the viewer on this result, as `mereo view` does, and print its address.
 

@@ -41,8 +41,18 @@ def _argument(found: re.Match[str]) -> str:
 
 
 @contextmanager
+def option_words() -> Iterator[None]:
+    """Let the block's errors and warnings keep the options of the command line."""
+    before = SPEAKS_OPTIONS.set(True)
+    try:
+        yield
+    finally:
+        SPEAKS_OPTIONS.reset(before)
+
+
+@contextmanager
 def python_words() -> Iterator[None]:
-    """Raise the block's errors in the words of Python, unless the command line has called."""
+    """Raise errors of the block, or of what this decorates, in the words of Python, unless the command line calls."""
     try:
         yield
     except (ValueError, OSError, ImportError, TypeError) as error:

@@ -14,6 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from mereo.api.words import option_words
 from mereo.cli.reconstruct import FrameJob, answer_frame, print_segments, written
 from mereo.cli.reconstruct_told import Told
 from mereo.io.output_folders import check_new_directory, new_directory
@@ -80,6 +81,7 @@ class _Answering:
         printed = io.StringIO()
         try:
             with (
+                option_words(),
                 TemporaryDirectory() as folder,
                 redirect_stdout(printed),
                 warnings.catch_warnings(record=True) as warned,

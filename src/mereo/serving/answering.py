@@ -18,6 +18,7 @@ from typing import Any, cast
 from mereo.api.objects import Object, load_object
 from mereo.api.reconstruct import reconstruct
 from mereo.api.result import Result
+from mereo.api.words import option_words
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar
 from mereo.io.atomic_files import to_json
@@ -128,7 +129,7 @@ class Answerer:
 
     def _answer(self, frame: FrameRequest) -> Reply:
         started, messages, loaded = time.perf_counter(), list[str](), self.loaded[frame.weights]
-        with taken_warnings(messages, frame):
+        with option_words(), taken_warnings(messages, frame):
             read = read_frame(frame.path, frame.reading)
             if len(read.cloud) > self.setup.max_points:
                 raise TooManyPoints(

@@ -159,7 +159,7 @@ def _are_object(everything: Candidate, surfaces: Candidate) -> bool:
     """Whether the points that one hypothesis drops are the object's: either fit explains them."""
     dropped = ~surfaces.hypothesis.keep
     fits = [(one, one.modes) for one in (everything, surfaces) if one.modes is not None]
-    return max((one.off_surface[dropped] <= modes.tolerance).mean() for one, modes in fits) > GIVEN_BACK
+    return bool(max((one.off_surface[dropped] <= modes.tolerance).mean() for one, modes in fits) > GIVEN_BACK)
 
 
 def _with_explained_given_back(surfaces: Candidate) -> Reading | None:
