@@ -87,8 +87,8 @@ def answer_of(
     recognition = recognize(registration, model.calibration, displaced, stated, refusal)
     taken = registrar is not None and registration is not None and registrar.takes(registration)
     hypothesis = candidate.hypothesis if taken else likelier.reading
-    if taken and registrar is not None and registration is not None:
-        seen = seen.in_unit(registrar.unit_of(registration))
+    if taken and registrar is not None and registration is not None and recognition.known is not False:
+        seen = seen.in_unit(registrar.unit_of(registration))  # the size of another object says nothing
     return Answer(
         seen=seen.read_as(hypothesis),
         model=model,

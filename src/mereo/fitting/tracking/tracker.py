@@ -111,16 +111,18 @@ class Tracker:
         self._best = tracked.score if restart else max(self._best, tracked.score)
         model = self.registrar.network
         stated = self.registrar.stated_scene_unit(seen.frame.unit_m)
-        named = seen.in_unit(self.registrar.unit_of(tracked.registration))
+        recognition = recognize(tracked.registration, model.calibration, stated_scene_unit=stated)
+        if recognition.known is not False:
+            seen = seen.in_unit(self.registrar.unit_of(tracked.registration))
         return Answer(
-            seen=named.read_as(tracked.hypothesis),
+            seen=seen.read_as(tracked.hypothesis),
             model=model,
             registrar=self.registrar,
             hypothesis=tracked.hypothesis,
             T_camera_input=self._T_camera_input,
             registration=tracked.registration,
             taken=True,
-            recognition=recognize(tracked.registration, model.calibration, stated_scene_unit=stated),
+            recognition=recognition,
             seconds=time.perf_counter() - started,
         )
 
