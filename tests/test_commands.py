@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import mereo.__main__ as command_line
+from mereo.cli.outcome import Outcome
 from mereo.cli.reconstruct import FrameJob
 from mereo.io.config import InputConfig
 from mereo.training.config import PRESETS
@@ -23,22 +24,22 @@ from mereo.training.config import PRESETS
         ),
         (
             "train data --output run --preset tiny",
-            "mereo.training.trainer",
+            "mereo.api.steps",
             "train",
-            {"dataset_dir": Path("data"), "run_dir": Path("run"), "config": PRESETS["tiny"]},
+            {"dataset": Path("data"), "output": Path("run"), "config": PRESETS["tiny"]},
         ),
         (
             "evaluate bunny --output out --examples 4 --seed 1000001",
-            "mereo.visualization.result_files",
-            "evaluate_weights",
-            {"weights": "bunny", "output": Path("out"), "examples": 4, "seed": 1_000_001, "scene": None},
+            "mereo.api.steps",
+            "evaluate",
+            {"model": "bunny", "output": Path("out"), "examples": 4, "seed": 1_000_001, "scene": None},
         ),
         (
             "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force",
             "mereo.cli.reconstruct_many",
-            "reconstruct_file",
+            "reconstruct_inputs",
             {
-                "input": Path("a.png"),
+                "inputs": (Path("a.png"),),
                 "output": Path("out"),
                 "job": FrameJob("rope", reading=InputConfig(Path("k.json"), 5000.0, Path("m.png")), force=True),
             },
@@ -58,7 +59,13 @@ def test_command_calls_the_library_with_its_options(
     library = import_module(module)
     signature = inspect.signature(getattr(library, function))
     calls: list[dict[str, object]] = []
-    monkeypatch.setattr(library, function, lambda *a, **k: calls.append(signature.bind(*a, **k).arguments))
+    returned = {"main": {}, "reconstruct_inputs": Outcome({})}.get(function)
+
+    def called(*given: object, **named: object) -> object:
+        calls.append(signature.bind(*given, **named).arguments)
+        return returned
+
+    monkeypatch.setattr(library, function, called)
     assert command_line.main(text.split()) == 0
     (call,) = calls
     assert {name: call[name] for name in expected} == expected

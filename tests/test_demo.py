@@ -72,9 +72,10 @@ def test_the_result_of_an_earlier_version_is_kept_and_stops_no_demo(
 ) -> None:
     """It has no list of its files, so nobody can tell it from somebody's own."""
 
-    def show(_case: object, folder: Path, _console: object) -> None:
+    def show(_case: object, folder: Path, _console: object) -> dict[str, object]:
         with new_directory(folder, force=True) as directory:
             (directory / "summary.json").write_text("new")
+        return {}
 
     case = SimpleNamespace(name="rope")
     monkeypatch.setattr(demo, "_inputs", lambda: iter([lambda: case]))

@@ -154,7 +154,7 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
 def test_an_existing_result_is_kept(answer: Answer, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/mine.txt").write_text("keep")
-    with pytest.raises(FileExistsError, match="choose another --output or pass --force"):
+    with pytest.raises(FileExistsError, match="choose another output or pass overwrite=True"):
         Result.of(answer).save(tmp_path / "out")
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "mine.txt"]
 

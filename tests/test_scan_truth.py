@@ -128,7 +128,7 @@ def test_a_truth_file_never_runs_a_python_scene_that_the_user_has_not_named(
             read_truth(truth)
         assert not (folder / "was-run").exists()
     model = AnalyticModel.of(lambda points: points, ("left", "right"))
-    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.api.steps.load_for", lambda *_: model)
     monkeypatch.setattr("mereo.evaluation.scan_scoring.check_names", lambda _, names: named.append(names))
     monkeypatch.setattr("mereo.evaluation.scan_scoring.registrar_for", lambda *_: sys.exit("read"))
     named: list[tuple[str, ...]] = []

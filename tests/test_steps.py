@@ -26,7 +26,7 @@ def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest
     assert (scene, output, settings) == (str(tmp_path / "mine.yaml"), tmp_path / "data", GenerateConfig())
     assert named["examples"] == 3 and named["seed"] == 0 and named["workers"] == 2 and named["shard"] == (0, 1)
     trained: list[TrainConfig] = []
-    monkeypatch.setattr(steps.trainer, "train", lambda data, run, recipe: trained.append(recipe) or run / "w")
+    monkeypatch.setattr(steps.trainer, "train", lambda data, run, recipe, device: trained.append(recipe) or run / "w")
     assert mereo.train("data", tmp_path, "tiny", init="rope") == tmp_path / "w"
     assert trained == [replace(PRESETS["tiny"], init="rope")]
     with pytest.raises(ValueError, match="the preset is 'tinny'; it must be one of paper, .*: correct the spelling"):

@@ -207,7 +207,9 @@ def test_functions_take_urls_as_texts(monkeypatch: pytest.MonkeyPatch, tmp_path:
     made = mereo.generate(TOY, url, SMALL, examples=2, seed=3)
     assert isinstance(made, ObjectPath) and str(made) == url
     asked: list[object] = []
-    monkeypatch.setattr(trainer, "train", lambda dataset, output, config: asked.extend([dataset, output]) or output)
+    monkeypatch.setattr(
+        trainer, "train", lambda dataset, output, config, device: asked.extend([dataset, output]) or output
+    )
     mereo.train(url, tmp_path / "run", "tiny")
     mereo.train("data", "run", "tiny")
     assert asked == [made, tmp_path / "run", Path("data"), Path("run")]

@@ -77,7 +77,8 @@ def test_a_glb_has_normals_that_point_outward(tmp_path: Path) -> None:
         part = scene.geometry[name]
         outward = part.vertices - part.vertices.mean(axis=0)
         np.testing.assert_allclose(np.linalg.norm(part.vertex_normals, axis=1), 1.0, atol=1e-6)
-        assert (np.einsum("ij,ij->i", part.vertex_normals, outward) > 0.4 * np.linalg.norm(outward, axis=1)).all()
+        # at the corners of a long box, whose faces have normals of their own, they are nearly across
+        assert (np.einsum("ij,ij->i", part.vertex_normals, outward) > 0.2 * np.linalg.norm(outward, axis=1)).all()
 
 
 IMPORT = """

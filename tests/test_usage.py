@@ -33,7 +33,7 @@ def said(text: str, capsys: pytest.CaptureFixture[str]) -> str:
         ("--weights b reconstruct", "'--weights' comes before the command; options follow it: give the command first; "
          "see `mereo --help`"),
         # options
-        ("reconstruct", "mereo reconstruct lacks --weights and --output: add them; "
+        ("reconstruct", "mereo reconstruct lacks --weights: add it; "
          "see `mereo reconstruct --help`"),
         ("train data", "mereo train lacks --output: add it; see `mereo train --help`"),
         (f"{RECONSTRUCT} --resoluton 64", "mereo reconstruct has no option '--resoluton' (did you mean --resolution?); "

@@ -28,7 +28,6 @@ from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.cli.serve_command import ServeCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.cli.usage import noted_events, usage_sentence
-from mereo.io.atomic_files import json_text
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import FreeCores, use_free_cores, use_threads
 from mereo.io.foreseen import is_foreseen, printable_line, words_of
@@ -57,6 +56,9 @@ ANSWERING = (
 )
 """Commands that compute on the cores that are free. Not what trains: it outlives what is busy as it starts, and the
 same command gives the same weights."""
+
+AS_JSON = (commands.Demo, commands.Evaluate, ReconstructCommand)
+"""Commands that leave an outcome, which ``--json`` prints; others print their own."""
 
 USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 """Exit codes; 70 is EX_SOFTWARE of sysexits.h, the last two are 128 plus the signal's number, as shells report them."""
@@ -108,12 +110,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run(command: Command) -> int:
     """Run a command, and return its exit status; with ``--json`` standard output gets one object and nothing else."""
-    as_json = getattr(command, "json", False)
+    as_json = isinstance(command, AS_JSON) and command.json
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         outcome = command.run()
     if outcome is None:
         return 0
     if as_json:
+        from mereo.io.atomic_files import json_text
+
         print(json_text(outcome.facts), end="")
     return outcome.status
 

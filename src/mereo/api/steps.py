@@ -165,7 +165,7 @@ def evaluate(
             if settings is not None:
                 raise ValueError("scans are real and take no simulated camera: leave out the settings")
             if cluster is not None:
-                raise ValueError("scans are few and are scored here: leave out --ray")
+                raise ValueError("--scans are few and are scored here: leave out --ray")
             loaded = model if isinstance(model, Model) else load_for(model, inference)
             if output is None:
                 posed = load_scene(named) if isinstance(named, str) else named

@@ -249,7 +249,7 @@ class Evaluate:
             overwrite=self.force,
             options=options_of(self, "evaluate"),
         )
-        return Outcome(read_metrics(self.output / "metrics.json"))
+        return Outcome(read_metrics(self.output / "metrics.json") if self.json else {})
 
 
 @dataclass(frozen=True)
