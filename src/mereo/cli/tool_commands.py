@@ -76,9 +76,9 @@ class ViewCommand:
     """Look at a frame and its reconstruction in a browser, or move a scene by hand (--scene): needs the extra `view`.
 
     Attributes:
-        input: a point cloud or depth image, as for `mereo reconstruct`, or a result of it with a registered model (the
-            folder, or its state.json; the YAML scene file that it was made with is found again); a folder of `mereo
-            scene record`, which is played; without it (and --scene) a shipped frame.
+        input: a point cloud or depth image, as for `mereo reconstruct`, or a result of it (the folder, or its
+            state.json; the YAML scene file that it was made with is found again); a GLB file; a folder of `mereo scene
+            record`, which is played; without it (and --scene) a shipped frame.
         weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
         scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
         state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
