@@ -21,6 +21,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.models.weights import save_model
+from mereo.scenes import assets
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng

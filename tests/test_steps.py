@@ -65,8 +65,10 @@ def test_the_lines_of_the_readme_run_as_printed(tmp_path: Path, monkeypatch: pyt
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     exec(compile(code, "README.md", "exec"), names)
-    assert names["result"].taken and names["here"].shape == (1, 3)
-    np.testing.assert_allclose(names["result"].registration.to_rest(names["here"]), [[0, 1, 2]], atol=0.01)
+    result = names["result"]
+    assert result.taken and result.known is True and result["head"].error_radius > 0
+    here = result.registered.to_camera([[0.0, 1.0, 2.0]])
+    np.testing.assert_allclose(result.registered.to_rest(here), [[0, 1, 2]], atol=0.01)
     assert sorted(path.name for path in (tmp_path / "result").glob("[!.]*")) == [
         *("labels.npz", "preview.png", "radius95.glb", "report.html", "segments.glb", "state.json", "summary.json")
     ]
