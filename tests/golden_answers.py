@@ -33,14 +33,15 @@ from mereo.evaluation.results import grid_confusion, labels_on
 from mereo.evaluation.scans import SCANS, bunny_posed
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import fit_rigid
-from mereo.scenes.scene import SCENES, Scene
+from mereo.models.weights import shipped_names
+from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.examples import sample_view
 
 SEED, VIEWS = 1000, 4
 CAMERAS: tuple[Sensor, ...] = ("paper", "structured-light", "time-of-flight")
-OBJECTS = (*SCENES, *OWN, "scans")
+OBJECTS = (*shipped_names(), *OWN, "scans")
 RESOLUTION, CELLS, POSITIONS = 48, 60, 64
 
 NEAR_SIZE, NEAR_SHARE = 0.002, 0.01
