@@ -1,4 +1,4 @@
-"""Answers are as they were: what of the golden answers in ``golden/`` holds on every processor (``golden_answers``)."""
+"""Answers are as they were: what of the golden answers (``golden_answers``) holds on every processor."""
 
 import pytest
 from golden_answers import OBJECTS, difference, facts_of, frames_of, kept_of, mean_score
