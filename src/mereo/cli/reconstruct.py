@@ -113,8 +113,9 @@ class FrameJob:
 
     def asking(self, model: Model) -> "FrameJob":
         """The same, asking the same weights on another device; what is known of scene and attachments stays so."""
-        moved, _ = copy(self), self.registrar
-        vars(moved).pop("registrar")
+        _ = self.registrar  # set up once, before it is moved
+        moved = copy(self)
+        vars(moved).pop("registrar", None)
         vars(moved).update(object=self.object.asking(model))
         return moved
 
