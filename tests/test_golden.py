@@ -4,8 +4,8 @@ import pytest
 from golden_answers import OBJECTS, difference, facts_of, frames_of, kept_of, mean_score
 
 AS_WELL = 0.05
-"""How far the mean score of an object's clean views may be from what it was: on another processor one of four may end in
-another state. Noisy views end in others so often that their scores say nothing (experiments, entry 62)."""
+"""How far the mean score of an object's clean views may be from what it was: on another processor one of four may end
+in another state. Noisy views end in others so often that their scores say nothing (experiments, entry 62)."""
 
 FIRM = {"pliers": "paper 0", "lump": "paper 0", "liver": "paper 1"}
 """Views that are answered in a second or two, on every processor alike."""

@@ -44,7 +44,8 @@ class InputConfig:
         mask: image that is not 0 on the object.
         frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
         drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
-        unit_m: metres per unit of a point cloud: 0.001 for millimetres; by default 1 (ZDF: 0.001).
+        unit_m: metres per unit of a point cloud: 0.001 for millimetres (ZDF has it). Without it lengths of options are
+            in the cloud's unit, and the fit finds the unit where the object's true size is known.
         topic: of a ROS recording; by default its first depth image topic, else its first cloud topic.
         frame_index: which frame of a ROS recording, from 0, or of an intrinsics file that describes many.
     """
