@@ -165,7 +165,7 @@ def altered(**changes: Any) -> SimpleNamespace:
     return made
 
 
-IMAGE = "is an image of depths, which needs the camera's intrinsics: give mereo.DepthImage.depth, camera"
+IMAGE = "is an image of depths, which needs the camera's intrinsics: give intrinsics=, .* or mereo.DepthImage.depth, "
 
 REFUSED: dict[str, tuple[Any, str]] = {
     "nothing": (None, "^the NoneType cannot be read as a frame; one of these is needed: an array, tensor or nested"),

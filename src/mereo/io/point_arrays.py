@@ -215,8 +215,8 @@ def _what_it_is(values: np.ndarray) -> str:
     wide = columns > MOST_COLUMNS
     if (wide and rows != 3) if flat else (columns == 1 or (wide and rows == 1)):
         return (
-            "is an image of depths, which needs the camera's intrinsics: give mereo.DepthImage(depth, camera), with "
-            "h x w floats and a mereo.Camera or mereo.read_camera(file)"
+            "is an image of depths, which needs the camera's intrinsics: give intrinsics=, a mereo.Camera or a file of "
+            "one, or mereo.DepthImage(depth, camera)"
         )
     if columns < 3:
         return f"has {counted(columns, 'column')}; points have three, x, y and z: give all three"

@@ -39,7 +39,8 @@ class SensorFrame:
         cloud: the measured points, in the file's axes and unit.
         unit_m: metres per unit; None where neither the file nor an option says it.
         axes: the cloud's.
-        depth: the depth image in metres that the points come from, without what a mask leaves out; None for clouds.
+        depth: the depth image that the points come from, in their unit (metres, of files), without what a mask leaves
+            out; None for clouds.
         message: the recording's message, by topic and time; empty for other files.
         invalid: number of points without a measurement that were left out.
     """
