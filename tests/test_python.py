@@ -216,7 +216,7 @@ def test_a_frame_may_be_many_things(result: Result, tmp_path: Path, monkeypatch:
         found = mereo.reconstruct(one, MODEL, "network", resolution=24)
         np.testing.assert_array_equal(found.reconstruction.labels.labels, grid)
     known = replace(MODEL, provenance={"visible_m": [2, 3]})
-    monkeypatch.setattr(reconstruct, "_reconstruct", unchecked(reconstruct._reconstruct))
+    monkeypatch.setattr(reconstruct, "reconstruct_observation", unchecked(reconstruct.reconstruct_observation))
     for one in (tmp_path / "cloud.npy", seen(), [seen()]):
         with pytest.warns(SizeWarning, match="the visible part is 0.18 m long, but 2 to 3 m in training") as warned:
             unchecked(mereo.reconstruct)(one, known, resolution=8, unit_m=1.0)

@@ -74,39 +74,37 @@ def reconstruct(
     where nothing is found, and for methods other than "auto" where the model cannot be registered.
     """
     with python_words():
-        one = partial(
-            _reconstruct,
+        answer = partial(
+            reconstruct_observation,
             object=object_of(object),
             method=method,
             resolution=resolution,
             isolation=isolation or IsolationConfig(),
             label_points=label_points,
-            reading=reading,
         )
-        return list(map(one, frame)) if _are_many(frame) else one(frame)  # a warning names the caller's line
+        frames = frame if _are_many(frame) else [frame]
+        seen = (observation_of(one, isolation or IsolationConfig(), reading) for one in frames)
+        results = list(map(answer, seen))  # a warning names the caller's line
+        return results if _are_many(frame) else results[0]
 
 
-def _are_many(frame: Any) -> bool:
-    """Whether this is a list of frames; those that are read already count as such."""
-    read = SensorFrame | Observation
-    return is_frame_list(frame) or (isinstance(frame, list | tuple) and any(isinstance(one, read) for one in frame))
-
-
-def _reconstruct(
-    frame: Any,
+def reconstruct_observation(
+    seen: Observation,
     object: Object,
-    method: AnswerMethod,
-    resolution: int,
-    isolation: IsolationConfig,
-    label_points: bool,
-    reading: dict[str, Any],
+    method: AnswerMethod = "auto",
+    *,
+    resolution: int = 128,
+    isolation: IsolationConfig = IsolationConfig(),  # noqa: B008 (frozen)
+    label_points: bool = False,
 ) -> Result:
-    registrar = object.registrar(method)
-    seen = observation_of(frame, isolation, reading)
+    """Find all segments of an object that was observed: ``reconstruct`` once the frame is read and isolated.
+
+    Takes its arguments, raises and warns as it does. Of ``isolation`` it matters whether every point is kept.
+    """
     answer = answer_frame(
         seen,
         object.model,
-        registrar,
+        object.registrar(method),
         keep_all=isolation.keep_all,
         resolution=resolution,
         label_points=label_points,
@@ -119,6 +117,12 @@ def _reconstruct(
     if warning is not None:
         warnings.warn(warning if SPEAKS_OPTIONS.get() else in_python(warning), SizeWarning, stacklevel=3)
     return result
+
+
+def _are_many(frame: Any) -> bool:
+    """Whether this is a list of frames; those that are read already count as such."""
+    read = SensorFrame | Observation
+    return is_frame_list(frame) or (isinstance(frame, list | tuple) and any(isinstance(one, read) for one in frame))
 
 
 def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, Any]) -> Observation:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.api.objects import Object, load_object
-from mereo.api.reconstruct import reconstruct
+from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Result
 from mereo.cli.explain import explain, print_sure, wish_of
 from mereo.cli.outcome import NOT_RECOGNIZED, Outcome
@@ -154,7 +154,7 @@ def answer_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: Path)
     print(seen)
     placed = job.placed  # what is carried is refused before the work
     wishes = [wish_of(text, job.object.names) for text in job.explain]
-    found = reconstruct(
+    found = reconstruct_observation(
         seen,
         job.object,
         job.method,

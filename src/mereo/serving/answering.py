@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 from mereo.api.objects import Object, load_object
-from mereo.api.reconstruct import reconstruct
+from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Result
 from mereo.api.words import option_words
 from mereo.fitting.config import AnswerMethod
@@ -138,7 +138,7 @@ class Answerer:
                 )
             seen = find_object(read, frame.isolation)
             read_s = time.perf_counter() - started
-            result = reconstruct(
+            result = reconstruct_observation(
                 seen, loaded.object, loaded.method, resolution=frame.resolution, isolation=frame.isolation
             )
         started = time.perf_counter()
