@@ -27,7 +27,7 @@ from mereo.models.model import EncodedCloud, Model
 from mereo.reconstruction.coarse_to_fine import Field
 from mereo.reconstruction.isosurfaces import extract_whole, locate
 from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
-from mereo.reconstruction.strays import Reading, as_cloud
+from mereo.reconstruction.strays import Reading
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
@@ -105,14 +105,11 @@ class EncodedFrame:
         return PointCloud(transform_points(self.T_camera_input, self.points))
 
 
-def encode_frame(
-    cloud: PointCloud | Float[np.ndarray, "n 3"] | Reading, model: Model, axes: CloudAxes = "camera"
-) -> EncodedFrame:
-    """Encode a cloud, or a reading of it.
+def encode_frame(reading: Reading, model: Model, axes: CloudAxes = "camera") -> EncodedFrame:
+    """Encode the points that a hypothesis takes for the object's.
 
     Raises ``ValueError`` for unusable clouds.
     """
-    reading = cloud if isinstance(cloud, Reading) else Reading.of_all(as_cloud(cloud))
     points = reading.cloud.points
     T_camera_input = into_camera(points, axes)
     seconds: dict[str, float] = {}

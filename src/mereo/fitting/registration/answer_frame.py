@@ -117,13 +117,13 @@ def fit_hypotheses(
     """
     started = time.perf_counter()
     axes = seen.frame.axes
+    is_certain = scene_unit is not None
+    if scene_unit is None and registrar is not None:
+        scene_unit = registrar.stated_scene_unit(seen.frame.metres)
     hypotheses = readings(seen.cloud, axes, keep_all)
     likelier = encode_frame(hypotheses[0], model, axes)
     if registrar is None:
         return Candidate(likelier), likelier
-    is_certain = scene_unit is not None
-    if scene_unit is None:
-        scene_unit = registrar.stated_scene_unit(seen.frame.metres)
 
     def fit(encoded: EncodedFrame, patience: Registrar) -> Candidate:
         dropped = encoded.reading.whole.points[~encoded.reading.keep]
