@@ -69,7 +69,8 @@ def executed(notebook: Notebook) -> Notebook:
 def shown(notebook: Notebook) -> list[str]:
     """What the cells print and show as text, without what differs from run to run and where meshes are missing.
 
-    Numbers are #, and so is the way of a fit, which without the scene's mesh is by modes alone; warnings are left out.
+    Numbers are #, with one space however they are aligned, and so is the way of a fit, which without the scene's mesh is
+    by modes alone; warnings are left out.
     """
     told = []
     for cell in notebook["cells"]:
@@ -77,7 +78,7 @@ def shown(notebook: Notebook) -> list[str]:
             if output.get("name") == "stderr":
                 continue
             text = output.get("text") or output.get("data", {}).get("text/plain") or [output["output_type"]]
-            told.append(re.sub(r"[\d.]+|modes|draws", "#", "".join(text)))
+            told.append(re.sub(r" +", " ", re.sub(r"[\d.]+|modes|draws", "#", "".join(text))))
     return told
 
 
