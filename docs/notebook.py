@@ -69,8 +69,8 @@ def executed(notebook: Notebook) -> Notebook:
 def shown(notebook: Notebook) -> list[str]:
     """What the cells print and show as text, without what differs from run to run and where meshes are missing.
 
-    Numbers are #, with one space however they are aligned, and so is the way of a fit, which without the scene's mesh is
-    by modes alone; warnings are left out.
+    Numbers are #, with one space however they are aligned, and so is the way of a fit, which without the scene's mesh
+    is by modes alone; warnings are left out.
     """
     told = []
     for cell in notebook["cells"]:
