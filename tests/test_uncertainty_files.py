@@ -205,7 +205,7 @@ def load_unit(model: Model, cloud: PointCloud) -> float:
 
 
 def test_a_stream_says_it_where_it_is_asked_to(model: Model, cloud: PointCloud) -> None:
-    tracker = Tracker.of(model, "modes")
+    tracker = Tracker(Registrar.of(model, "modes"))
     followed = [tracker.follow(observe(cloud), 0.05 * number) for number in range(2)]
     assert followed[1].tracked
     silent, told = FrameAnswer.of_registration(followed[1]), FrameAnswer.of_registration(followed[1], True)

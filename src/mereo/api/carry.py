@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried, carry, place
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
@@ -104,10 +105,17 @@ def _moved(answer: Answer, mesh: SegmentedMesh, files: CarryFrame) -> SegmentedM
 
 
 def _carried(answer: Answer, attachment: Attachment, files: CarryFrame) -> Carried:
-    if answer.registrar is None or answer.registered is None:
-        raise ValueError(
-            "the answer is the network's, but --carry needs a registration, along which things move: leave out of the "
-            "frame what is not the object, or take the registered model in any case with --method modes"
-        )
+    registered = registration_of(answer)
+    assert answer.registrar is not None
     (placed,) = place([attachment], answer.registrar, files)
-    return carry(placed, answer.registered)
+    return carry(placed, registered)
+
+
+def registration_of(answer: Answer) -> Registration:
+    """Registration along which things are carried, in the frame's axes; ``ValueError`` where the network answers."""
+    if answer.registered is None:
+        raise ValueError(
+            "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
+            "cloud what is not the object, or take the registered model in any case with --method modes"
+        )
+    return answer.registered

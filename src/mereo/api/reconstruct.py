@@ -73,19 +73,20 @@ def reconstruct(
     Warns with ``SizeWarning`` where the visible part cannot be the object. Raises ``ValueError`` for unusable frames,
     where nothing is found, and for methods other than "auto" where the model cannot be registered.
     """
+    isolation = isolation or IsolationConfig()
     with python_words():
         answer = partial(
             reconstruct_observation,
             object=object_of(object),
             method=method,
             resolution=resolution,
-            isolation=isolation or IsolationConfig(),
+            isolation=isolation,
             label_points=label_points,
         )
-        frames = frame if _are_many(frame) else [frame]
-        seen = (observation_of(one, isolation or IsolationConfig(), reading) for one in frames)
-        results = list(map(answer, seen))  # a warning names the caller's line
-        return results if _are_many(frame) else results[0]
+        if not _are_many(frame):
+            return answer(observation_of(frame, isolation, reading))
+        seen = (observation_of(one, isolation, reading) for one in frame)
+        return list(map(answer, seen))  # not a comprehension: a warning names the caller's line
 
 
 def reconstruct_observation(

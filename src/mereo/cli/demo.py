@@ -21,7 +21,8 @@ from mereo.cli.reconstruct import print_source
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import grid_confusion, labels_on
-from mereo.evaluation.sample_views import SHIPPED_SCAN, T_MODEL_SCAN, load_view, shipped_frame
+from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view, shipped_frame
+from mereo.evaluation.scans import BUNNY_SCAN_POSES
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import statistical_model_of
 from mereo.io.output_folders import check_new_directory
@@ -121,7 +122,7 @@ def _scan_case() -> Case:
     frame, known = shipped_frame(SHIPPED_SCAN), load_object("bunny")
     model = statistical_model_of(known.model)
     assert model.source_frame is not None
-    truth = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source @ T_MODEL_SCAN))
+    truth = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source @ BUNNY_SCAN_POSES[SHIPPED_SCAN]))
     title = f"{SHIPPED_SCAN}: a real range scan of the Stanford bunny"
     return Case(SHIPPED_SCAN, title, known, frame, truth_grid(truth))
 

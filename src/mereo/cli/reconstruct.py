@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from mereo.api.carry import registration_of
 from mereo.api.objects import Object, load_object
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Result
@@ -141,7 +142,7 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Re
     with shown_stages(), new_directory(output, job.force, [input, *job.read]) as directory:
         found = answer_frame(read_frame(input, job.reading), directory, job, Path(input).absolute())
     print_segments(found)
-    print(written(output, seconds_of(found)))
+    print(written(output, found.reconstruction.seconds))
     return found
 
 
@@ -188,21 +189,12 @@ def written(output: str | Path, seconds: float) -> str:
     return f"wrote {output} in {seconds:.1f} s; open {Path(output) / 'report.html'} in a browser"
 
 
-def seconds_of(found: Answer) -> float:
-    """Seconds that an answer took, without reading and writing."""
-    return sum(found.reconstruction.timings_s.values())
-
-
 def carried_along(placed: Sequence[Placed], found: Answer) -> tuple[Carried, ...]:
     """What is carried, in the input's frame and unit, one printed line each; ``ValueError`` without a registration."""
-    if placed and (found.registration is None or not found.taken):
-        raise ValueError(
-            "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
-            "cloud what is not the object, or take the registered model in any case with --method modes"
-        )
-    if found.registered is None:
+    if not placed:
         return ()
-    carried = tuple(carry_one(one, found.registered) for one in placed)
+    registered = registration_of(found)
+    carried = tuple(carry_one(one, registered) for one in placed)
     for one in carried:
         print(one.told)
     return carried

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from mereo.cli.reconstruct import seconds_of
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.recognition import Known
 from mereo.visualization.result_files import summary_of
@@ -42,6 +41,6 @@ class Told:
             explained="" if registration is None else f"{registration.explained:.1%}",
             known=KNOWN[found.recognition.known],
             segments=f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}",
-            seconds=seconds_of(found),
+            seconds=found.reconstruction.seconds,
             summary=summary_of(found),
         )

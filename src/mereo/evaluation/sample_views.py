@@ -27,9 +27,6 @@ SHIPPED = Path(__file__).parents[1] / "frames"
 SHIPPED_SCAN = "bun000"
 """Name of the shipped range scan of the Stanford bunny: 4,000 of its 40,256 points, evenly spread."""
 
-T_MODEL_SCAN = np.eye(4)
-"""Pose of the shipped scan: its coordinates are those of the scanned model."""
-
 GUESSED_UNIT_M = 0.01
 """Metres per scene unit of shipped frames of objects whose true size is not known."""
 

@@ -72,7 +72,6 @@ class Answer:
         candidate: the fit to the frame by itself; None where the last frame's state led to the answer.
         registration: of the deformation model, in the camera frame and the frame's unit; None without one.
         taken: whether the answer is the registered model; otherwise it is the network's.
-        error: why no registration was found, where one was wanted.
         recognition: whether the frame shows the object, in a state that was learned; whoever answers.
         likelier: the hypothesis that is likelier without a fit, encoded: from it the network answers.
         resolution: cells along the longest side of the object's box in ``reconstruction``.
@@ -88,7 +87,6 @@ class Answer:
     candidate: Candidate | None = None
     registration: Registration | None = None
     taken: bool = False
-    error: ValueError | None = None
     recognition: Recognition = NOT_ASKED
     likelier: EncodedFrame | None = None
     resolution: int = 128
@@ -97,6 +95,11 @@ class Answer:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.seen.frame.source!r}: {self.source})"
+
+    @property
+    def error(self) -> ValueError | None:
+        """Why no registration was found, where one was wanted, as it was raised."""
+        return None if self.candidate is None else self.candidate.error
 
     @property
     def refusal(self) -> str | None:
@@ -144,7 +147,7 @@ class Answer:
 
     @property
     def encoded(self) -> EncodedFrame:
-        """Observed points of the answer, and what the network makes of them; a tracked answer asks it now."""
+        """Observed points of the registered model, and what the network makes of them; a tracked answer asks it now."""
         if self.candidate is not None:
-            return self.candidate.encoded if self.taken or self.likelier is None else self.likelier
+            return self.candidate.encoded
         return encode_frame(self.hypothesis, self.model, self.seen.frame.axes)

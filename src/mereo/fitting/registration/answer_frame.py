@@ -12,7 +12,7 @@ import time
 from dataclasses import replace
 
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.recognition import recognize
+from mereo.fitting.registration.recognition import Recognition, recognize
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.transforms import transform_points
@@ -87,8 +87,8 @@ def answer_of(
     recognition = recognize(registration, model.calibration, displaced, stated, refusal)
     taken = registrar is not None and registration is not None and registrar.takes(registration)
     hypothesis = candidate.hypothesis if taken else likelier.reading
-    if taken and registrar is not None and registration is not None and recognition.known is not False:
-        seen = seen.in_unit(registrar.unit_of(registration))  # the size of another object says nothing
+    if taken and registrar is not None and registration is not None:
+        seen = in_found_unit(seen, registrar, registration, recognition)
     return Answer(
         seen=seen.read_as(hypothesis),
         model=model,
@@ -98,10 +98,16 @@ def answer_of(
         candidate=candidate,
         registration=registration,
         taken=taken,
-        error=candidate.error,
         recognition=recognition,
         likelier=likelier,
     )
+
+
+def in_found_unit(
+    seen: Observation, registrar: Registrar, registration: Registration, recognition: Recognition
+) -> Observation:
+    """Observation in the unit that a registration finds, where the frame knows none; another object's says nothing."""
+    return seen if recognition.known is False else seen.in_unit(registrar.unit_of(registration))
 
 
 # --- which points belong to the object --------------------------------------------------------------------------------

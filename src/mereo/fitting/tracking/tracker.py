@@ -12,9 +12,9 @@ from functools import cached_property
 
 import numpy as np
 
-from mereo.fitting.config import AnswerMethod, FitConfig
+from mereo.fitting.config import FitConfig
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.answer_frame import answer_of, fit_hypotheses
+from mereo.fitting.registration.answer_frame import answer_of, fit_hypotheses, in_found_unit
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import Registrar
@@ -23,7 +23,6 @@ from mereo.fitting.tracking.config import TrackConfig
 from mereo.fitting.tracking.next_fit import Track, gated, next_fit
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.transforms import transform_points
-from mereo.models.model import Model
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.reconstruction.strays import Reading
@@ -43,11 +42,6 @@ class Tracker:
         self.registrar = registrar.at_once
         self.config = config
         self.forget()
-
-    @classmethod
-    def of(cls, network: Model, method: AnswerMethod = "auto") -> "Tracker":
-        """Tracker of the object that weights were trained on; raises as ``Registrar.of`` does."""
-        return cls(Registrar.of(network, method))
 
     def forget(self) -> None:
         """Start anew: the next frame is fitted by itself."""
@@ -112,8 +106,7 @@ class Tracker:
         model = self.registrar.network
         stated = self.registrar.stated_scene_unit(seen.frame.unit_m)
         recognition = recognize(tracked.registration, model.calibration, stated_scene_unit=stated)
-        if recognition.known is not False:
-            seen = seen.in_unit(self.registrar.unit_of(tracked.registration))
+        seen = in_found_unit(seen, self.registrar, tracked.registration, recognition)
         return Answer(
             seen=seen.read_as(tracked.hypothesis),
             model=model,
