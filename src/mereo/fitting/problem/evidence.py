@@ -1,9 +1,10 @@
 """What a frame shows, and what it rules out: observed points, the silhouette, and the free space in front of them.
 
-A frame is a cloud seen from one place. A vertex of a fitted model may lie neither beside all lines of sight that met
-the object (outside the silhouette) nor in front of the observed points around its own line of sight (free space). Lines
-of sight are compared by their angles, so a depth image and a cloud without one are the same, and so is any axis or
-unit.
+A frame is a cloud seen from one place, and what is known of the lines of sight beside it (``geometry.sight_lines``). A
+vertex of a fitted model may lie neither on a line of sight that went past the object, before what that met (outside the
+silhouette), nor in front of the observed points around its own line of sight (free space). Nothing is ruled out along
+lines of sight on which nothing is known. Lines of sight are compared by their angles, so a depth image and a cloud
+without one are the same, and so is any axis or unit.
 The camera is at the origin.
 """
 
@@ -15,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.downsampling import means_along_sight
+from mereo.geometry.sight_lines import SightKind, SightLines
 
 MOST_POINTS = 6000
 """Denser clouds are averaged to so many points, which have less noise."""
@@ -37,17 +39,44 @@ AROUND = 9
 
 
 @dataclass(frozen=True, eq=False)
+class PastLines:
+    """Lines of sight that went past the object, each to something behind it.
+
+    Attributes:
+        sight: search tree over their unit vectors.
+        ranges: distance from the camera of what each met.
+        reach: angle up to which a line of sight without a measurement of its own is taken to be like the nearest.
+    """
+
+    sight: cKDTree
+    ranges: Float[np.ndarray, " p"]
+    reach: float
+
+    @classmethod
+    def of(cls, points: Float[np.ndarray, "p 3"], pitch: float) -> "PastLines | None":
+        """Lines of sight to points behind an object whose own are ``pitch`` apart; None without any."""
+        if not len(points):
+            return None
+        ranges = np.linalg.norm(points, axis=1)
+        sight = cKDTree(points / ranges[:, None])
+        angle = sight.query(sight.data, k=[min(4, len(points))])[0]
+        return cls(sight, ranges, AROUND_PITCHES * max(pitch, float(np.median(angle))))
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """An observed cloud, prepared for comparison with surfaces; lengths in scene units.
 
     Attributes:
         points: observed, camera frame.
         partners: some of them, evenly spread.
-        sight: search tree over the unit vectors towards ``points`` and doubtful points.
+        sight: search tree over the unit vectors towards ``points``, and along lines of sight on which nothing is known.
         ranges: distance of each point from the camera.
-        front: nearest of these among each line of sight and those around it; 0 along those of doubtful points.
+        front: nearest of these among each line of sight and those around it; 0 where nothing is known.
         pitch: angle between neighbouring lines of sight.
         around: indices of each point's neighbours among the lines of sight, up to 8.
+        past: lines of sight that went past the object to something that was measured; None without any.
+        elsewhere: kind of the lines of sight that are near none of all these.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -57,6 +86,8 @@ class Evidence:
     front: Float[np.ndarray, " s"]
     pitch: float
     around: Int[np.ndarray, "n k"]
+    past: PastLines | None = None
+    elsewhere: SightKind = "past"
 
     @classmethod
     def of(
@@ -64,11 +95,13 @@ class Evidence:
         points: Float[np.ndarray, "n 3"],
         doubtful: Float[np.ndarray, "d 3"] | None = None,
         partners: int = PARTNERS,
+        lines: SightLines | None = None,
     ) -> "Evidence":
         """Prepare a cloud, with so many ``partners`` at most; its lines of sight start at the origin.
 
-        Along those of ``doubtful`` points, which a front end has taken for strays, anything may be: they are within
-        the silhouette, and rule nothing out.
+        Along those of ``doubtful`` points, which a front end has taken for outliers, anything may be: they are within
+        the silhouette, and rule nothing out. ``lines`` says what is known beside the cloud; without it, and where it
+        leaves that open, all lines of sight beside the cloud went past the object.
         """
         points = means_along_sight(points, MOST_POINTS)
         ranges = np.linalg.norm(points, axis=1)
@@ -77,11 +110,17 @@ class Evidence:
         # the fourth neighbour of a pixel is one pitch away, as the first is; irregular clouds are not so lucky
         pitch = float(np.median(angle[:, min(4, len(points)) - 1]))
         front = np.where(angle <= AROUND_PITCHES * pitch, ranges[near], np.inf).min(axis=1)
-        if doubtful is not None and len(doubtful):
-            toward = doubtful / np.linalg.norm(doubtful, axis=1, keepdims=True)
+        unknown = [part for part in (doubtful, None if lines is None else lines.unknown) if part is not None]
+        if sum(map(len, unknown)):
+            toward = np.concatenate(unknown)
+            toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
             sight = cKDTree(np.concatenate([sight.data, toward]))
-            front = np.concatenate([front, np.zeros(len(doubtful))])
-        return cls(points, points[spread(points, partners)], sight, ranges, front, pitch, near[:, 1:])
+            front = np.concatenate([front, np.zeros(len(toward))])
+        chosen, around = points[spread(points, partners)], near[:, 1:]
+        if lines is None:
+            return cls(points, chosen, sight, ranges, front, pitch, around)
+        past, elsewhere = PastLines.of(lines.past, pitch), lines.elsewhere or "past"
+        return cls(points, chosen, sight, ranges, front, pitch, around, past, elsewhere)
 
     @property
     def with_more_partners(self) -> "Evidence":
@@ -104,4 +143,22 @@ class Evidence:
         out = sideways / np.maximum(length, 1e-12)[:, None]
         ahead = self.front[near] - slack - distance
         direction = np.where(beside[:, None], out, toward)
-        return direction, np.maximum(np.where(beside, length - self.pitch * distance, ahead), 0.0)
+        amount = np.maximum(np.where(beside, length - self.pitch * distance, ahead), 0.0)
+        if self.past is not None or self.elsewhere == "unknown":
+            rows = np.flatnonzero(beside)
+            nearest = np.where(near[rows] < len(self.points), np.inf, angle[rows])
+            amount[rows[distance[rows] > self._free(toward[rows], nearest) - slack]] = 0.0
+        return direction, amount
+
+    def _free(self, toward: Float[np.ndarray, "n 3"], unknown: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Distance up to which lines of sight beside the object are free: infinite where nothing ends them.
+
+        ``unknown`` is the angle to the nearest line of sight on which nothing is known, infinite where one that met the
+        object is nearer; one that went past the object counts where it is nearer than that.
+        """
+        elsewhere = np.inf if self.elsewhere == "past" else 0.0
+        if self.past is None:
+            return np.full(len(toward), elsewhere)
+        angle, near = self.past.sight.query(toward)
+        free = np.where(angle <= self.past.reach, self.past.ranges[near], elsewhere)
+        return np.where(unknown < angle, 0.0, free)
