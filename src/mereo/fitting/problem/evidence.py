@@ -150,6 +150,19 @@ class Evidence:
             amount[rows[distance[rows] > self._free(toward[rows], nearest) - slack]] = 0.0
         return direction, amount
 
+    def along(
+        self, toward: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """What each line of sight says, as ``violations`` takes it.
+
+        Returns the unit vector of the nearest one that met the object or of which nothing is known, the distance before
+        which that is free, and the distance up to which a line of sight beside it is free; -1 where it is not beside.
+        """
+        angle, near = self.sight.query(toward)
+        nearest = np.where(near < len(self.points), np.inf, angle)
+        free = np.where(angle > SILHOUETTE_PITCHES * self.pitch, self._free(toward, nearest), -1.0)
+        return self.sight.data[near], self.front[near], free
+
     def _free(self, toward: Float[np.ndarray, "n 3"], unknown: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Distance up to which lines of sight beside the object are free: infinite where nothing ends them.
 

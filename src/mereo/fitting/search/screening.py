@@ -1,0 +1,262 @@
+"""Many poses at once, compared with a frame and drawn towards it by rigid steps, in single array operations.
+
+    poses -aligned-> poses nearer to the frame, with their costs
+
+Each pose takes some observed points into the frame of its state, whose table names the nearest sample of the surface;
+some samples are looked up in a table of what the frame rules out. A Gauss-Newton step turns, shifts and scales.
+
+Notation: n poses, p observed points, w samples that are looked up.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.spatial.transform import Rotation
+
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.residuals import ROBUST, WITNESS_WEIGHT
+from mereo.fitting.search.shape_tables import CELLS, ShapeTables
+from mereo.geometry.transforms import rotation_along
+from mereo.scenes.statistical_model import WITNESSES
+
+POINTS = 128
+"""Observed points that a pose is compared with."""
+
+LOOKED_UP = 128
+"""Samples of the surface that are looked up."""
+
+SIDE = 96
+"""Cells along each side of the table of what a frame rules out; about as many as a depth image has pixels there."""
+
+OUTSIDE = WITNESS_WEIGHT * WITNESSES / 3000.0
+"""Weight of what the frame rules out beside that of the cloud: as in the fit."""
+
+DAMPING = 1e-3
+"""Damping of a step, relative to the diagonal."""
+
+FARTHEST = 0.5
+"""Largest turn of one step, rad, and largest change of the scale's logarithm."""
+
+ALONG = 0.2
+"""Weight of the distance along the surface in a step: with planes alone, poses far away slide past each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class SightTable:
+    """What a frame rules out, as a table of lines of sight; the rules are those of ``Evidence.violations``.
+
+    Attributes:
+        T: rotation into the axes of the table, whose third is the direction of the cloud.
+        low, cell: corner of the table and length of a cell, as slopes across the direction.
+        toward: unit vector of the nearest line of sight to each cell that met the object, or of which nothing is known.
+        front: distance before which it is free.
+        free: distance up to which a cell beside these is free; negative where it is not beside.
+        pitch: angle between neighbouring lines of sight.
+    """
+
+    T: Float32[np.ndarray, "3 3"]
+    low: Float32[np.ndarray, "2"]
+    cell: float
+    toward: Float32[np.ndarray, "c 3"]
+    front: Float32[np.ndarray, " c"]
+    free: Float32[np.ndarray, " c"]
+    pitch: float
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> "SightTable":
+        """Table around the cloud, three times as wide; beyond, the nearest cell of the border stands for a place."""
+        direction = evidence.sight.data[: len(evidence.points)]
+        T = rotation_along(direction.mean(axis=0) / np.linalg.norm(direction.mean(axis=0))).T
+        turned = evidence.points @ T.T
+        slope = turned[:, :2] / np.maximum(turned[:, 2:], 0.1 * np.linalg.norm(turned, axis=1, keepdims=True))
+        low, high = slope.min(axis=0), slope.max(axis=0)
+        side = 3.0 * float((high - low).max()) + 4 * evidence.pitch
+        corner = (low + high - side) / 2
+        cells = min(SIDE, max(16, int(side / evidence.pitch)))
+        across = corner + (np.stack(np.meshgrid(*(np.arange(cells) + 0.5,) * 2, indexing="ij"), -1)) * side / cells
+        sight = np.concatenate([across.reshape(-1, 2), np.ones((cells * cells, 1))], axis=1) @ T
+        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        toward, front, free = evidence.along(sight)
+        return cls(
+            T.astype(np.float32),
+            corner.astype(np.float32),
+            side / cells,
+            toward.astype(np.float32),
+            front.astype(np.float32),
+            free.astype(np.float32),
+            evidence.pitch,
+        )
+
+    def violations(
+        self, place: Float32[np.ndarray, "n w 3"], slack: float
+    ) -> tuple[Float32[np.ndarray, "n w 3"], Float32[np.ndarray, "n w"]]:
+        """``Evidence.violations`` of many places, up to a cell."""
+        cells = round(np.sqrt(len(self.front)))
+        turned = place @ self.T.T
+        slope = turned[..., :2] / np.maximum(turned[..., 2:], 1e-6)
+        index = np.clip(((slope - self.low) / self.cell).astype(np.int32), 0, cells - 1)
+        row = index[..., 0] * cells + index[..., 1]
+        distance = np.sqrt(np.einsum("nwi,nwi->nw", place, place))
+        toward, free = self.toward[row], self.free[row]
+        beside = free > distance - slack
+        sideways = toward * distance[..., None] - place
+        length = np.sqrt(np.einsum("nwi,nwi->nw", sideways, sideways))
+        direction = np.where(beside[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
+        ahead = np.where(free < 0, self.front[row] - slack - distance, 0.0)
+        amount = np.where(beside, length - self.pitch * distance, ahead)
+        return direction, np.maximum(amount, 0.0).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Many poses of states, with their costs.
+
+    Attributes:
+        state: row of each one's state in the tables.
+        rotation, translation, log_scale: of the similarity into the camera frame.
+        cost: of each, as last computed.
+    """
+
+    state: Int[np.ndarray, " n"]
+    rotation: Float32[np.ndarray, "n 3 3"]
+    translation: Float32[np.ndarray, "n 3"]
+    log_scale: Float32[np.ndarray, " n"]
+    cost: Float32[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def rows(self, chosen: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Poses":
+        """Some of them."""
+        return Poses(*(part[chosen] for part in vars(self).values()))
+
+    @classmethod
+    def of_all(cls, parts: "list[Poses]") -> "Poses":
+        """All of several."""
+        return cls(*(np.concatenate(part) for part in zip(*(vars(one).values() for one in parts), strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """What poses are compared with: tables of states, some observed points, and what the frame rules out."""
+
+    tables: ShapeTables
+    points: Float32[np.ndarray, "p 3"]
+    sight: SightTable
+    half: float
+
+    @classmethod
+    def of(cls, tables: ShapeTables, evidence: Evidence, half: float) -> "Screen":
+        """Screen of a frame; ``half`` is half the object's length."""
+        return cls(tables, evidence.partners[:POINTS].astype(np.float32), SightTable.of(evidence), half)
+
+    def starts(self, rotations: Float[np.ndarray, "r 3 3"], scaled: bool) -> Poses:
+        """Every state at every rotation, its visible side on the cloud; where ``scaled``, as large as the cloud."""
+        rotations = rotations.astype(np.float32)
+        center = self.points.mean(axis=0)
+        ahead = center / np.linalg.norm(center)
+        weight = np.maximum(-(self.tables.normal @ (rotations.transpose(0, 2, 1) @ ahead).T), 0.0)  # q s r
+        weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
+        middle = np.matmul(weight.transpose(0, 2, 1), self.tables.place)  # q r 3
+        state, turn = np.divmod(np.arange(len(middle) * len(rotations)), len(rotations))
+        rotation, middle = rotations[turn], middle[state, turn]
+        log_scale = np.zeros(len(state), dtype=np.float32)
+        if scaled:
+            place = np.matmul(self.tables.place[state] - middle[:, None], rotation.transpose(0, 2, 1))
+            across = np.eye(3, dtype=np.float32) - ahead[:, None] * ahead
+            spread = np.einsum("nsi,nsi,ns->n", place @ across, place, weight.transpose(0, 2, 1)[state, turn])
+            seen = ((self.points - center) @ across * (self.points - center)).sum(axis=1).mean()
+            log_scale = (0.5 * np.log(seen / np.maximum(spread, 1e-9))).astype(np.float32)
+        shift = np.exp(log_scale)[:, None] * np.einsum("nij,nj->ni", rotation, middle)
+        return Poses(state, rotation, center - shift, log_scale, np.full(len(state), np.inf, dtype=np.float32))
+
+    def aligned(self, poses: Poses, sigmas: Float[np.ndarray, " i"], scaled: bool) -> Poses:
+        """Poses after one rigid step for each sigma, in shares of ``half``; the cost is that before the last step."""
+        for sigma in sigmas:
+            poses = self._step(poses, float(sigma) * self.half, scaled, True)
+        return poses
+
+    def judged(self, poses: Poses, sigma: float) -> Poses:
+        """Poses with their costs for a sigma in shares of ``half``."""
+        return self._step(poses, sigma * self.half, False, False)
+
+    def _step(self, poses: Poses, sigma: float, scaled: bool, moves: bool) -> Poses:
+        tables, state = self.tables, poses.state[:, None]
+        size, inverse = np.exp(poses.log_scale)[:, None, None], poses.rotation.transpose(0, 2, 1)
+        seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
+        index = ((seen - tables.low[state]) / tables.cell[state][..., None]).astype(np.int32)
+        index = np.clip(index, 0, CELLS - 1)
+        sample = tables.nearest[state, (index[..., 0] * CELLS + index[..., 1]) * CELLS + index[..., 2]]
+        place, normal = tables.place[state, sample], tables.normal[state, sample]
+        offset, narrow = seen - place, sigma / size[..., 0]
+        camera = -np.matmul(inverse, poses.translation[..., None]).transpose(0, 2, 1) / size
+        facing = np.einsum("npi,npi->np", camera - place, normal) > 0
+        squared = np.einsum("npi,npi->np", offset, offset) / narrow**2
+        squared = np.where(facing, squared, squared + ROBUST**2)
+        few = tables.place[poses.state, :: max(1, tables.place.shape[1] // LOOKED_UP)]
+        posed = size * np.matmul(few, inverse) + poses.translation[:, None]
+        direction, amount = self.sight.violations(posed, ROBUST * sigma)
+        outside, robust = (amount / sigma) ** 2, (4 * ROBUST) ** 2
+        cost = (squared / (1.0 + squared / ROBUST**2)).mean(axis=1)
+        cost = cost + OUTSIDE * (outside / (1.0 + outside / robust)).mean(axis=1)
+        poses = replace(poses, cost=cost.astype(np.float32))
+        if not moves:
+            return poses
+        weight = np.where(facing, 1.0 / (1.0 + squared / ROBUST**2) ** 2, 0.0) / len(self.points)
+        weight_outside = OUTSIDE / few.shape[1] / (1.0 + outside / robust) ** 2
+        rows = np.concatenate([np.cross(seen, normal), normal, -np.einsum("npi,npi->np", seen, normal)[..., None]], 2)
+        toward = np.matmul(direction, poses.rotation)  # in the model's frame, where a sample moves the other way
+        pull = -np.concatenate([np.cross(few, toward), toward, -np.einsum("nwi,nwi->nw", few, toward)[..., None]], 2)
+        rows, residual, weight = (
+            np.concatenate(parts, axis=1)
+            for parts in (
+                (rows, pull),
+                (np.einsum("npi,npi->np", offset, normal), -amount / size[..., 0]),
+                (weight, np.where(amount > 0, weight_outside, 0.0)),
+            )
+        )
+        matrix, gradient = _normal_equations(rows, residual, weight)
+        near, pulled = _along(seen, offset, ALONG * weight[:, : len(self.points)])
+        return _moved(poses, matrix + near, gradient + pulled, scaled)
+
+
+def _normal_equations(
+    rows: Float[np.ndarray, "n r 7"], residual: Float[np.ndarray, "n r"], weight: Float[np.ndarray, "n r"]
+) -> tuple[Float[np.ndarray, "n 7 7"], Float[np.ndarray, "n 7"]]:
+    weighted = (rows * weight[..., None]).transpose(0, 2, 1)
+    return np.matmul(weighted, rows), np.matmul(weighted, residual[..., None])[..., 0]
+
+
+def _along(
+    seen: Float[np.ndarray, "n p 3"], offset: Float[np.ndarray, "n p 3"], weight: Float[np.ndarray, "n p"]
+) -> tuple[Float[np.ndarray, "n 7 7"], Float[np.ndarray, "n 7"]]:
+    """Normal equations of the points' distances in space, from the nearest samples."""
+    rows = np.zeros((*seen.shape, 7), dtype=np.float32)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rows[:, :, i, j], rows[:, :, i, k] = seen[..., k], -seen[..., j]
+        rows[:, :, i, 3 + i], rows[:, :, i, 6] = 1.0, -seen[..., i]
+    count = len(seen)
+    return _normal_equations(rows.reshape(count, -1, 7), offset.reshape(count, -1), np.repeat(weight, 3, axis=1))
+
+
+def _moved(poses: Poses, matrix: Float[np.ndarray, "n 7 7"], gradient: Float[np.ndarray, "n 7"], scaled: bool) -> Poses:
+    """Poses after the step that the normal equations ask for."""
+    count = 7 if scaled else 6
+    matrix, gradient = matrix[:, :count, :count].astype(np.float64), gradient[:, :count].astype(np.float64)
+    diagonal = np.einsum("nkk->nk", matrix)
+    matrix = matrix + (DAMPING * diagonal + 1e-9)[:, :, None] * np.eye(count)
+    step = -np.linalg.solve(matrix, gradient[..., None])[..., 0]
+    angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
+    step[:, :3] *= np.minimum(1.0, FARTHEST / np.maximum(angle, 1e-9))
+    log_scale = poses.log_scale.astype(np.float64)
+    if scaled:
+        log_scale = log_scale + np.clip(step[:, 6], -FARTHEST, FARTHEST)
+    rotation = poses.rotation @ Rotation.from_rotvec(-step[:, :3]).as_matrix()
+    shift = np.exp(log_scale)[:, None] * np.einsum("nij,nj->ni", rotation, step[:, 3:6])
+    return replace(
+        poses,
+        rotation=rotation.astype(np.float32),
+        translation=(poses.translation - shift).astype(np.float32),
+        log_scale=log_scale.astype(np.float32),
+    )
