@@ -84,6 +84,12 @@ class Correspondences:
         return self.rows(np.concatenate(chosen))
 
 
+def nothing() -> Correspondences:
+    """No correspondences, of a frame of which no network was asked."""
+    none = np.empty((0, 3))
+    return Correspondences(none, none, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))
+
+
 def find_correspondences(
     model: Model, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
 ) -> Correspondences | None:

@@ -1,15 +1,14 @@
 """Search for the pose and the state of an object in a frame, without a network.
 
-    cloud, lines of sight, statistical model -search_modes-> ModesFit, and how many candidates explain the frame alike
+    cloud, lines of sight, statistical model -search-> the state that explains the frame, and how many explain it alike
 
 1. Rotations, evenly over all, of the mean state, with its visible side on the cloud; rigid steps draw each towards the
    frame (``screening``).
 2. The best that differ are bent towards the frame by few points, from wide to narrow.
-3. The best of these are fitted as a frame always is, until one explains the frame and its rivals are worse.
-4. While none does, the same again from other states of the library, more and more of them.
+3. The best of these are fitted as a frame always is, as long as they may be better or as good.
+4. While the frame is not explained, the same again from other states of the library, more and more of them.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from mereo.fitting.modes.fit import Judged, explored, fit_cloud, refine
 from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.joints import positions
 from mereo.fitting.problem.priors import Prior
-from mereo.fitting.problem.problem import UNEXPLAINED, Problem
+from mereo.fitting.problem.problem import Problem
 from mereo.fitting.search.screening import Poses, Screen
 from mereo.fitting.search.shape_tables import tables_of
 
@@ -41,23 +41,31 @@ class SearchRound:
     fitted: int
 
 
-ROUNDS = (SearchRound(0, 600, 24, 6), SearchRound(12, 300, 40, 6), SearchRound(40, 300, 60, 8))
+ROUNDS = (SearchRound(0, 600, 12, 4), SearchRound(12, 300, 24, 6), SearchRound(40, 300, 40, 8))
 """Rounds of the search, one after the other while the frame is not explained."""
 
-SIGMAS = (0.15, 0.15, 0.12, 0.1, 0.08)
-"""The cloud's standard deviations in the rigid steps of all poses, as shares of the object's half length."""
-
-KEPT = 100
-"""Poses that are drawn nearer."""
-
-LAST_SIGMAS = (0.06, 0.05, 0.05, 0.05)
-"""The same of these."""
+SIGMAS = (
+    *((0.15, 1.0), (0.15, 0.7), (0.12, 0.6), (0.1, 0.6), (0.08, 0.6), (0.06, 0.7)),
+    *((0.05, 1.0), (0.05, 1.0), (0.05, 1.0)),
+)
+"""The cloud's standard deviation in each rigid step, in half lengths, and which share of the poses go on after it."""
 
 APART = 0.15
-"""Distance between two candidates' samples, as a share of the half length, up to which they are one."""
+"""Distance between two poses' samples, as a share of the half length, up to which they are one."""
+
+BENT_APART = 0.05
+"""The same of candidates that are bent already."""
 
 BENDING = ((0.12, 5, 0.05), (0.05, 8, 0.02))
 """First sigma, steps, and the sigma of the choice, of the two stages in which few points bend a candidate."""
+
+RIVAL = 1.5
+"""Misfit by few points, in misfits of the best, up to which a candidate may still be as good.
+
+Of 176 candidates of training views that had more, none was better than the best by more than a hundredth."""
+
+ALIKE = 0.05
+"""Difference of the cloud's misfit up to which two states explain a frame alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +73,13 @@ class Found:
     """Outcome of a search.
 
     Attributes:
+        problem: the frame, with the constants of its noise.
         best: the candidate that explains the frame best.
-        alike: number of candidates that explain it as well and differ from each other, itself included.
+        alike: number of candidates that explain it alike and differ from each other, the best included.
         tried: number of candidates that were fitted.
     """
 
+    problem: Problem
     best: Judged
     alike: int
     tried: int
@@ -87,35 +97,70 @@ def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
 
 def search(problem: Problem) -> Found:
     """Search for the state that explains a frame; the problem has no correspondences."""
-    best: Judged | None = None
     fitted: list[Judged] = []
     for stage in ROUNDS:
-        for posed in candidates(problem, stage):
-            judged = _fitted(problem, posed)
-            fitted.append(judged)
-            if best is None or judged.misfit.total < best.misfit.total:
-                best = judged
-        assert best is not None
+        fitted += fit_likely(problem, candidates(problem, stage), stage.fitted)
+        best = min(fitted, key=_total)
         if is_explained(problem, best):
             break
-    best = explored(problem, best)
-    return Found(best, 1, len(fitted))
+        fitted.append(explored(problem, best))
+        if is_explained(problem, fitted[-1]):
+            break
+    best = min(fitted, key=_total)
+    likely = [judged for judged in fitted if judged.misfit.cloud < best.misfit.cloud + ALIKE]
+    alike = differing(problem, [judged.posed for judged in sorted(likely, key=_total)], APART)
+    return Found(problem, best, len(alike), len(fitted))
+
+
+def _total(judged: Judged) -> float:
+    return judged.misfit.total
 
 
 def is_explained(problem: Problem, judged: Judged) -> bool:
     """Whether a state explains the cloud, noise aside."""
-    return judged.misfit.cloud < UNEXPLAINED
+    return problem.explained(judged.misfit.cloud, judged.surface, problem.config.explained)
 
 
-def candidates(problem: Problem, stage: SearchRound) -> Iterator[Posed]:
-    """Candidates of a round, the likeliest first."""
-    bent = screened(problem, stage)
+def fit_likely(problem: Problem, candidates: list[tuple[float, Posed]], most: int) -> list[Judged]:
+    """Fits of candidates that may be the best, of those given with their misfits by few points, the lowest first."""
+    fitted: list[Judged] = []
+    for cost, posed in candidates[:most]:
+        if fitted and cost > RIVAL * candidates[0][0] and is_explained(problem, min(fitted, key=_total)):
+            break
+        fitted.append(_fitted(problem, posed))
+    return fitted
+
+
+def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]]:
+    """Candidates of a round with their misfits by few points, the lowest first."""
     coarse, whole = problem.coarse, Prior.whole(problem.model)
+    bent, cost = screened(problem, stage), list[float]()
     for start, steps, sigma in BENDING:
         bent = [fit_cloud(coarse, posed, whole, start, steps, problem.config.pair_slack) for posed in bent]
         cost = [coarse.screen(posed, sigma * problem.model.half).without_network for posed in bent]
-        bent = [bent[index] for index in np.argsort(cost)[: max(stage.fitted, len(bent) // 2)]]
-    yield from bent[: stage.fitted]
+        order = np.argsort(cost)
+        bent, cost = [bent[index] for index in order], [cost[index] for index in order]
+        rows = differing(problem, bent, BENT_APART)[: max(stage.fitted, len(bent) // 2)]
+        bent, cost = [bent[row] for row in rows], [cost[row] for row in rows]
+    return list(zip(cost, bent, strict=True))
+
+
+def differing(problem: Problem, states: list[Posed], apart: float) -> list[int]:
+    """Rows of the states of which each differs from all before it by ``apart`` half lengths in the mean."""
+    model = problem.model
+    z = np.stack([posed.z for posed in states]).astype(np.float32)
+    unposed = positions(model, problem.joints.corners, z).reshape(len(z), -1, 3)
+    places = np.stack([posed.place(points) for posed, points in zip(states, unposed, strict=True)])
+    return _first_of_each(places, apart * model.half)
+
+
+def _first_of_each(places: Float[np.ndarray, "n p 3"], apart: float) -> list[int]:
+    """Rows of which each is farther than ``apart`` from all before it, in the root mean square."""
+    kept: list[int] = []
+    for row, place in enumerate(places):
+        if not kept or np.sqrt(((places[kept] - place) ** 2).sum(axis=2).mean(axis=1)).min() > apart:
+            kept.append(row)
+    return kept
 
 
 def screened(problem: Problem, stage: SearchRound) -> list[Posed]:
@@ -123,11 +168,17 @@ def screened(problem: Problem, stage: SearchRound) -> list[Posed]:
     tables = tables_of(problem.model, stage.states)
     screen = Screen.of(tables, problem.evidence, problem.model.half)
     turns = rotations(stage.rotations)
-    poses = screen.aligned(screen.starts(turns, False), np.array(SIGMAS), False)
-    poses = screen.judged(poses, LAST_SIGMAS[0])
-    poses = poses.rows(np.argsort(poses.cost)[: max(KEPT, 2 * stage.bent)])
-    poses = screen.judged(screen.aligned(poses, np.array(LAST_SIGMAS), False), LAST_SIGMAS[-1])
-    return [_posed(screen, poses, row) for row in _differing(screen, poses, stage.bent)]
+    poses = screen.starts(turns, False)
+    for sigma, share in SIGMAS:
+        poses = screen.aligned(poses, sigma, False)
+        count = max(round(share * len(poses)), 2 * stage.bent)
+        poses = poses if count >= len(poses) else poses.rows(np.argpartition(poses.cost, count)[:count])
+    poses = screen.judged(poses, SIGMAS[-1][0])
+    poses = poses.rows(np.argsort(poses.cost))
+    few = tables.place[poses.state, ::16]
+    size = np.exp(poses.log_scale)[:, None, None]
+    places = size * np.matmul(few, poses.rotation.transpose(0, 2, 1)) + poses.translation[:, None]
+    return [_posed(screen, poses, row) for row in _first_of_each(places, APART * problem.model.half)[: stage.bent]]
 
 
 def _posed(screen: Screen, poses: Poses, row: int) -> Posed:
@@ -136,24 +187,8 @@ def _posed(screen: Screen, poses: Poses, row: int) -> Posed:
     return Posed(rotation, poses.translation[row].astype(np.float64), z, float(poses.log_scale[row]))
 
 
-def _differing(screen: Screen, poses: Poses, count: int) -> list[int]:
-    """Rows of the best poses, each of which differs from all before it."""
-    few = screen.tables.place[poses.state, ::16]
-    size = np.exp(poses.log_scale)[:, None, None]
-    place = size * np.matmul(few, poses.rotation.transpose(0, 2, 1)) + poses.translation[:, None]
-    kept: list[int] = []
-    for row in np.argsort(poses.cost):
-        apart = np.sqrt(((place[kept] - place[row]) ** 2).sum(axis=2).mean(axis=1))
-        if not len(kept) or apart.min() > APART * screen.half:
-            kept.append(int(row))
-        if len(kept) == count:
-            break
-    return kept
-
-
 def _fitted(problem: Problem, posed: Posed) -> Judged:
     """Fit of a candidate, as a frame's fit ends."""
-    config = problem.config
-    whole = Prior.whole(problem.model)
+    config, whole = problem.config, Prior.whole(problem.model)
     posed = fit_cloud(problem, posed, whole, config.start_sigma, config.last_steps, config.pair_slack)
     return Judged.of(problem, posed).better(problem, refine(problem, posed))

@@ -75,7 +75,7 @@ class ShapeTables:
 
 
 def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
-    """Rows of the library's states that stand for all: nearest to the centres of so many clusters, the largest first."""
+    """Rows of the library's states that stand for all of them: those nearest to the centres of so many clusters."""
     if count >= len(model.library):
         return np.arange(len(model.library))
     shape = (model.library * model.motion).astype(np.float64)
@@ -89,7 +89,7 @@ def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
 
 @lru_cache(maxsize=MODELS)
 def tables_of(model: StatisticalModel, count: int) -> ShapeTables:
-    """Tables of the mean state (``count`` 0), or of ``count`` medoids of the library; kept, as a model never changes."""
+    """Tables of the mean state (``count`` 0), or of ``count`` medoids of the library; those of few models are kept."""
     surface = SampledSurface.of(model, SAMPLES)
     z = np.zeros((1, model.count), dtype=np.float32) if count == 0 else model.library[medoids(model, count)]
     return ShapeTables.of(model, z, surface)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, in_space
 from mereo.fitting.problem.noise import constants_for
@@ -206,9 +206,3 @@ def descend(problem: Problem, start: Posed, expectation: Expectation, config: Tr
         normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
         posed = posed.moved(normal.step(constants.damping))
     return posed
-
-
-def nothing() -> Correspondences:
-    """No correspondences."""
-    none = np.empty((0, 3))
-    return Correspondences(none, none, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))
