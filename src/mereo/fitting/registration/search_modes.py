@@ -4,6 +4,7 @@ cloud, lines of sight, statistical model -search-> ModesFit
 """
 
 import time
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -44,12 +45,14 @@ def search_modes(
         raise NotImplementedError
     unit, scale_std = scene_unit, KNOWN_SCALE_STD
     with one_blas_thread():
-        evidence = Evidence.of(
-            points / unit,
-            None if doubtful is None else doubtful / unit,
-            lines=None if lines is None else lines.scaled(1 / unit),
-        )
-        found = search(Problem(model, NetworkTerm.none(model), evidence, scale_std, config))
+        def problem_of(lines: SightLines | None) -> Problem:
+            seen, outliers = points / unit, None if doubtful is None else doubtful / unit
+            evidence = Evidence.of(seen, outliers, lines=None if lines is None else lines.scaled(1 / unit))
+            return Problem(model, NetworkTerm.none(model), evidence, scale_std, config)
+
+        is_open = lines is None or lines.elsewhere is None
+        partial = replace(lines or SightLines.of_cloud(), elsewhere="unknown")
+        found = search(problem_of(lines), problem_of(partial) if is_open else None)
         problem, modes = found.problem, found.best
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)

@@ -9,7 +9,7 @@
 4. While the frame is not explained, the same again from other states of the library, more and more of them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +19,7 @@ from mereo.fitting.modes.fit import Judged, explored, fit_cloud, refine
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.joints import positions
 from mereo.fitting.problem.priors import Prior
-from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.problem import UNEXPLAINED, Problem
 from mereo.fitting.search.screening import Poses, Screen
 from mereo.fitting.search.shape_tables import tables_of
 
@@ -64,8 +64,18 @@ RIVAL = 1.5
 
 Of 176 candidates of training views that had more, none was better than the best by more than a hundredth."""
 
+NOISY_FITS = 4
+"""Candidates that are fitted again where a frame is noisy."""
+
 ALIKE = 0.05
 """Difference of the cloud's misfit up to which two states explain a frame alike."""
+
+
+WHOLE = 150.0
+"""Misfit by which an object that is seen whole may be explained worse than one that something hides in part.
+
+The silhouette only adds to the misfit, so the hypothesis without it always has a lower one: on whole views by less than
+this, on views of which 30 % are hidden by more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,21 +105,72 @@ def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
     return matrices
 
 
-def search(problem: Problem) -> Found:
-    """Search for the state that explains a frame; the problem has no correspondences."""
-    fitted: list[Judged] = []
-    for stage in ROUNDS:
-        fitted += fit_likely(problem, candidates(problem, stage), stage.fitted)
-        best = min(fitted, key=_total)
-        if is_explained(problem, best):
+@dataclass(eq=False)
+class _Trail:
+    """Search under one hypothesis of what the lines of sight beside the cloud say, as far as it has come."""
+
+    problem: Problem
+    fitted: list[Judged] = field(default_factory=list)
+
+    @property
+    def best(self) -> Judged:
+        return min(self.fitted, key=_total)
+
+    @property
+    def is_explained(self) -> bool:
+        return is_explained(self.problem, self.best)
+
+    def go_on(self, stage: SearchRound) -> None:
+        self.fitted += fit_likely(self.problem, candidates(self.problem, stage), stage.fitted)
+        if not self.is_explained:
+            self.fitted.append(explored(self.problem, self.best))
+
+    def try_too(self, posed: Posed) -> None:
+        self.fitted.append(Judged.of(self.problem, posed).better(self.problem, refine(self.problem, posed)))
+
+    def as_noisy(self) -> "_Trail | None":
+        """The same with the constants for what the best fit leaves over, where that is noise and not its own error.
+
+        Not before other states were tried: a wrong state may leave over what looks like noise.
+        """
+        noisy = self.problem.as_noisy_as(self.best.surface)
+        if noisy is None:
+            return None
+        states = [judged.posed for judged in sorted(self.fitted, key=_total)]
+        rows = differing(noisy, states, BENT_APART)[:NOISY_FITS]
+        trail = _Trail(noisy, [explored(noisy, _fitted(noisy, states[row])) for row in rows])
+        return trail if noisy.leaves_noise(trail.best.surface) else None
+
+    def found(self) -> Found:
+        best = self.best
+        likely = [judged for judged in self.fitted if judged.misfit.cloud < best.misfit.cloud + ALIKE]
+        alike = differing(self.problem, [judged.posed for judged in sorted(likely, key=_total)], APART)
+        return Found(self.problem, best, len(alike), len(self.fitted))
+
+
+def search(whole: Problem, partial: Problem | None = None) -> Found:
+    """Search for the state that explains a frame.
+
+    Args:
+        whole: the frame, without correspondences.
+        partial: the same where it is open whether the object is seen whole: with nothing known beside the cloud. It is
+            taken where it explains the frame better by more than ``WHOLE``.
+    """
+    trails = [_Trail(problem) for problem in (whole, partial) if problem is not None]
+    for number, stage in enumerate(ROUNDS):
+        for trail in trails:
+            trail.go_on(stage)
+        if partial is not None:  # either may have found what the other has missed
+            first, second = (trail.best.posed for trail in trails)
+            trails[0].try_too(second)
+            trails[1].try_too(first)
+        chosen = min(trails, key=lambda trail: trail.best.misfit.total + (WHOLE if trail is not trails[0] else 0.0))
+        LOG.append([trail.best.misfit.total for trail in trails])
+        if chosen.is_explained or (number > 0 and chosen.best.misfit.cloud < UNEXPLAINED):
             break
-        fitted.append(explored(problem, best))
-        if is_explained(problem, fitted[-1]):
-            break
-    best = min(fitted, key=_total)
-    likely = [judged for judged in fitted if judged.misfit.cloud < best.misfit.cloud + ALIKE]
-    alike = differing(problem, [judged.posed for judged in sorted(likely, key=_total)], APART)
-    return Found(problem, best, len(alike), len(fitted))
+        if number > 0 and (noisy := chosen.as_noisy()) is not None:
+            return noisy.found()
+    return chosen.found()
 
 
 def _total(judged: Judged) -> float:
@@ -192,3 +253,4 @@ def _fitted(problem: Problem, posed: Posed) -> Judged:
     config, whole = problem.config, Prior.whole(problem.model)
     posed = fit_cloud(problem, posed, whole, config.start_sigma, config.last_steps, config.pair_slack)
     return Judged.of(problem, posed).better(problem, refine(problem, posed))
+LOG = []
