@@ -28,8 +28,9 @@ RIM = 1.5
 """Pixels from the object within which a line of sight is unknown: masks are wrong by one, and cameras mix both sides of
 an edge."""
 
-AROUND = 5
-"""Pixels, along each side, of the neighbourhood whose farthest object depth a depth beside it is compared with."""
+AROUND = 49
+"""Object points nearest to a line of sight, with whose median depth its own is compared; a mask that is too wide leaves
+a rim of background among them, which are the fewer."""
 
 ALIKE, AGREEING = 0.25, 3
 """Pixels that went past are a surface's: of the 8 around each, so many agree in how far behind the object they are, to
@@ -89,10 +90,9 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     # at least the picture's own pixels next to the border are the object's, or nothing of it lies beyond
     cut = min(rows[0], columns[0], shown.shape[0] - 1 - rows[-1], shown.shape[1] - 1 - columns[-1]) < RIM
     distance, nearest = ndimage.distance_transform_edt(~is_object, return_indices=True)
-    farthest = ndimage.maximum_filter(np.where(is_object, depth, 0.0), size=AROUND)
-    behind = farthest[nearest[0], nearest[1]]
-    past = (depth - behind > STEEPEST * behind / _focal_px(whole.camera)) & (distance > RIM)
-    past &= _agrees(np.where(past, depth - behind, 0.0))
+    near = _outline_depth(depth, is_object)[nearest[0], nearest[1]]
+    past = (depth - near > STEEPEST * near / _focal_px(whole.camera)) & (distance > RIM)
+    past &= _agrees(np.where(past, depth - near, 0.0))
     beside = inside & (distance > RIM)
     silent = past.sum() < max(SILENT * beside.sum(), 1)
     unknown = ~is_object & ~past & ((inside & ((depth > 0) | (not silent))) | (~inside & cut))
@@ -101,7 +101,7 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     u, v = u[kept], v[kept]
     went = past[v, u]
     places = whole.camera.unproject(
-        np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(went, depth[v, u], behind[v, u])
+        np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(went, depth[v, u], near[v, u])
     )
     return SightLines(places[went], places[~went], None if silent else "unknown")
 
@@ -120,6 +120,16 @@ def _window(
     inside = image[low[0] : high[0], low[1] : high[1]]
     cut[low[0] - top : high[0] - top, low[1] - left : high[1] - left] = inside
     return cut
+
+
+def _outline_depth(depth: Float[np.ndarray, "h w"], is_object: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Median depth of the object around each pixel of its outline, 0 elsewhere."""
+    pixels = np.argwhere(is_object)
+    outline = np.argwhere(is_object & ~ndimage.binary_erosion(is_object))
+    nearest = cKDTree(pixels).query(outline, k=range(1, min(AROUND, len(pixels)) + 1))[1]
+    around = np.zeros(depth.shape)
+    around[tuple(outline.T)] = np.median(depth[tuple(pixels.T)][nearest], axis=1)
+    return around
 
 
 def _agrees(behind: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -170,17 +180,18 @@ def lines_of_points(points: Float[np.ndarray, "n 3"], is_object: Bool[np.ndarray
     if len(others) == 0 or not is_object.any():
         return SightLines.of_cloud()
     tree, own = cKDTree(sight[is_object]), ranges[is_object]
-    near = min(len(own), AROUND)
-    pitch = float(np.median(tree.query(tree.data, k=[near])[0]))
+    # the fourth neighbour of a pixel is one pitch away, as the first is
+    pitch = float(np.median(tree.query(tree.data, k=[min(len(own), 5)])[0]))
     size = float(np.ptp(tree.data, axis=0).max())
-    angle, nearest = tree.query(sight[others], k=range(1, near + 1), distance_upper_bound=max(size, pitch))
+    angle = tree.query(sight[others], distance_upper_bound=max(size, pitch))[0]
     # along a line that met the object, nothing else is said
-    there = (angle[:, 0] > 0.5 * pitch) & np.isfinite(angle[:, 0])
-    others, angle, nearest = others[there], angle[there], nearest[there]
-    behind = np.append(own, 0.0)[nearest].max(axis=1)
-    past = (ranges[others] - behind > STEEPEST * pitch * behind) & (angle[:, 0] > RIM * pitch)
+    there = (angle > 0.5 * pitch) & np.isfinite(angle)
+    others, angle = others[there], angle[there]
+    nearest = tree.query(sight[others], k=range(1, min(len(own), AROUND) + 1))[1]
+    near = np.median(own[nearest], axis=1)
+    past = (ranges[others] - near > STEEPEST * pitch * near) & (angle > RIM * pitch)
     ahead = tree.data.mean(axis=0)
     across = np.linalg.svd(ahead[None])[2][1:]
     u, v = np.floor((sight[others] - ahead) @ across.T / max(pitch, 1e-12)).astype(np.int64).T
-    kept = _evenly(u, v, angle[:, 0] / max(pitch, 1e-12), MOST_LINES)
+    kept = _evenly(u, v, angle / max(pitch, 1e-12), MOST_LINES)
     return SightLines(points[others[past & kept]], points[others[~past & kept]])
