@@ -81,9 +81,9 @@ def read_intrinsics(
     """Pinhole intrinsics, and the depth scale where it is stated, from JSON or ROS YAML.
 
     Understood: ``fx fy cx cy``, RealSense's ``fx fy ppx ppy``, nerfstudio's ``fl_x fl_y cx cy w h``, 3DObjectTracking's
-    ``f_u f_v pp_x pp_y``, a matrix (``MATRICES``), ROS CameraInfo as YAML or JSON, and files of many frames: BOP's scene_camera.json, and
-    transforms.json with intrinsics for each frame. ``width`` and ``height`` may be called ``image_width`` and
-    ``image_height``.
+    ``f_u f_v pp_x pp_y``, a matrix (``MATRICES``), ROS CameraInfo as YAML or JSON, and files of many frames: BOP's
+    scene_camera.json, and transforms.json with intrinsics for each frame. ``width`` and ``height`` may be called
+    ``image_width`` and ``image_height``.
 
     Args:
         path: the file.

@@ -10,9 +10,11 @@ that isolation left out.
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.camera import DepthImage
 from mereo.geometry.downsampling import STEEPEST
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.sight_lines import SightLines
@@ -80,19 +82,23 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
         whole: the depth image with all that was measured.
         shown: pixels that show the object.
     """
-    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
-    reach = max(int(np.ptp(rows)), int(np.ptp(columns))) + 1
+    rows, columns = np.flatnonzero(shown.any(axis=1)).tolist(), np.flatnonzero(shown.any(axis=0)).tolist()
+    height, width = rows[-1] - rows[0] + 1, columns[-1] - columns[0] + 1
+    reach = max(height, width)
     # the window may reach beyond the picture
     top, left = rows[0] - reach, columns[0] - reach
-    shape = int(np.ptp(rows)) + 1 + 2 * reach, int(np.ptp(columns)) + 1 + 2 * reach
+    shape = height + 2 * reach, width + 2 * reach
     depth, is_object = _window(whole.depth, top, left, shape), _window(shown, top, left, shape)
     inside = _window(np.ones_like(shown), top, left, shape)
-    # at least the picture's own pixels next to the border are the object's, or nothing of it lies beyond
+    # nothing of the object lies outside the picture unless it reaches the edge
     cut = min(rows[0], columns[0], shown.shape[0] - 1 - rows[-1], shown.shape[1] - 1 - columns[-1]) < RIM
     distance, nearest = ndimage.distance_transform_edt(~is_object, return_indices=True)
     near = _outline_depth(depth, is_object)[nearest[0], nearest[1]]
-    past = (depth - near > STEEPEST * near / _focal_px(whole.camera)) & (distance > RIM)
+    step = STEEPEST / min(whole.camera.focal_x_px, whole.camera.focal_y_px)
+    past = (depth - near > step * near) & (distance > RIM)
     past &= _agrees(np.where(past, depth - near, 0.0))
+    hides = (depth > 0) & ~is_object & (distance <= RIM) & (near - depth > step * near)
+    past &= (depth > (1 + step) * near.max()) | ~_surfaces_with(hides, np.where(is_object, 0.0, depth), step)
     beside = inside & (distance > RIM)
     silent = past.sum() < max(SILENT * beside.sum(), 1)
     unknown = ~is_object & ~past & ((inside & ((depth > 0) | (not silent))) | (~inside & cut))
@@ -104,10 +110,6 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
         np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(went, depth[v, u], near[v, u])
     )
     return SightLines(places[went], places[~went], None if silent else "unknown")
-
-
-def _focal_px(camera: Camera) -> float:
-    return min(camera.focal_x_px, camera.focal_y_px)
 
 
 def _window(
@@ -132,6 +134,27 @@ def _outline_depth(depth: Float[np.ndarray, "h w"], is_object: Bool[np.ndarray, 
     return around
 
 
+def _surfaces_with(
+    marked: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], step: float
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of all surfaces that have ``AGREEING`` marked pixels or more; a depth of 0 is no surface.
+
+    A surface goes on from pixel to pixel as long as depth changes by less than ``step`` times itself.
+    """
+    if marked.sum() < AGREEING:
+        return np.zeros(depth.shape, dtype=bool)
+    number = np.arange(depth.size).reshape(depth.shape)
+    pairs = []
+    for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        one, other = depth[first], depth[second]
+        joined = (one > 0) & (other > 0) & (np.abs(one - other) < step * np.minimum(one, other))
+        pairs.append(np.stack([number[first][joined], number[second][joined]]))
+    row, column = np.concatenate(pairs, axis=1)
+    edges = coo_matrix((np.ones(len(row), dtype=np.int8), (row, column)), shape=(depth.size, depth.size))
+    label = connected_components(edges, directed=False)[1].reshape(depth.shape)
+    return np.asarray(np.bincount(label[marked], minlength=label.max() + 1)[label] >= AGREEING)
+
+
 def _agrees(behind: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels with enough neighbours that are as far behind the object, see ``ALIKE``; 0 is not behind."""
     padded = np.pad(behind, 1)
@@ -153,15 +176,27 @@ def _evenly(
     The pitch of the grid grows with the distance from the object, in pixels, but it is 1 up to ``DENSE``, even where
     more than ``limit`` pixels are so near.
     """
-    far = float(distance.max(initial=DENSE))
-    kept = np.ones(len(u), dtype=bool)
-    while kept.sum() > limit and far > DENSE:
-        far = max(0.8 * far, DENSE)
-        level = np.floor(np.log2(np.maximum(distance / far, 1.0))).astype(np.int64)
-        level += distance > far
-        between = (1 << level) - 1
-        kept = (u & between == 0) & (v & between == 0)
+    octaves = np.log2(np.maximum(distance / DENSE, 1.0))
+    low, high = 0.0, float(octaves.max(initial=0.0))  # how many of them are dense
+    kept = _on_grids(u, v, octaves)
+    if len(u) <= limit or kept.sum() > limit:
+        return kept if len(u) > limit else np.ones(len(u), dtype=bool)
+    while high - low > 0.1:
+        middle = 0.5 * (low + high)
+        more = _on_grids(u, v, octaves - middle)
+        if more.sum() > limit:
+            high = middle
+        else:
+            low, kept = middle, more
     return kept
+
+
+def _on_grids(
+    u: Int[np.ndarray, " n"], v: Int[np.ndarray, " n"], octaves: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Pixels of which both coordinates are multiples of 2^k, where k is ``octaves`` rounded up, and 0 at least."""
+    between = (1 << np.maximum(np.ceil(octaves), 0.0).astype(np.int64)) - 1
+    return (u | v) & between == 0
 
 
 # --- clouds ----------------------------------------------------------------------------------------------------------
