@@ -180,6 +180,8 @@ def test_a_depth_as_far_as_the_object_is_unknown() -> None:
     depth = np.where(SHOWN, 1.0, np.where(np.arange(50)[:, None] >= 35, 1.02, 2.0))
     labels = lines_of_image(DepthImage(depth, CAMERA), SHOWN)
     assert 1.02 not in labels.past[:, 2] and (np.isclose(depth[pixels(labels.unknown, CAMERA)], 1.02)).sum() > 500
+    by_cloud = lines_of_points(DepthImage(depth, CAMERA).to_points().points, SHOWN.ravel())
+    assert 1.02 not in by_cloud.past[:, 2] and (np.isclose(by_cloud.unknown[:, 2], 1.02)).sum() > 500
 
 
 @pytest.mark.parametrize("factor", [0.001, 1000.0])
