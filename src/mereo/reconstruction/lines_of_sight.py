@@ -211,10 +211,10 @@ def lines_of_points(points: Float[np.ndarray, "n 3"], is_object: Bool[np.ndarray
     """
     ranges = np.linalg.norm(points, axis=1)
     sight = points / np.maximum(ranges, 1e-300)[:, None]
-    others = np.flatnonzero(~is_object & (ranges > 0))
+    others = np.flatnonzero(~is_object & (points[:, 2] > 0))
     if len(others) == 0 or not is_object.any():
         return SightLines.of_cloud()
-    tree, own = cKDTree(sight[is_object]), ranges[is_object]
+    tree, own = cKDTree(sight[is_object]), points[is_object, 2]
     # the fourth neighbour of a pixel is one pitch away, as the first is
     pitch = float(np.median(tree.query(tree.data, k=[min(len(own), 5)])[0]))
     size = float(np.ptp(tree.data, axis=0).max())
@@ -224,7 +224,7 @@ def lines_of_points(points: Float[np.ndarray, "n 3"], is_object: Bool[np.ndarray
     others, angle = others[there], angle[there]
     nearest = tree.query(sight[others], k=range(1, min(len(own), AROUND) + 1))[1]
     near = np.median(own[nearest], axis=1)
-    past = (ranges[others] - near > STEEPEST * pitch * near) & (angle > RIM * pitch)
+    past = (points[others, 2] - near > STEEPEST * pitch * near) & (angle > RIM * pitch)
     ahead = tree.data.mean(axis=0)
     across = np.linalg.svd(ahead[None])[2][1:]
     u, v = np.floor((sight[others] - ahead) @ across.T / max(pitch, 1e-12)).astype(np.int64).T
