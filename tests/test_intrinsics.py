@@ -30,6 +30,7 @@ CAMERAS = {
     "bop.json": json.dumps({"0": {"cam_K": FLAT, "depth_scale": 1.0, **SIZE}}),
     "nerfstudio.json": json.dumps({"fl_x": 525, "fl_y": 520, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480}),
     "calibrator.yml": CALIBRATOR,
+    "tracking.yaml": "%YAML:1.2\nintrinsics: {f_u: 525, f_v: 520, pp_x: 319.5, pp_y: 239.5, width: 640, height: 480}\n",
 }
 
 

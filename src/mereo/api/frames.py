@@ -95,7 +95,7 @@ def load_frame(
     if isinstance(observed, DepthImage):
         if axes == "scanner":
             raise ValueError("a depth image is in the camera's axes: leave out axes")
-        return SensorFrame(CLOUD, observed.to_points(), unit_m, "camera", observed)
+        return SensorFrame(CLOUD, observed.to_points(), unit_m, "camera", observed, whole=observed)
     return SensorFrame(CLOUD, observed, unit_m, axes or "camera", invalid=invalid)
 
 
@@ -111,4 +111,4 @@ def _depth_frame(
         camera, stated = found.camera, None if raw.dtype.kind == "f" else found.depth_scale
     image = depth_of(DEPTH, raw, stated if depth_scale is None else depth_scale, camera)
     usable = usable_depth(image, DEPTH, mask)
-    return SensorFrame(DEPTH, usable.to_points(), 1.0, "camera", usable)
+    return SensorFrame(DEPTH, usable.to_points(), 1.0, "camera", usable, whole=image)

@@ -15,6 +15,7 @@ ARGUMENTS = {
     "--force": "overwrite=True",
     "--drop-invalid": "drop_invalid=True",
     "--keep-all": "isolation=IsolationConfig(keep_all=True)",
+    "--extent": "isolation=IsolationConfig(extent=...)",
     "--frame": "axes",
     "--carry-frame": "files",
     "--carry": "carry",

@@ -137,7 +137,8 @@ def shipped_frame(name: str) -> SensorFrame:
         return SensorFrame(path, read_point_cloud(path), 1.0, "scanner", message="shipped scan")
     view = load_view(name)
     image = DepthImage(view.depth.depth * view.metres, view.depth.camera)
-    return SensorFrame(SHIPPED / f"{name}.npz", image.to_points(), 1.0, "camera", image, "shipped frame")
+    path = SHIPPED / f"{name}.npz"
+    return SensorFrame(path, image.to_points(), 1.0, "camera", image, "shipped frame", whole=image)
 
 
 def _view_of(stored: dict[str, np.ndarray]) -> SampleView:

@@ -1,4 +1,4 @@
-"""Intrinsics of depth cameras as other programs write them: ROS, RealSense, Open3D, BOP, nerfstudio.
+"""Intrinsics of depth cameras as other programs write them: ROS, RealSense, Open3D, BOP, nerfstudio, 3DObjectTracking.
 
 Three conventions differ between them and are settled here:
 
@@ -25,8 +25,13 @@ from jaxtyping import Float
 from mereo.geometry.camera import Camera
 from mereo.io.errors import readable
 
-NAMED = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
-"""Names of focal lengths and principal point: plain, RealSense, nerfstudio."""
+NAMED = (
+    ("fx", "fy", "cx", "cy"),
+    ("fx", "fy", "ppx", "ppy"),
+    ("fl_x", "fl_y", "cx", "cy"),
+    ("f_u", "f_v", "pp_x", "pp_y"),
+)
+"""Names of focal lengths and principal point: plain, RealSense, nerfstudio, 3DObjectTracking (DLR's M3T)."""
 
 MATRICES = ("intrinsic_matrix", "K", "k", "cam_K", "camera_matrix")
 """Names of camera matrices, 3 x 3 or 9 numbers row by row; the first is Open3D's, column by column.
@@ -75,10 +80,10 @@ def read_intrinsics(
 ) -> Intrinsics:
     """Pinhole intrinsics, and the depth scale where it is stated, from JSON or ROS YAML.
 
-    Understood: ``fx fy cx cy``, RealSense's ``fx fy ppx ppy``, nerfstudio's ``fl_x fl_y cx cy w h``, a matrix
-    (``MATRICES``), ROS CameraInfo as YAML or JSON, and files of many frames: BOP's scene_camera.json, and
-    transforms.json with intrinsics for each frame. ``width`` and ``height`` may be called ``image_width`` and
-    ``image_height``.
+    Understood: ``fx fy cx cy``, RealSense's ``fx fy ppx ppy``, nerfstudio's ``fl_x fl_y cx cy w h``, 3DObjectTracking's
+    ``f_u f_v pp_x pp_y``, a matrix (``MATRICES``), ROS CameraInfo as YAML or JSON, and files of many frames: BOP's
+    scene_camera.json, and transforms.json with intrinsics for each frame. ``width`` and ``height`` may be called
+    ``image_width`` and ``image_height``.
 
     Args:
         path: the file.

@@ -43,6 +43,7 @@ class SensorFrame:
             out; None for clouds.
         message: the recording's message, by topic and time; empty for other files.
         invalid: number of points without a measurement that were left out.
+        whole: the whole depth image, without any mask; None for clouds.
     """
 
     path: Path
@@ -52,6 +53,7 @@ class SensorFrame:
     depth: DepthImage | None = None
     message: str = ""
     invalid: int = 0
+    whole: DepthImage | None = None
 
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in np.ptp(self.cloud.points, axis=0) * self.metres)
@@ -131,8 +133,9 @@ def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
     found = read_intrinsics(reading.intrinsics, (raw.shape[1], raw.shape[0]), path, reading.frame_index)
     stated = None if raw.dtype.kind == "f" else found.depth_scale
     scale = stated if reading.depth_scale is None else reading.depth_scale
-    image = usable_depth(depth_of(path, raw, scale, found.camera), path, reading.mask)
-    return SensorFrame(path, image.to_points(), 1.0, "camera", image)
+    whole = depth_of(path, raw, scale, found.camera)
+    image = usable_depth(whole, path, reading.mask)
+    return SensorFrame(path, image.to_points(), 1.0, "camera", image, whole=whole)
 
 
 def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
@@ -146,7 +149,7 @@ def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> Senso
     content = message.read()
     if isinstance(content, DepthImage):
         image = usable_depth(content, path, reading.mask)
-        return SensorFrame(path, image.to_points(), 1.0, reading.frame, image, message.name)
+        return SensorFrame(path, image.to_points(), 1.0, reading.frame, image, message.name, whole=content)
     if reading.mask is not None:
         raise ValueError(f"{message.topic} in {path} has point clouds; leave out the mask, or name an image's --topic")
     cloud = PointCloud(valid_points(content, path, reading.drop_invalid))

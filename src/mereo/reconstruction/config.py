@@ -2,8 +2,12 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from mereo.io.bounds import NotNegative, check_bounds
+
+Extent = Literal["auto", "whole", "partial"]
+"""Extent of the object that a frame shows: see ``IsolationConfig.extent``."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +24,10 @@ class IsolationConfig:
         cluster_gap: with `largest_cluster`, also keep groups (of 32 points or more) nearer than this to it, in metres.
         keep_all: drop no strays, the points off all surfaces (a rim of background, flying pixels) that would stretch
             the cloud.
+        extent: how much of the object's outline the frame shows. whole: nothing hides or cuts the object, so that it
+            ends where its points end. partial: something may hide or cut it anywhere, so that nothing is known beside
+            its points. auto: as the depths measured beside the object say; where the frame does not say it, the fit
+            decides.
     """
 
     depth_range: tuple[float, float] | None = None
@@ -29,6 +37,7 @@ class IsolationConfig:
     largest_cluster: bool = False
     cluster_gap: NotNegative = 0.0
     keep_all: bool = False
+    extent: Extent = "auto"
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -55,7 +64,7 @@ class IsolationConfig:
     @property
     def on(self) -> bool:
         """Whether a step was asked for."""
-        return replace(self, keep_all=False) != IsolationConfig()
+        return replace(self, keep_all=False, extent="auto") != IsolationConfig()
 
 
 def _numbers(values: tuple[float, ...]) -> str:

@@ -68,6 +68,33 @@ Step = Callable[[Float[np.ndarray, "_ 3"]], Keep]
 """Function from points to those it keeps."""
 
 
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Points of a cloud that are the object's, and why the others are not.
+
+    Attributes:
+        keep: the object's points.
+        compared: points that the steps which compare neighbours saw; fewer than all that reached them where the cloud
+            was thinned before.
+        thinned: points that were left out by thinning alone, whatever they are.
+        steps: what each step left out.
+    """
+
+    keep: Bool[np.ndarray, " n"]
+    compared: Bool[np.ndarray, " n"]
+    thinned: Bool[np.ndarray, " n"]
+    steps: tuple[IsolationStep, ...]
+
+    def of_object(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Points of the object, also those that were thinned out: their nearest compared point is the object's."""
+        whole = self.keep.copy()
+        if self.thinned.any():
+            compared = np.flatnonzero(self.compared)
+            nearest = cKDTree(points[compared]).query(points[self.thinned])[1]
+            whole[self.thinned] = self.keep[compared[nearest]]
+        return whole
+
+
 def isolate(
     seen: PointCloud | DepthImage,
     config: IsolationConfig,
@@ -88,7 +115,20 @@ def isolate(
     Raises ``ValueError`` where fewer than ``MIN_POINTS`` points are left, naming the step and its cure.
     """
     cloud = seen.to_points() if isinstance(seen, DepthImage) else seen
-    points, done = cloud.points, list[IsolationStep]()
+    selection = select_object(cloud, config, unit_m, frame, rng)
+    return cloud if selection.keep.all() else PointCloud(cloud.points[selection.keep]), selection.steps
+
+
+def select_object(
+    cloud: PointCloud,
+    config: IsolationConfig,
+    unit_m: float = 1.0,
+    frame: CloudAxes = "camera",
+    rng: np.random.Generator | None = None,
+) -> Selection:
+    """Select the object's points of a cloud; takes the arguments of ``isolate`` and raises as it does."""
+    points, rows, done = cloud.points, np.arange(len(cloud)), list[IsolationStep]()
+    thinned, compared = np.zeros(len(cloud), dtype=bool), np.ones(len(cloud), dtype=bool)
     for name, step in _steps(config, unit_m, frame, np.random.default_rng(0) if rng is None else rng):
         keep, detail = step(points)
         left = int(keep.sum())
@@ -100,8 +140,13 @@ def isolate(
             )
         if left < len(points) or name != "thinning":
             done.append(IsolationStep(name, len(points), left, detail))
-        points = points[keep]
-    return PointCloud(points), tuple(done)
+        if name == "thinning":
+            thinned[rows[~keep]] = True
+            compared = np.isin(np.arange(len(cloud)), rows[keep])
+        points, rows = points[keep], rows[keep]
+    kept = np.zeros(len(cloud), dtype=bool)
+    kept[rows] = True
+    return Selection(kept, compared, thinned, tuple(done))
 
 
 CURES = {

@@ -7,6 +7,7 @@ Frames are read by ``mereo.io.sensor_frame``.
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ import numpy as np
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.sight_lines import SightLines
 from mereo.io.sensor_frame import SensorFrame
-from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.isolation import IsolationStep, isolate
+from mereo.reconstruction.config import Extent, IsolationConfig
+from mereo.reconstruction.isolation import IsolationStep, Selection, select_object
+from mereo.reconstruction.lines_of_sight import lines_of_frame
 from mereo.reconstruction.strays import Reading
 
 SIZE_FACTOR = 2.0
@@ -40,11 +43,20 @@ class Observation:
         frame: everything that the sensor measured.
         cloud: the object's points, in the frame's axes and unit.
         steps: what isolation left out.
+        selection: points of the frame that isolation took for the object's; None means all.
+        extent: how much of the object's outline the frame shows, see ``IsolationConfig``.
     """
 
     frame: SensorFrame
     cloud: PointCloud
     steps: tuple[IsolationStep, ...] = ()
+    selection: Selection | None = None
+    extent: Extent = "auto"
+
+    @cached_property
+    def lines(self) -> SightLines:
+        """Lines of sight beside the object, in the frame's axes and unit; strays count as the object's points."""
+        return lines_of_frame(self.frame, self.selection, self.extent)
 
     def read_as(self, reading: Reading) -> "Observation":
         """The object as a reading of ``cloud`` has it: what was dropped as strays is a step of its own."""
@@ -127,13 +139,19 @@ def find_object(
             f"{frame.path} is in a scanner's frame, in which depth is not known: leave out --depth-range and crop with "
             "--box"
         )
-    cloud, steps = isolate(frame.cloud, isolation, frame.metres, frame.axes)
-    return Observation(frame, cloud, steps)
+    selection = select_object(frame.cloud, isolation, frame.metres, frame.axes)
+    cloud = frame.cloud if selection.keep.all() else PointCloud(frame.cloud.points[selection.keep])
+    return Observation(frame, cloud, selection.steps, selection, isolation.extent)
 
 
-def observe(cloud: PointCloud, axes: CloudAxes = "camera", unit_m: float | None = None) -> Observation:
-    """Observation of points that are all the object's, in ``unit_m`` metres or an unknown unit."""
-    return Observation(SensorFrame(CLOUD, cloud, unit_m, axes), cloud)
+def observe(
+    cloud: PointCloud, axes: CloudAxes = "camera", unit_m: float | None = None, extent: Extent = "auto"
+) -> Observation:
+    """Observation of points that are all the object's, in ``unit_m`` metres or an unknown unit.
+
+    ``extent`` is how much of the object's outline they show, see ``IsolationConfig``.
+    """
+    return Observation(SensorFrame(CLOUD, cloud, unit_m, axes), cloud, extent=extent)
 
 
 def size_warning(observation: Observation, provenance: Mapping[str, object]) -> str | None:

@@ -8,7 +8,7 @@ from pydantic_core import ErrorDetails
 
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
-from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.config import Extent, IsolationConfig
 from mereo.serving.refusals import Refused
 
 
@@ -40,6 +40,7 @@ class FrameOptions(BaseModel):
     largest_cluster: bool = Field(False, alias="largest-cluster", description="Keep the largest group of points")
     cluster_gap: float = Field(0.0, alias="cluster-gap", description="Gap across which groups belong to it, metres")
     keep_all: bool = Field(False, alias="keep-all", description="Drop no strays")
+    extent: Extent = Field("auto", description="How much of the object the frame shows: whole, partial, auto")
     resolution: int | None = Field(None, description="Cells along the longest side; by default the server's")
 
     def reading(self, folder: Path, intrinsics: str | None, mask: str | None) -> InputConfig:
@@ -68,6 +69,7 @@ class FrameOptions(BaseModel):
                 largest_cluster=self.largest_cluster,
                 cluster_gap=self.cluster_gap,
                 keep_all=self.keep_all,
+                extent=self.extent,
             )
         except ValueError as error:
             raise Refused(422, str(error)) from None

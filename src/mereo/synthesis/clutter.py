@@ -90,10 +90,31 @@ class Backdrop:
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
-    """Everything in a view that is not the object: tools, hands, a plane behind."""
+class Screen:
+    """Flat occluder with one straight edge: all points of a depth whose slope (x/z, y/z) along an axis is small enough.
 
-    occluders: tuple[Capsule, ...] = ()
+    Attributes:
+        depth: z of its points.
+        axis: unit vector in the image plane, across the edge.
+        limit: largest slope along the axis.
+    """
+
+    depth: float
+    axis: Float[np.ndarray, "2"]
+    limit: float
+
+    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+        """Rows of the rays from the origin that hit the screen, and where."""
+        slope = directions[:, :2] / directions[:, 2:]
+        rows = np.flatnonzero(slope @ self.axis <= self.limit)
+        return rows, Hits(self.depth / directions[rows, 2], np.tile([0.0, 0.0, 1.0], (len(rows), 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Everything in a view that is not the object: tools, hands, screens, a plane behind."""
+
+    occluders: tuple[Capsule | Screen, ...] = ()
     background: Backdrop | None = None
 
     def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
@@ -102,8 +123,8 @@ class Surroundings:
         source = np.where(np.isfinite(hits.distance), OBJECT, NOTHING).astype(np.uint8)
         if self.background is not None:
             source[first.nearer(*self.background.first_hit(directions))] = BACKGROUND
-        for capsule in self.occluders:
-            source[first.nearer(*capsule.first_hit(directions))] = OCCLUDER
+        for occluder in self.occluders:
+            source[first.nearer(*occluder.first_hit(directions))] = OCCLUDER
         return first, source
 
 

@@ -45,12 +45,13 @@ class PastLines:
     Attributes:
         sight: search tree over their unit vectors.
         ranges: distance from the camera of what each met.
-        reach: angle up to which a line of sight without a measurement of its own is taken to be like the nearest.
+        reach: angle from each up to which a line of sight without a measurement of its own is taken to be like it; they
+            are the farther apart the farther they are from the object.
     """
 
     sight: cKDTree
     ranges: Float[np.ndarray, " p"]
-    reach: float
+    reach: Float[np.ndarray, " p"]
 
     @classmethod
     def of(cls, points: Float[np.ndarray, "p 3"], pitch: float) -> "PastLines | None":
@@ -59,8 +60,8 @@ class PastLines:
             return None
         ranges = np.linalg.norm(points, axis=1)
         sight = cKDTree(points / ranges[:, None])
-        angle = sight.query(sight.data, k=[min(4, len(points))])[0]
-        return cls(sight, ranges, AROUND_PITCHES * max(pitch, float(np.median(angle))))
+        angle = sight.query(sight.data, k=[min(AROUND, len(points))])[0][:, 0]
+        return cls(sight, ranges, AROUND_PITCHES * np.maximum(pitch, angle))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,5 +174,5 @@ class Evidence:
         if self.past is None:
             return np.full(len(toward), elsewhere)
         angle, near = self.past.sight.query(toward)
-        free = np.where(angle <= self.past.reach, self.past.ranges[near], elsewhere)
+        free = np.where(angle <= self.past.reach[near], self.past.ranges[near], elsewhere)
         return np.where(unknown < angle, 0.0, free)

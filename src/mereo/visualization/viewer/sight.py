@@ -11,13 +11,11 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.raycasting import Hits
 from mereo.geometry.solids import Solids
-from mereo.synthesis.clutter import OBJECT, Capsule, Surroundings, sample_occluder
+from mereo.synthesis.clutter import Capsule
 from mereo.synthesis.config import SENSORS, GenerateConfig, Occluder, Sensor
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import View
-
-PLACES = 24
-"""Places of a tool or hand among which that is taken which hides nearest to what is asked for."""
+from mereo.synthesis.occluded_views import PLACES, occluder_hiding
 
 PAPER = GenerateConfig()
 
@@ -71,18 +69,10 @@ def in_front(solids: Solids, camera: Camera, sensing: Sensing) -> tuple[tuple[Ca
     directions = camera.directions().reshape(-1, 3)
     hits = solids.first_hit(directions)
     visible = np.isfinite(hits.distance)
-    count = int(visible.sum())
-    if sensing.front == "none" or count < MIN_POINTS:
+    if sensing.front == "none" or visible.sum() < MIN_POINTS:
         return (), 0.0
     rays, alone = directions[visible], Hits(hits.distance[visible], hits.normal[visible])
-    seen, reach = rays * alone.distance[:, None], float(np.linalg.norm(directions[:, :2], axis=1).max())
+    reach = float(np.linalg.norm(directions[:, :2], axis=1).max())
     unit = 1 / SENSORS[sensing.sensor].metres_per_unit
-    best: tuple[Capsule, ...] = ()
-    hidden = 0.0
-    for place in range(PLACES):
-        capsules = sample_occluder(sensing.front, seen, reach, unit, np.random.default_rng(place))
-        left = int((Surroundings(capsules).join(alone, rays)[1] == OBJECT).sum())
-        share = 1 - left / count
-        if left >= MIN_POINTS and (not best or abs(share - sensing.hidden) < abs(hidden - sensing.hidden)):
-            best, hidden = capsules, share
-    return best, hidden
+    places = [np.random.default_rng(place) for place in range(PLACES)]
+    return occluder_hiding(sensing.front, sensing.hidden, rays, alone, reach, unit, places)

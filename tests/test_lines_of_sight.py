@@ -1,0 +1,194 @@
+"""Kinds of lines of sight in images, clouds and files that are made by hand, and the option that states the extent."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_files import write_camera
+from PIL import Image
+from sight_parts import CAMERA, SHOWN, pixels, scene
+
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
+from mereo.geometry.sight_lines import SightLines
+from mereo.geometry.transforms import rigid
+from mereo.io.config import InputConfig
+from mereo.io.sensor_frame import SensorFrame, read_frame
+from mereo.reconstruction.config import Extent, IsolationConfig
+from mereo.reconstruction.isolation import select_object
+from mereo.reconstruction.lines_of_sight import DENSE, MOST_LINES, lines_of_frame, lines_of_image, lines_of_points
+from mereo.reconstruction.observation import find_object, observe
+from mereo.reconstruction.strays import Reading
+from mereo.serving.options import FrameOptions
+from mereo.visualization.sight_picture import OBJECT_COLOR, PAST_COLOR, UNKNOWN_COLOR, sight_picture
+
+
+def test_each_pixel_has_its_kind() -> None:
+    lines = lines_of_image(DepthImage(scene(), CAMERA), SHOWN)
+    expected = np.where(scene() == 2.0, "p", "u")
+    expected[14:36, 19:41] = "u"  # the rim, which the object's own pixels cover but for one all around
+    expected[SHOWN] = ""
+    image = np.full((50, 60), "", dtype="U1")
+    for points, kind in ((lines.past, "p"), (lines.unknown, "u")):
+        image[pixels(points, CAMERA)] = kind
+    reach = np.s_[:, :]
+    wrong = image[reach] != expected[reach]
+    # at the ends of the wall, at other depths beside it, a pixel may have too few that agree
+    assert wrong.sum() <= 4 and not wrong[12:38, 17:43].any()
+    assert lines.elsewhere == "unknown"
+
+
+def test_a_lone_depth_between_object_and_wall_is_no_surface() -> None:
+    depth = scene()
+    depth[25, 42] = 1.5
+    lines = lines_of_image(DepthImage(depth, CAMERA), SHOWN)
+    assert 1.5 not in lines.past[:, 2]
+    assert (25, 42) in set(zip(*pixels(lines.unknown, CAMERA), strict=True))
+
+
+def test_a_depth_as_far_as_the_object_is_unknown() -> None:
+    """What it stands on touches it: neither before nor behind."""
+    depth = np.where(SHOWN, 1.0, np.where(np.arange(50)[:, None] >= 35, 1.02, 2.0))
+    labels = lines_of_image(DepthImage(depth, CAMERA), SHOWN)
+    assert 1.02 not in labels.past[:, 2] and (np.isclose(depth[pixels(labels.unknown, CAMERA)], 1.02)).sum() > 500
+    by_cloud = lines_of_points(DepthImage(depth, CAMERA).to_points().points, SHOWN.ravel())
+    assert 1.02 not in by_cloud.past[:, 2] and (np.isclose(by_cloud.unknown[:, 2], 1.02)).sum() > 500
+
+
+@pytest.mark.parametrize("factor", [0.001, 1000.0])
+def test_any_unit_gives_the_same_lines(factor: float) -> None:
+    lines = lines_of_image(DepthImage(scene(), CAMERA), SHOWN)
+    other = lines_of_image(DepthImage(scene() * factor, CAMERA), SHOWN)
+    for expected, found in ((lines.scaled(factor), other), (lines, other.scaled(1 / factor))):
+        np.testing.assert_allclose(found.past, expected.past)
+        np.testing.assert_allclose(found.unknown, expected.unknown)
+        assert found.elsewhere == expected.elsewhere
+
+
+def test_many_lines_are_thinned_far_from_the_object_only() -> None:
+    camera = Camera(600, 500, 800.0, 800.0, 300.0, 250.0)
+    shown, depth = np.kron(SHOWN, np.ones((10, 10), dtype=bool)), np.kron(scene(), np.ones((10, 10)))
+    lines = lines_of_image(DepthImage(depth, camera), shown)
+    kept = np.zeros(shown.shape, dtype=bool)
+    for points in (lines.past, lines.unknown):
+        kept[pixels(points, camera)] = True
+    assert 0.5 * MOST_LINES < kept.sum() <= MOST_LINES
+    rows, columns = np.mgrid[:500, :600]
+    distance = np.hypot(
+        np.maximum(np.maximum(150 - rows, rows - 349), 0), np.maximum(np.maximum(200 - columns, columns - 399), 0)
+    )
+    assert kept[(distance > 0) & (distance <= DENSE)].all()
+    # the gap grows no faster than the distance, and reaches everywhere within one size of the object
+    near = np.argwhere(kept)
+    for row, column in np.argwhere((distance > 0) & (distance <= 100))[::997]:
+        gap = np.abs(near - [row, column]).max(axis=1).min()
+        assert gap <= max(1.0, distance[row, column] / DENSE)
+
+
+# --- clouds ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_cloud_has_the_kinds_of_its_image() -> None:
+    """What isolation leaves out of a cloud is compared as the pixels that a mask leaves out; no pixel is no point."""
+    whole = DepthImage(scene(), CAMERA)
+    cut = DepthImage(np.where(SHOWN, whole.depth, 0.0), CAMERA)
+    frame = SensorFrame(Path("x"), cut.to_points(), 1.0, "camera", cut, whole=whole)
+    by_image = find_object(frame).lines
+    by_cloud = find_object(
+        SensorFrame(Path("x"), whole.to_points(), 1.0, "camera"), IsolationConfig(depth_range=(0.9, 1.1))
+    ).lines
+    assert by_cloud.elsewhere is None
+    past, unknown = (
+        {place for place in zip(*pixels(points, CAMERA), strict=True) if 5 <= place[0] < 45 and 5 <= place[1] < 55}
+        for points in (by_cloud.past, by_cloud.unknown)
+    )
+    by_pixel = set(zip(*pixels(by_image.past, CAMERA), strict=True))
+    measured = set(zip(*np.nonzero(scene() > 0), strict=True))
+    near = {place for place in measured if 5 <= place[0] < 45 and 5 <= place[1] < 55 and not SHOWN[place]}
+    assert past | unknown == near and past & unknown == set()
+    # but for the corner of the wall, where too few pixels agree
+    assert past >= by_pixel & near and len(past - by_pixel) <= 2
+
+
+def test_a_scanner_has_the_lines_of_a_camera() -> None:
+    points = DepthImage(scene(), CAMERA).to_points().points
+    is_object = points[:, 2] == 1.0
+    selection = replace(select_object(PointCloud(points), IsolationConfig()), keep=is_object)
+    axes = rigid(SCANNER_TO_CAMERA, np.zeros(3))
+    scanned = points @ axes[:3, :3].T
+    lines = lines_of_frame(SensorFrame(Path("x"), PointCloud(scanned), None, "scanner"), selection)
+    # in the file's own axes: single points of it
+    everything = {tuple(np.round(point, 9)) for point in scanned}
+    assert {tuple(np.round(point, 9)) for point in (*lines.past, *lines.unknown)} <= everything
+    assert (lines.past[:, 2] == -2.0).mean() > 0.999 and len(lines.past) > 500
+    assert (np.isclose(lines.unknown[:, 2], -0.8)).sum() > 100
+    turned = SightLines(lines.past, lines.unknown, "past").transformed(axes)
+    np.testing.assert_allclose(turned.past, lines.past * [1, -1, -1])
+    assert turned.elsewhere == "past"
+
+
+def test_a_bare_cloud_says_nothing() -> None:
+    points = np.random.default_rng(0).normal((0, 0, 10), size=(100, 3))
+    for lines in (observe(PointCloud(points)).lines, lines_of_points(points, np.ones(100, dtype=bool))):
+        assert lines.elsewhere is None and len(lines.past) == len(lines.unknown) == 0
+
+
+def test_points_that_were_only_thinned_out_are_the_objects() -> None:
+    camera = Camera(400, 300, 400.0, 400.0, 200.0, 150.0)
+    x, y, _ = np.moveaxis(camera.directions(), 2, 0)
+    ball = x**2 + y**2 < 0.2**2
+    depth = np.where(ball, 1.0 - np.sqrt(np.maximum(0.2**2 - x**2 - y**2, 0.0)), 3.0)
+    whole = DepthImage(depth, camera)
+    seen = find_object(
+        SensorFrame(Path("x"), whole.to_points(), 1.0, "camera", whole, whole=whole),
+        IsolationConfig(largest_cluster=True),
+    )
+    # the wall is larger: so the ball is what is left out, behind nothing, and the wall is the object
+    assert seen.selection is not None and seen.selection.thinned.any()
+    rest = seen.selection.of_object(seen.frame.cloud.points)
+    assert rest.sum() > len(seen.cloud) and not rest[ball.ravel()].any()
+    assert rest[~ball.ravel()].mean() > 0.999
+    rows, columns = pixels(seen.lines.unknown, camera)
+    inside = (rows >= 0) & (rows < 300) & (columns >= 0) & (columns < 400)
+    assert ball[rows[inside], columns[inside]].mean() > 0.9 and len(seen.lines.past) == 0
+
+
+# --- options and files -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("extent", "elsewhere"), [("whole", "past"), ("partial", "unknown"), ("auto", None)])
+def test_the_extent_can_be_stated(extent: Extent, elsewhere: str | None) -> None:
+    lines = observe(PointCloud(np.random.default_rng(0).normal((0, 0, 10), size=(50, 3))), extent=extent).lines
+    assert lines.elsewhere == elsewhere and len(lines.past) == len(lines.unknown) == 0
+    whole = DepthImage(scene(), CAMERA)
+    cut = DepthImage(np.where(SHOWN, whole.depth, 0.0), CAMERA)
+    frame = SensorFrame(Path("x"), cut.to_points(), 1.0, "camera", cut, whole=whole)
+    lines = find_object(frame, IsolationConfig(extent=extent)).lines
+    assert lines.elsewhere == (elsewhere or "unknown")
+    assert (len(lines.past) > 0) == (extent != "partial") and (len(lines.unknown) > 0) == (extent == "auto")
+    assert not IsolationConfig(extent=extent).on and FrameOptions(extent=extent).isolation().extent == extent
+
+
+def test_a_file_keeps_what_its_mask_leaves_out(tmp_path: Path) -> None:
+    write_camera(tmp_path / "k.json", CAMERA)
+    Image.fromarray((1000 * scene()).astype(np.uint16)).save(tmp_path / "d.png")
+    Image.fromarray(SHOWN).save(tmp_path / "m.png")
+    frame = read_frame(tmp_path / "d.png", InputConfig(intrinsics=tmp_path / "k.json", mask=tmp_path / "m.png"))
+    assert frame.depth is not None and frame.whole is not None and len(frame.cloud) == 400
+    np.testing.assert_allclose(frame.whole.depth, scene())
+    seen = find_object(frame)
+    assert len(seen.lines.past) > 500 and seen.lines.elsewhere == "unknown"
+    # strays are dropped from the points, and remain lines of sight that met something
+    fewer = seen.read_as(Reading(seen.cloud, np.arange(400) > 20))
+    assert len(fewer.cloud) == 379
+    np.testing.assert_array_equal(fewer.lines.past, seen.lines.past)
+    unmasked = read_frame(tmp_path / "d.png", InputConfig(intrinsics=tmp_path / "k.json"))
+    isolated = find_object(unmasked, IsolationConfig(depth_range=(0.9, 1.1)))
+    np.testing.assert_array_equal(isolated.lines.past, seen.lines.past)
+    np.testing.assert_array_equal(isolated.lines.unknown, seen.lines.unknown)
+    picture = sight_picture(isolated)
+    for place, color in (((20, 45), PAST_COLOR), ((20, 18), UNKNOWN_COLOR), ((20, 30), OBJECT_COLOR)):
+        assert np.argmax(picture[place]) == np.argmax(color), place
+    with pytest.raises(ValueError, match="cloud has no depth image; lines of sight are drawn in one"):
+        sight_picture(observe(isolated.cloud))
