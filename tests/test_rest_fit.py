@@ -11,8 +11,8 @@ from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.modes.rest import narrowing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed
-from mereo.fitting.problem.problem import Problem
-from mereo.fitting.registration.fit import KNOWN_SCALE_STD, ModesFit, fit_correspondences
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
+from mereo.fitting.registration.fit import ModesFit, fit_correspondences
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 

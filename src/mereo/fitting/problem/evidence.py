@@ -128,6 +128,11 @@ class Evidence:
         """The same with as many partners as a noisy frame needs."""
         return replace(self, partners=self.points[spread(self.points, MORE_PARTNERS)])
 
+    @property
+    def may_be_cut(self) -> bool:
+        """Whether something may hide a part of the object, or lie beside it where nothing is known."""
+        return self.elsewhere == "unknown" or len(self.sight.data) > len(self.points)
+
     def violations(
         self, vertices: Float[np.ndarray, "n 3"], slack: float
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:

@@ -32,6 +32,9 @@ COARSE = 3
 BESIDE = 1.0
 """Share of the samples' spacing: a partner so far beside one is still on its plane."""
 
+KNOWN_SCALE_STD = 1e-6
+"""``Problem.scale_std`` of a frame whose unit is known."""
+
 FAR = 1.0
 """Scene units beyond the tolerance by which a vertex is ruled out for good."""
 
@@ -94,6 +97,11 @@ class Problem:
     ) -> "Problem":
         """Problem of one frame: what the network found, and what the frame shows."""
         return cls(model, NetworkTerm.of(model, found), evidence, scale_std, config)
+
+    @property
+    def is_scale_open(self) -> bool:
+        """Whether the length of a scene unit is not known."""
+        return self.scale_std > KNOWN_SCALE_STD
 
     @cached_property
     def pairs(self) -> PairTerm:

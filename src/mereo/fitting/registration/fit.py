@@ -23,7 +23,7 @@ from mereo.fitting.modes.understood import Ask, as_noisy
 from mereo.fitting.problem.correspondences import Correspondences, find_correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.problem.scene_unit import agree, estimate_unit
 from mereo.fitting.registration.registration import Method, Registration
@@ -33,8 +33,6 @@ from mereo.io.cores import one_blas_thread
 from mereo.models.calibration import Calibration
 from mereo.models.model import EncodedCloud, Model
 from mereo.scenes.statistical_model import StatisticalModel
-
-KNOWN_SCALE_STD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,13 +13,18 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.modes.rest import fit_rest, is_at_rest
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
-from mereo.fitting.registration.fit import KNOWN_SCALE_STD, ModesFit
-from mereo.fitting.search.search import search
+from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.search.screening import Screen
+from mereo.fitting.search.search import rotations, search
+from mereo.fitting.search.shape_tables import tables_of
 from mereo.geometry.sight_lines import SightLines
 from mereo.io.cores import one_blas_thread
 from mereo.scenes.statistical_model import StatisticalModel
+
+ROTATIONS = 200
+"""Rotations by which the size of an object is guessed from its cloud."""
 
 
 def search_modes(
@@ -41,19 +46,31 @@ def search_modes(
         lines: what is known of the lines of sight beside the cloud; where they leave it open, the fits decide.
     """
     started = time.perf_counter()
-    if scene_unit is None:
-        raise NotImplementedError
-    unit, scale_std = scene_unit, KNOWN_SCALE_STD
     with one_blas_thread():
-        def problem_of(lines: SightLines | None) -> Problem:
-            seen, outliers = points / unit, None if doubtful is None else doubtful / unit
-            evidence = Evidence.of(seen, outliers, lines=None if lines is None else lines.scaled(1 / unit))
+        unit = size_of(points, model) if scene_unit is None else scene_unit
+        lines = SightLines.of_cloud() if lines is None else lines
+        partial = replace(lines, elsewhere="unknown") if lines.elsewhere is None else None
+
+        def problem_of(lines: SightLines, unit: float) -> Problem:
+            outliers = None if doubtful is None else doubtful / unit
+            evidence = Evidence.of(points / unit, outliers, lines=lines.scaled(1 / unit))
+            scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD
             return Problem(model, NetworkTerm.none(model), evidence, scale_std, config)
 
-        is_open = lines is None or lines.elsewhere is None
-        partial = replace(lines or SightLines.of_cloud(), elsewhere="unknown")
-        found = search(problem_of(lines), problem_of(partial) if is_open else None)
+        found = search(problem_of(lines, unit), None if partial is None else problem_of(partial, unit))
         problem, modes = found.problem, found.best
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)
     return ModesFit(problem, nothing(), unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
+
+
+def size_of(points: Float[np.ndarray, "n 3"], model: StatisticalModel) -> float:
+    """Length of a scene unit by the cloud's extent: the median over all rotations of the mean state.
+
+    Args:
+        points: the cloud, seen from the origin, any unit.
+        model: the statistical model.
+    """
+    evidence = Evidence.of(points)
+    poses = Screen.of(tables_of(model, 0), evidence, model.half, scaled=True).starts(rotations(ROTATIONS))
+    return float(np.exp(np.median(poses.log_scale)))

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.residuals import ROBUST, WITNESS_WEIGHT
 from mereo.fitting.search.shape_tables import CELLS, ShapeTables
+from mereo.fitting.search.sight_table import SightTable
 from mereo.geometry.transforms import rotation_along
 from mereo.io.cores import cores
 from mereo.scenes.statistical_model import WITNESSES
@@ -31,9 +32,6 @@ LOOKED_UP = 128
 BLOCK = 150
 """Poses in one array operation: their arrays fit a core's cache, where 3,600 at once take seven times as long each."""
 
-SIDE = 96
-"""Cells along each side of the table of what a frame rules out; about as many as a depth image has pixels there."""
-
 OUTSIDE = WITNESS_WEIGHT * WITNESSES / 3000.0
 """Weight of what the frame rules out beside that of the cloud: as in the fit."""
 
@@ -45,72 +43,6 @@ FARTHEST = 0.5
 
 ALONG = 0.2
 """Weight of the distance along the surface in a step: with planes alone, poses far away slide past each other."""
-
-
-@dataclass(frozen=True, eq=False)
-class SightTable:
-    """What a frame rules out, as a table of lines of sight; the rules are those of ``Evidence.violations``.
-
-    Attributes:
-        T: rotation into the axes of the table, whose third is the direction of the cloud.
-        low, cell: corner of the table and length of a cell, as slopes across the direction.
-        toward: unit vector of the nearest line of sight to each cell that met the object, or of which nothing is known.
-        front: distance before which it is free.
-        free: distance up to which a cell beside these is free; negative where it is not beside.
-        pitch: angle between neighbouring lines of sight.
-    """
-
-    T: Float32[np.ndarray, "3 3"]
-    low: Float32[np.ndarray, "2"]
-    cell: float
-    toward: Float32[np.ndarray, "c 3"]
-    front: Float32[np.ndarray, " c"]
-    free: Float32[np.ndarray, " c"]
-    pitch: float
-
-    @classmethod
-    def of(cls, evidence: Evidence) -> "SightTable":
-        """Table around the cloud, three times as wide; beyond, the nearest cell of the border stands for a place."""
-        direction = evidence.sight.data[: len(evidence.points)]
-        T = rotation_along(direction.mean(axis=0) / np.linalg.norm(direction.mean(axis=0))).T
-        turned = evidence.points @ T.T
-        slope = turned[:, :2] / np.maximum(turned[:, 2:], 0.1 * np.linalg.norm(turned, axis=1, keepdims=True))
-        low, high = slope.min(axis=0), slope.max(axis=0)
-        side = 3.0 * float((high - low).max()) + 4 * evidence.pitch
-        corner = (low + high - side) / 2
-        cells = min(SIDE, max(16, int(side / evidence.pitch)))
-        across = corner + (np.stack(np.meshgrid(*(np.arange(cells) + 0.5,) * 2, indexing="ij"), -1)) * side / cells
-        sight = np.concatenate([across.reshape(-1, 2), np.ones((cells * cells, 1))], axis=1) @ T
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        toward, front, free = evidence.along(sight)
-        return cls(
-            T.astype(np.float32),
-            corner.astype(np.float32),
-            side / cells,
-            toward.astype(np.float32),
-            front.astype(np.float32),
-            free.astype(np.float32),
-            evidence.pitch,
-        )
-
-    def violations(
-        self, place: Float32[np.ndarray, "n w 3"], slack: float
-    ) -> tuple[Float32[np.ndarray, "n w 3"], Float32[np.ndarray, "n w"]]:
-        """``Evidence.violations`` of many places, up to a cell."""
-        cells = round(np.sqrt(len(self.front)))
-        turned = place @ self.T.T
-        slope = turned[..., :2] / np.maximum(turned[..., 2:], 1e-6)
-        index = np.clip(((slope - self.low) / self.cell).astype(np.int32), 0, cells - 1)
-        row = index[..., 0] * cells + index[..., 1]
-        distance = np.sqrt(np.einsum("nwi,nwi->nw", place, place))
-        toward, free = self.toward[row], self.free[row]
-        beside = free > distance - slack
-        sideways = toward * distance[..., None] - place
-        length = np.sqrt(np.einsum("nwi,nwi->nw", sideways, sideways))
-        direction = np.where(beside[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
-        ahead = np.where(free < 0, self.front[row] - slack - distance, 0.0)
-        amount = np.where(beside, length - self.pitch * distance, ahead)
-        return direction, np.maximum(amount, 0.0).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,55 +76,88 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """What poses are compared with: tables of states, some observed points, and what the frame rules out."""
+    """What poses are compared with.
+
+    Attributes:
+        tables: of the states.
+        points: some of the observed ones, evenly spread.
+        sight: what the frame rules out.
+        half: half the object's length.
+        scaled: whether the scale is unknown.
+        in_part: whether something may hide a part of the object.
+    """
 
     tables: ShapeTables
     points: Float32[np.ndarray, "p 3"]
     sight: SightTable
     half: float
+    scaled: bool
+    in_part: bool
 
     @classmethod
-    def of(cls, tables: ShapeTables, evidence: Evidence, half: float) -> "Screen":
-        """Screen of a frame; ``half`` is half the object's length."""
-        return cls(tables, evidence.partners[:POINTS].astype(np.float32), SightTable.of(evidence), half)
+    def of(cls, tables: ShapeTables, evidence: Evidence, half: float, scaled: bool = False) -> "Screen":
+        """Screen of a frame."""
+        points, sight = evidence.partners[:POINTS].astype(np.float32), SightTable.of(evidence)
+        return cls(tables, points, sight, half, scaled, evidence.may_be_cut)
 
-    def starts(self, rotations: Float[np.ndarray, "r 3 3"], scaled: bool) -> Poses:
-        """Every state at every rotation, its visible side on the cloud; where ``scaled``, as large as the cloud."""
+    def starts(self, rotations: Float[np.ndarray, "r 3 3"]) -> Poses:
+        """Every state at every rotation, its visible side on the cloud; where ``scaled``, as large as the cloud.
+
+        Where something may hide a part of the object, also the four halves of its visible side.
+        """
         rotations = rotations.astype(np.float32)
         center = self.points.mean(axis=0)
         ahead = center / np.linalg.norm(center)
-        weight = np.maximum(-(self.tables.normal @ (rotations.transpose(0, 2, 1) @ ahead).T), 0.0)  # q s r
-        weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
+        toward = (rotations.transpose(0, 2, 1) @ ahead).T
+        visible = np.maximum(-(self.tables.normal @ toward), 0.0)  # q s r
+        parts = [visible]
+        if self.in_part:
+            for axis in rotation_along(ahead)[:, :2].T.astype(np.float32):
+                across = self.tables.place @ (rotations.transpose(0, 2, 1) @ axis).T
+                middle = (across * visible).sum(axis=1, keepdims=True) / np.maximum(
+                    visible.sum(axis=1, keepdims=True), 1e-9
+                )
+                parts += [np.where(across > middle, visible, 0.0), np.where(across <= middle, visible, 0.0)]
+        return Poses.of_all([self._on_cloud(part, rotations, ahead) for part in parts])
+
+    def _on_cloud(
+        self,
+        weight: Float32[np.ndarray, "q s r"],
+        rotations: Float32[np.ndarray, "r 3 3"],
+        ahead: Float32[np.ndarray, "3"],
+    ) -> Poses:
+        """Every state at every rotation, with the centre of its weighted samples on that of the cloud."""
+        center = self.points.mean(axis=0)
+        weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
         middle = np.matmul(weight.transpose(0, 2, 1), self.tables.place)  # q r 3
         state, turn = np.divmod(np.arange(len(middle) * len(rotations)), len(rotations))
         rotation, middle = rotations[turn], middle[state, turn]
         log_scale = np.zeros(len(state), dtype=np.float32)
-        if scaled:
+        if self.scaled:
             place = np.matmul(self.tables.place[state] - middle[:, None], rotation.transpose(0, 2, 1))
             across = np.eye(3, dtype=np.float32) - ahead[:, None] * ahead
             spread = np.einsum("nsi,nsi,ns->n", place @ across, place, weight.transpose(0, 2, 1)[state, turn])
             seen = ((self.points - center) @ across * (self.points - center)).sum(axis=1).mean()
             log_scale = (0.5 * np.log(seen / np.maximum(spread, 1e-9))).astype(np.float32)
         shift = np.exp(log_scale)[:, None] * np.einsum("nij,nj->ni", rotation, middle)
-        return Poses(state, rotation, center - shift, log_scale, np.full(len(state), np.inf, dtype=np.float32))
+        none = np.full(len(state), np.inf, dtype=np.float32)
+        return Poses(state, rotation, (center - shift).astype(np.float32), log_scale, none)
 
-    def aligned(self, poses: Poses, sigma: float, scaled: bool) -> Poses:
+    def aligned(self, poses: Poses, sigma: float) -> Poses:
         """Poses after a rigid step, with the costs that they had before; ``sigma`` is a share of ``half``."""
-        return self._in_blocks(poses, sigma, scaled, True)
+        return self._in_blocks(poses, sigma, True)
 
     def judged(self, poses: Poses, sigma: float) -> Poses:
         """Poses with their costs for a sigma in shares of ``half``."""
-        return self._in_blocks(poses, sigma, False, False)
+        return self._in_blocks(poses, sigma, False)
 
-    def _in_blocks(self, poses: Poses, sigma: float, scaled: bool, moves: bool) -> Poses:
+    def _in_blocks(self, poses: Poses, sigma: float, moves: bool) -> Poses:
         """``_step`` of blocks that fit a core's cache, on all cores."""
         blocks = [poses.rows(np.arange(first, min(first + BLOCK, len(poses)))) for first in range(0, len(poses), BLOCK)]
         with ThreadPoolExecutor(cores()) as pool:
-            return Poses.of_all(
-                list(pool.map(lambda block: self._step(block, sigma * self.half, scaled, moves), blocks))
-            )
+            return Poses.of_all(list(pool.map(lambda block: self._step(block, sigma * self.half, moves), blocks)))
 
-    def _step(self, poses: Poses, sigma: float, scaled: bool, moves: bool) -> Poses:
+    def _step(self, poses: Poses, sigma: float, moves: bool) -> Poses:
         tables, state = self.tables, poses.state[:, None]
         size, inverse = np.exp(poses.log_scale)[:, None, None], poses.rotation.transpose(0, 2, 1)
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
@@ -229,7 +194,7 @@ class Screen:
         )
         matrix, gradient = _normal_equations(rows, residual, weight)
         near, pulled = _along(seen, offset, ALONG * weight[:, : len(self.points)])
-        return _moved(poses, matrix + near, gradient + pulled, scaled)
+        return _moved(poses, matrix + near, gradient + pulled, self.scaled)
 
 
 def _normal_equations(

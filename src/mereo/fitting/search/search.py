@@ -227,11 +227,10 @@ def _first_of_each(places: Float[np.ndarray, "n p 3"], apart: float) -> list[int
 def screened(problem: Problem, stage: SearchRound) -> list[Posed]:
     """Poses that are worth bending, which differ from each other."""
     tables = tables_of(problem.model, stage.states)
-    screen = Screen.of(tables, problem.evidence, problem.model.half)
-    turns = rotations(stage.rotations)
-    poses = screen.starts(turns, False)
+    screen = Screen.of(tables, problem.evidence, problem.model.half, problem.is_scale_open)
+    poses = screen.starts(rotations(stage.rotations))
     for sigma, share in SIGMAS:
-        poses = screen.aligned(poses, sigma, False)
+        poses = screen.aligned(poses, sigma)
         count = max(round(share * len(poses)), 2 * stage.bent)
         poses = poses if count >= len(poses) else poses.rows(np.argpartition(poses.cost, count)[:count])
     poses = screen.judged(poses, SIGMAS[-1][0])
@@ -253,4 +252,6 @@ def _fitted(problem: Problem, posed: Posed) -> Judged:
     config, whole = problem.config, Prior.whole(problem.model)
     posed = fit_cloud(problem, posed, whole, config.start_sigma, config.last_steps, config.pair_slack)
     return Judged.of(problem, posed).better(problem, refine(problem, posed))
-LOG = []
+
+
+LOG: list[list[float]] = []

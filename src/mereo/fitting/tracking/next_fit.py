@@ -22,9 +22,9 @@ from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, in_space
 from mereo.fitting.problem.noise import constants_for
 from mereo.fitting.problem.priors import Prior
-from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
-from mereo.fitting.registration.fit import KNOWN_SCALE_STD, ModesFit
+from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.tracking.config import TrackConfig
 from mereo.geometry.downsampling import means_along_sight
 from mereo.io.cores import one_blas_thread
