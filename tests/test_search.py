@@ -1,0 +1,155 @@
+"""The search for pose and state without a network: what its tables hold, and what it finds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from test_fitting_theorems import seen
+
+from mereo.fitting.config import FitConfig
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.registration.search_modes import search_modes, size_of
+from mereo.fitting.search.screening import Poses, Screen
+from mereo.fitting.search.search import rotations
+from mereo.fitting.search.shape_tables import CELLS, medoids, tables_of
+from mereo.fitting.search.sight_table import SightTable
+from mereo.geometry.sight_lines import SightLines
+from mereo.models.weights import load_model
+from mereo.scenes.statistical_model import StatisticalModel
+
+FAR = np.array([12.0, -7.0, 150.0])
+
+
+@pytest.fixture(scope="module")
+def model() -> StatisticalModel:
+    """Model of a lobe with a core inside and a tip that lies on it, which bends."""
+    found = load_model("tests/golden/lump.safetensors").statistical_model
+    assert found is not None
+    return found
+
+
+def state(model: StatisticalModel, index: int) -> Posed:
+    """A state of the library, turned at random, before the camera."""
+    turn = rotations(97)[(31 * index + 7) % 97]
+    return Posed(turn, FAR - turn @ model.mean.mean(axis=0), model.library[index].astype(np.float64))
+
+
+def view(model: StatisticalModel, posed: Posed) -> np.ndarray:
+    """Cloud that the camera sees of a state."""
+    return seen(model.mesh(posed.place(model.material(posed.z))))
+
+
+def cut(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points that are left where something on the right hides a share of them, and the lines of sight to that."""
+    slope = points[:, 0] / points[:, 2]
+    limit = np.quantile(slope, 1 - share)
+    x, y = np.meshgrid(np.arange(limit, limit + 0.6, 0.006), np.arange(-0.5, 0.5, 0.006))
+    return points[slope < limit], 50.0 * np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+
+
+def off(model: StatisticalModel, material: np.ndarray, posed: Posed) -> float:
+    """Root mean square distance of the found places from the true ones, in half lengths."""
+    true = posed.place(model.material(posed.z))
+    return float(np.sqrt(((material - true) ** 2).sum(axis=1).mean()) / model.half)
+
+
+def test_rotations_are_even() -> None:
+    turns = rotations(600)
+    np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turns.shape), atol=1e-12)
+    trace = np.einsum("nij,mij->nm", turns, turns)
+    np.fill_diagonal(trace, -1.0)
+    nearest = np.degrees(np.arccos(np.clip((trace.max(axis=1) - 1) / 2, -1, 1)))
+    assert nearest.min() > 15 and nearest.max() < 32  # as far apart as 600 can be, about 25 degrees
+
+
+def test_a_table_names_the_sample_nearest_to_each_cell(model: StatisticalModel) -> None:
+    tables = tables_of(model, 3)
+    steps = np.indices((CELLS,) * 3).reshape(3, -1).T + 0.5
+    for row in range(len(tables.z)):
+        centers = tables.low[row] + tables.cell[row] * steps
+        distance = np.linalg.norm(tables.place[row, tables.nearest[row]] - centers, axis=1)
+        np.testing.assert_allclose(distance, cKDTree(tables.place[row]).query(centers)[0], rtol=1e-5)
+
+
+def test_medoids_are_states_that_stand_for_all(model: StatisticalModel) -> None:
+    rows = medoids(model, 8)
+    assert len(set(rows)) == len(rows) <= 8
+    shape = model.library * model.motion
+    spread = np.sqrt(((shape[:, None] - shape[rows]) ** 2).sum(axis=2)).min(axis=1).mean()
+    rng = np.random.default_rng(0)
+    others = [rng.choice(len(shape), 8, replace=False) for _ in range(20)]
+    random = [np.sqrt(((shape[:, None] - shape[other]) ** 2).sum(axis=2)).min(axis=1).mean() for other in others]
+    assert spread < np.min(random)
+
+
+def test_a_table_of_sight_rules_out_what_the_evidence_does(model: StatisticalModel) -> None:
+    posed = state(model, 3)
+    points, unknown = cut(view(model, posed), 0.3)
+    evidence = Evidence.of(points, lines=SightLines(np.empty((0, 3)), unknown, "past"))
+    places = posed.place(model.material(posed.z)) + np.random.default_rng(0).normal(scale=4.0, size=model.mean.shape)
+    _, exact = evidence.violations(places, 0.5)
+    _, looked_up = SightTable.of(evidence).violations(places[None].astype(np.float32), 0.5)
+    # up to a cell's width, which is a few pixels here
+    assert np.mean((exact > 0) == (looked_up[0] > 0)) > 0.85
+    np.testing.assert_allclose(np.median(np.abs(exact - looked_up[0])), 0.0, atol=0.1)
+
+
+def test_a_rigid_step_draws_a_pose_to_the_frame(model: StatisticalModel) -> None:
+    posed = Posed(rotations(97)[5], FAR, np.zeros(model.count))
+    screen = Screen.of(tables_of(model, 0), Evidence.of(view(model, posed)), model.half)
+    turn = rotations(20_000)
+    near = turn[np.argsort(-np.einsum("nij,ij->n", turn, posed.rotation))[:30]]  # up to 10 degrees away
+    size = len(near)
+    poses = Poses(
+        np.zeros(size, dtype=np.int64),
+        near.astype(np.float32),
+        np.tile(FAR + 3.0, (size, 1)).astype(np.float32),
+        np.zeros(size, dtype=np.float32),
+        np.zeros(size, dtype=np.float32),
+    )
+    before = screen.judged(poses, 0.05).cost
+    for sigma in (0.15, 0.1, 0.1, 0.05, 0.05, 0.05):
+        poses = screen.aligned(poses, sigma)
+    assert screen.judged(poses, 0.05).cost.max() < 0.6 * before.min()
+    assert np.linalg.norm(poses.translation - FAR, axis=1).max() < 0.05 * model.half
+
+
+@pytest.mark.parametrize("index", [0, 5])
+@pytest.mark.parametrize("unit", [1.0, None])
+def test_a_view_is_found_from_nothing(model: StatisticalModel, index: int, unit: float | None) -> None:
+    posed = state(model, index)
+    scale = 1.0 if unit else 0.0021
+    fitted = search_modes(scale * view(model, posed), model, unit)
+    found = fitted.registration()
+    assert found.accepted and off(model, found.material / scale, posed) < 0.05
+    assert found.scene_unit == pytest.approx(scale, rel=0.02)
+    assert fitted.problem.evidence.elsewhere == "past"  # seen whole, and taken for that
+
+
+def test_a_view_of_which_a_half_is_hidden_is_found_as_one(model: StatisticalModel) -> None:
+    posed = state(model, 4)
+    points, unknown = cut(view(model, posed), 0.4)
+    told = search_modes(points, model, 1.0, lines=SightLines(np.empty((0, 3)), unknown, "past"))
+    open_ = search_modes(points, model, 1.0)
+    wrong = search_modes(points, model, 1.0, lines=SightLines.of_cloud("past"))
+    apart = [off(model, fitted.registration().material, posed) for fitted in (told, open_, wrong)]
+    assert max(apart[:2]) < 0.1 < apart[2]
+    assert open_.problem.evidence.elsewhere == "unknown"
+
+
+def test_the_size_of_a_cloud_is_guessed(model: StatisticalModel) -> None:
+    points = view(model, state(model, 2))
+    assert 0.6 < size_of(points, model) < 1.6
+    assert size_of(7.0 * points, model) == pytest.approx(7.0 * size_of(points, model), rel=1e-3)
+
+
+def test_noise_is_told_from_a_wrong_state(model: StatisticalModel) -> None:
+    posed = state(model, 1)
+    points = view(model, posed)
+    rng = np.random.default_rng(0)
+    noisy = points * (1 + rng.normal(scale=0.5, size=(len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True))
+    fitted = search_modes(noisy, model, 1.0, lines=SightLines.of_cloud("past"))
+    assert fitted.problem.noisy and off(model, fitted.registration().material, posed) < 0.1
+    assert not search_modes(points, model, 1.0, replace(FitConfig())).problem.noisy
