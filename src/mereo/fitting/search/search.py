@@ -10,6 +10,7 @@
 """
 
 from dataclasses import dataclass, field
+from itertools import permutations
 
 import numpy as np
 from jaxtyping import Float
@@ -110,6 +111,7 @@ class _Trail:
     """Search under one hypothesis of what the lines of sight beside the cloud say, as far as it has come."""
 
     problem: Problem
+    handicap: float = 0.0
     fitted: list[Judged] = field(default_factory=list)
 
     @property
@@ -138,7 +140,7 @@ class _Trail:
             return None
         states = [judged.posed for judged in sorted(self.fitted, key=_total)]
         rows = differing(noisy, states, BENT_APART)[:NOISY_FITS]
-        trail = _Trail(noisy, [explored(noisy, _fitted(noisy, states[row])) for row in rows])
+        trail = _Trail(noisy, 0.0, [explored(noisy, _fitted(noisy, states[row])) for row in rows])
         return trail if noisy.leaves_noise(trail.best.surface) else None
 
     def found(self) -> Found:
@@ -156,20 +158,20 @@ def search(whole: Problem, partial: Problem | None = None) -> Found:
         partial: the same where it is open whether the object is seen whole: with nothing known beside the cloud. It is
             taken where it explains the frame better by more than ``WHOLE``.
     """
-    trails = [_Trail(problem) for problem in (whole, partial) if problem is not None]
+    trails = [_Trail(whole)] if partial is None else [_Trail(whole), _Trail(partial, WHOLE)]
     for number, stage in enumerate(ROUNDS):
         for trail in trails:
             trail.go_on(stage)
-        if partial is not None:  # either may have found what the other has missed
-            first, second = (trail.best.posed for trail in trails)
-            trails[0].try_too(second)
-            trails[1].try_too(first)
-        chosen = min(trails, key=lambda trail: trail.best.misfit.total + (WHOLE if trail is not trails[0] else 0.0))
-        LOG.append([trail.best.misfit.total for trail in trails])
+        for trail, other in permutations(trails, 2):  # either may have found what the other has missed
+            trail.try_too(other.best.posed)
+        chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
         if chosen.is_explained or (number > 0 and chosen.best.misfit.cloud < UNEXPLAINED):
             break
-        if number > 0 and (noisy := chosen.as_noisy()) is not None:
-            return noisy.found()
+        if number > 0:
+            noisy = chosen.as_noisy()
+            if noisy is not None:
+                return noisy.found()
+            trails = [chosen]
     return chosen.found()
 
 
@@ -252,6 +254,3 @@ def _fitted(problem: Problem, posed: Posed) -> Judged:
     config, whole = problem.config, Prior.whole(problem.model)
     posed = fit_cloud(problem, posed, whole, config.start_sigma, config.last_steps, config.pair_slack)
     return Judged.of(problem, posed).better(problem, refine(problem, posed))
-
-
-LOG: list[list[float]] = []
