@@ -35,7 +35,7 @@ from mereo.evaluation.results import grid_confusion, labels_on
 from mereo.evaluation.scans import SCANS, bunny_posed
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import fit_rigid
-from mereo.models.weights import shipped_names
+from mereo.models.weights_place import shipped_names
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor

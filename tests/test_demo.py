@@ -16,7 +16,8 @@ from mereo.fitting.registration.state import load_state
 from mereo.fitting.registration.state_file import STATE
 from mereo.geometry.solids import Solids
 from mereo.io.output_folders import MARKER, new_directory
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud
 from mereo.models.weights import load_model
 from mereo.visualization.viewer.laboratory import QuickRegistrar
 

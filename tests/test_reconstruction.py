@@ -249,7 +249,7 @@ def test_a_stream_drops_strays_and_counts_them(
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     save_model(untrained(NAMES), tmp_path / "w.safetensors")
     np.save(tmp_path / "cloud.npy", scene("camera")[0][:5])
-    with pytest.raises(ValueError, match="the cloud has 5 points; the encoder needs at least 32"):
+    with pytest.raises(ValueError, match="the cloud has 5 points; a reconstruction needs at least 32"):
         reconstruct_file(tmp_path / "cloud.npy", tmp_path / "deep/out", FrameJob(tmp_path / "w.safetensors"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.npy", "w.safetensors"]
 

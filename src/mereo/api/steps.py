@@ -27,7 +27,8 @@ from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.models.elsewhere import for_tasks
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
-from mereo.models.weights import WEIGHTS, load_for
+from mereo.models.weights import load_for
+from mereo.models.weights_place import WEIGHTS
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
@@ -35,7 +36,7 @@ from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.training import trainer
 from mereo.training.config import PRESETS, PresetName, TrainConfig
-from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
+from mereo.visualization.evaluation_files import evaluate_on_scans, evaluate_weights
 from mereo.workers.cluster import joined_first
 from mereo.workers.config import Cluster, cluster_of
 

@@ -24,12 +24,10 @@ from mereo.evaluation.results import grid_confusion, labels_on
 from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view, shipped_frame
 from mereo.evaluation.scans import BUNNY_SCAN_POSES
 from mereo.fitting.config import AnswerMethod
-from mereo.fitting.registration.register import statistical_model_of
 from mereo.io.output_folders import check_new_directory
 from mereo.io.progress import shown_stages
 from mereo.io.scratch_folders import check_place
 from mereo.io.sensor_frame import SensorFrame
-from mereo.reconstruction.pipeline import segment_names
 from mereo.visualization.report_words import confidence_title
 from mereo.visualization.units import Unit
 
@@ -120,8 +118,8 @@ def _inputs() -> Iterator[Callable[[], Case]]:
 
 def _scan_case() -> Case:
     frame, known = shipped_frame(SHIPPED_SCAN), load_object("bunny")
-    model = statistical_model_of(known.model)
-    assert model.source_frame is not None
+    model = known.with_deformation_model().model
+    assert model is not None and model.source_frame is not None
     truth = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source @ BUNNY_SCAN_POSES[SHIPPED_SCAN]))
     title = f"{SHIPPED_SCAN}: a real range scan of the Stanford bunny"
     return Case(SHIPPED_SCAN, title, known, frame, truth_grid(truth))
@@ -160,10 +158,10 @@ def _answer(case: Case, method: AnswerMethod) -> tuple[Result, Column]:
     started = time.perf_counter()
     result = reconstruct(case.frame, case.object, method, resolution=RESOLUTION)
     seconds = time.perf_counter() - started
-    model = case.object.model
     labels = labels_on(result.surfaces, case.truth.grid)
-    confusion = grid_confusion(case.truth, labels, len(segment_names(model)[0]))
-    return result, Column(intersection_over_union(confusion, model.segmented), seconds)
+    network = case.object.network
+    confusion = grid_confusion(case.truth, labels, len(result.names))
+    return result, Column(intersection_over_union(confusion, network is None or network.segmented), seconds)
 
 
 def _table(case: Case, result: Result, columns: dict[str, Column]) -> Table:

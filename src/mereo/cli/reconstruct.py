@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -30,7 +31,7 @@ from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.medical import MM_PER_M
 from mereo.models.config import InferenceConfig
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import files_of
@@ -112,12 +113,12 @@ class FrameJob:
         """Registrar of the object's model; None where the network alone answers."""
         return self.object.registrar(self.method)
 
-    def asking(self, model: Model) -> "FrameJob":
+    def asking(self, network: Trained | None) -> "FrameJob":
         """The same, asking the same weights on another device; what is known of scene and attachments stays so."""
         _ = self.registrar  # set up once, before it is moved
         moved = copy(self)
         vars(moved).pop("registrar", None)
-        vars(moved).update(object=self.object.asking(model))
+        vars(moved).update(object=self.object.asking(network))
         return moved
 
     @cached_property
@@ -206,10 +207,16 @@ def print_source(found: Answer) -> None:
     if registration is None:
         print(f"the network's answer, as no registration was found: {found.refusal}")
         return
-    explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
+    by = " by search" if found.taken and found.found_by == "search" else ""
+    explained = (
+        f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method}; found{by})"
+        if by
+        else f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
+    )
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
-        print("that is too little to believe it: --method auto keeps the network's answer")
+        cure = "look at the result" if found.model is None else "--method auto keeps the network's answer"
+        print(f"that is too little to believe it: {cure}")
     if found.recognition.told is not None:
         print(found.recognition.told)
 
@@ -222,12 +229,15 @@ def print_segments(answered: Result) -> None:
     table = Table(title=f"{seen.frame.source}, {len(seen.cloud)} points", title_justify="left")
     table.add_column("segment")
     volume, centroid = f"volume ({unit.volume_name})", f"centroid ({unit.length_name})"
-    for column in (volume, confidence_title(result.calibrated), "components", centroid):
+    known = not all(np.isnan(found.confidence) for found in result.segments)
+    sure_of = [confidence_title(result.calibrated)] if known else []
+    for column in (volume, *sure_of, "components", centroid):
         table.add_column(column, justify="right")
     for found in result.segments:
         # the radius gives the digits; it is in the report, and would break the lines of 80 columns
         place = unit.place(found.centroid, radii.get(found.name)).partition(" ±")[0]
-        row = (unit.volume(found.volume), f"{found.confidence:.2f}", str(found.components), place)
+        told = [f"{found.confidence:.2f}"] if known else []
+        row = (unit.volume(found.volume), *told, str(found.components), place)
         table.add_row(found.name, *(row if found.voxels else ("0", "not found", "0", "")))
     console = Console(markup=False, emoji=False)
     console.print(table)

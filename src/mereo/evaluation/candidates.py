@@ -7,14 +7,15 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.answering.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.solids import label_grid
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 from mereo.reconstruction.observation import observe
 
@@ -71,7 +72,7 @@ class Candidates:
         return "network" if found is None else found.method
 
 
-def network_labels(model: Model, code: EncodedCloud, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
+def network_labels(model: Trained, code: EncodedCloud, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
     """Labels by the network at the voxels of a grid, evaluated coarse to fine."""
     x, y, z = grid.labels.shape
 
@@ -86,7 +87,7 @@ def find_candidates(
 ) -> Candidates:
     """Answers to a frame, scored on a grid: the one that a user gets, and all others that led to it."""
     answer = answer_frame(observe(cloud), model, registrar, scene_unit=scene_unit)
-    assert answer.likelier is not None and answer.candidate is not None
+    assert answer.likelier is not None and answer.candidate is not None and answer.likelier.code is not None
     started = time.perf_counter()
     code, encoding = answer.likelier.code, answer.likelier.timings_s["encode"]
     labels = network_labels(model, code, grid)

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from mereo.evaluation.ground_truth import TruthGrid
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud
 
 BINS = 15
 """Bins of equal width, as in the papers."""

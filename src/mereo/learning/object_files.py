@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -48,6 +49,13 @@ def scene_for(files: Sequence[Path], folder: Path, units: str | None, quiet: boo
             return str(path)
         print(told_of(path))
     return str(path)
+
+
+def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
+    """Scene of meshes as ``scene_for`` writes it, without a file; raises as ``write_scene_file`` does."""
+    with TemporaryDirectory() as folder:
+        scene = load_scene(write_scene_file(files, Path(folder) / SCENE, units, name=files[0].name.split(".")[0]))
+    return replace(scene, file=None)
 
 
 def told_of(path: Path) -> str:

@@ -27,6 +27,7 @@ STAGES = {
 SAID_ELSEWHERE = frozenset(
     {
         "title",
+        "found_by",
         "recognition",
         "radius95",
         "unit",
@@ -98,7 +99,8 @@ def _heads(summary: Mapping[str, Any], unit: Unit, confidence: str) -> list[str]
     sure = isinstance(summary.get("radius95"), Mapping)
     centre, volume = (", ± 95 %", ", 95 % range") if sure else ("", "")
     heads = [f"centre x, y, z{centre} ({unit.length_name})", f"volume{volume} ({unit.volume_name})"]
-    return ["segment", *heads, confidence]
+    known = any(_number(told.get("confidence")) is not None for told in summary.get("segments") or ())
+    return ["segment", *heads, *([confidence] if known or not summary.get("segments") else [])]
 
 
 def _facts(summary: Mapping[str, Any], unit: Unit, verdict: Trust) -> list[str]:

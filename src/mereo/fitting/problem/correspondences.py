@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.statistical_model import StatisticalModel
 
 SIGHT_LINES = 256
@@ -61,6 +61,12 @@ class Correspondences:
         """Correspondences in a camera frame that is turned about its origin."""
         return replace(self, points=self.points @ rotation.T)
 
+    @classmethod
+    def none(cls) -> "Correspondences":
+        """No correspondences: of a frame that no network was asked about."""
+        places = np.empty((0, 3))
+        return cls(places, places, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))
+
     def displaced(self, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> float | None:
         """How far the places of the object are from where a model's state has them, as a share of half its length.
 
@@ -85,7 +91,7 @@ class Correspondences:
 
 
 def find_correspondences(
-    model: Model, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
+    model: Trained, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
 ) -> Correspondences | None:
     """Correspondences: all that the network says about observed points and the lines of sight behind them.
 

@@ -31,7 +31,7 @@ from mereo.fitting.uncertainty.optimum import DrawsOptimum, ModesOptimum, Optimu
 from mereo.geometry.camera import PointCloud
 from mereo.io.cores import one_blas_thread
 from mereo.models.calibration import Calibration
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.statistical_model import StatisticalModel
 
 KNOWN_SCALE_STD = 1e-6
@@ -117,6 +117,14 @@ class ModesFit:
     def off_surface(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Distances, in scene units, of points of the camera frame in the cloud's unit from the facing surface."""
         return self.surface.nearest(points / self.unit)[0]
+
+    def misfit_in(self, other: "ModesFit") -> float:
+        """Misfit of this fit's state in the problem of another fit to the frame, without the network's term."""
+        model, surface = other.problem.model, self.surface
+        if self.unit != other.unit:
+            surface = Surface.through(model, surface.material * (self.unit / other.unit))
+        z = self.posed.z if self.rest is None else model.rest_z
+        return other.problem.misfit(replace(self.posed, z=z), surface).without_network
 
     @cached_property
     def surface(self) -> Surface:
@@ -221,7 +229,7 @@ def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: Judged 
 
 def fit_frame(
     cloud: PointCloud,
-    network: Model,
+    network: Trained,
     model: StatisticalModel,
     scene_unit: float | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
@@ -262,7 +270,7 @@ def fit_frame(
     return replace(fitted, seconds=fitted.seconds + asked, calibration=network.calibration)
 
 
-def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
+def _asked(network: Trained, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
     """Correspondences that the network states for a cloud, evenly."""
     found = find_correspondences(network, code, model.rest_center, model.half)
     if found is None:
@@ -274,7 +282,7 @@ def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Corre
 
 def fit(
     cloud: PointCloud,
-    network: Model,
+    network: Trained,
     model: StatisticalModel,
     scene_unit: float | None = None,
     states: DrawnStates | None = None,

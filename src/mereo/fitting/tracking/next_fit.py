@@ -145,7 +145,7 @@ def next_fit(
         passed = max(time_s - track.time_s, 0.0)
         posed = descend(problem, start, Expectation.of(track, start, passed, config), config)
     seconds = time.perf_counter() - started
-    fitted = ModesFit(problem, nothing(), track.unit, posed, seconds, calibration=track.calibration)
+    fitted = ModesFit(problem, Correspondences.none(), track.unit, posed, seconds, calibration=track.calibration)
     return fitted, followed(track, fitted, time_s, config)
 
 
@@ -206,9 +206,3 @@ def descend(problem: Problem, start: Posed, expectation: Expectation, config: Tr
         normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
         posed = posed.moved(normal.step(constants.damping))
     return posed
-
-
-def nothing() -> Correspondences:
-    """No correspondences."""
-    none = np.empty((0, 3))
-    return Correspondences(none, none, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))

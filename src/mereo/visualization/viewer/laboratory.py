@@ -17,8 +17,8 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scoring import check_names, predict_grid
+from mereo.fitting.answering.answer_frame import answer_frame
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.register import Registrar, registrar_for
 from mereo.fitting.registration.registration import Registration
@@ -26,7 +26,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.transforms import inverse_rigid
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction, segment_names
 from mereo.scenes.scene import Scene
@@ -85,6 +85,11 @@ class Trial:
 class QuickRegistrar(Registrar):
     """Registrar for frames that change while they are looked at: it fits the modes alone."""
 
+    @property
+    def asks_search(self) -> bool:
+        """Whether a search is asked too; it takes seconds."""
+        return False
+
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer of the modes."""
         return fitted.registration()
@@ -103,7 +108,7 @@ class Laboratory:
     """
 
     scene: Scene
-    model: Model | None
+    model: Trained | None
     shapes: Freedom[Any] | None = None
 
     def __post_init__(self) -> None:
@@ -185,6 +190,7 @@ class Laboratory:
         if answer.taken:
             predicted = label_grid(reconstruction.surfaces, *truth.grid.axes())
         else:
+            assert reconstruction.code is not None
             predicted = predict_grid(self.model, reconstruction.code, truth)
         confusion = grid_confusion(truth, predicted, len(segment_names(self.model)[0]))
         scores = intersection_over_union(confusion, self.model.segmented)

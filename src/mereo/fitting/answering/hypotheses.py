@@ -1,26 +1,27 @@
-"""The answer to one frame: the one way that every command and every public function goes.
+"""Which of a frame's points belong to the object: each hypothesis is fitted, and the fits decide.
 
     Observation -hypotheses-> which points belong to the object -encode, fit modes-> Candidate of each hypothesis
-        -choose-> the best candidate -fit draws-> Registration -recognize-> Recognition -> Answer
+        -choose-> the best candidate
 
 Outliers move the box that the network's frame is made from, thin parts of the object look like outliers, and geometry
-alone cannot tell them apart (``reconstruction.strays``). A model that explains the points can: each hypothesis is
-fitted, and the fits decide.
+alone cannot tell them apart (``reconstruction.strays``). A model that explains the points can. A network is quick, and
+is asked about every hypothesis; a search takes seconds, and goes on to the next where the first explains too little.
 """
 
 import time
 from dataclasses import replace
 
-from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.recognition import Recognition, recognize
+import numpy as np
+
+from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.registration.registration import Registration
+from mereo.fitting.search.search import search_modes
 from mereo.geometry.transforms import transform_points
-from mereo.io.progress import stage
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame, encode_frame
 from mereo.reconstruction.strays import Reading, readings
+from mereo.scenes.statistical_model import StatisticalModel
 
 CLEARLY = 0.05
 """Share of all points that the hypothesis with every point must explain beyond the others: outliers pull its fit
@@ -30,96 +31,20 @@ GIVEN_BACK = 0.8
 """Share of the dropped points that, once explained by the fit to the others, or by that to all, were none: then every
 point is kept. The fit to all explains .86 and more of them on clean views, and at most .44 where they are outliers."""
 
+SMALLEST, LARGEST = 0.05, 3.0
+"""Longest side of a view, in those of the object at rest, beyond which a unit is wrong or the cloud another thing's."""
+
 AS_WELL = 0.01
 """Share of all points that a fit with points given back may explain less."""
 
 
-def answer_frame(
-    seen: Observation,
-    model: Model,
-    registrar: Registrar | None,
-    *,
-    keep_all: bool = False,
-    scene_unit: float | None = None,
-    resolution: int = 128,
-    label_points: bool = False,
-) -> Answer:
-    """Answer to a frame, wherever it comes from.
-
-    Args:
-        seen: the object in the frame, outliers among its points.
-        model: the weights.
-        registrar: of the same object, set up once for many frames; None leaves the network alone. With "auto" a
-            registration that does not explain the frame leaves the answer to the network, with other choices it is
-            taken all the same.
-        keep_all: take every point for the object's.
-        scene_unit: length of a scene unit in the frame's unit, where it is known for certain. Otherwise it follows
-            from the frame's unit where the network's estimate agrees, or is found together with the pose.
-        resolution: cells along the longest side of the object's box in ``Answer.reconstruction``.
-        label_points: let ``Answer.reconstruction`` also say on which segment each observed point lies.
-
-    Raises ``ValueError`` for unusable clouds.
-    """
-    started = time.perf_counter()
-    with stage("register the model"):
-        candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
-    registration = None
-    if registrar is not None and candidate.modes is not None:
-        with stage("fit the parameters of the scene"):
-            registration = registrar.finish(candidate.modes)
-    answer = answer_of(seen, model, registrar, candidate, likelier, registration)
-    seconds = time.perf_counter() - started
-    return replace(answer, resolution=resolution, label_points=label_points, seconds=seconds)
-
-
-def answer_of(
-    seen: Observation,
-    model: Model,
-    registrar: Registrar | None,
-    candidate: Candidate,
-    likelier: EncodedFrame,
-    registration: Registration | None,
-) -> Answer:
-    """Answer from the best candidate and its registration: recognize the object, and choose who answers."""
-    displaced = None if registration is None else candidate.displaced(registration)
-    stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
-    refusal = None if candidate.error is None else str(candidate.error)
-    recognition = recognize(registration, model.calibration, displaced, stated, refusal)
-    taken = registrar is not None and registration is not None and registrar.takes(registration)
-    hypothesis = candidate.hypothesis if taken else likelier.reading
-    if taken and registrar is not None and registration is not None:
-        seen = in_found_unit(seen, registrar, registration, recognition)
-    return Answer(
-        seen=seen.read_as(hypothesis),
-        model=model,
-        registrar=registrar,
-        hypothesis=hypothesis,
-        T_camera_input=candidate.encoded.T_camera_input if taken else likelier.T_camera_input,
-        candidate=candidate,
-        registration=registration,
-        taken=taken,
-        recognition=recognition,
-        likelier=likelier,
-    )
-
-
-def in_found_unit(
-    seen: Observation, registrar: Registrar, registration: Registration, recognition: Recognition
-) -> Observation:
-    """Observation in the unit that a registration finds, where the frame knows none; another object's says nothing."""
-    return seen if recognition.known is False else seen.in_unit(registrar.unit_of(registration))
-
-
-# --- which points belong to the object --------------------------------------------------------------------------------
-
-
 def fit_hypotheses(
-    seen: Observation, model: Model, registrar: Registrar | None, keep_all: bool, scene_unit: float | None
+    seen: Observation, model: Trained, registrar: Registrar | None, keep_all: bool, scene_unit: float | None
 ) -> tuple[Candidate, EncodedFrame]:
-    """Fit the modes to each hypothesis, and return the best candidate and the encoding of the likelier hypothesis.
+    """Fit the modes from the network's correspondences to each hypothesis.
 
     Takes the arguments of ``answer_frame`` and raises as it does; a fit that finds too little is in
-    ``Candidate.error``.
+    ``Candidate.error``. Returns the best candidate and the encoding of the likelier hypothesis.
     """
     started = time.perf_counter()
     axes = seen.frame.axes
@@ -153,12 +78,60 @@ def fit_hypotheses(
             given_back = _with_explained_given_back(surfaces)
             again = surfaces if given_back is None else fit(encode_frame(given_back, model, axes), quick)
             best = _most_explained(everything, surfaces, surfaces if again.modes is None else again)
-    if best.modes is not None and not best.modes.registration().accepted:  # then it is not for outliers alone
-        best = _better(best, fit(best.encoded, registrar.at_last))
+    if best.modes is not None and not best.is_accepted:  # then it is not for outliers alone
+        best = better(best, fit(best.encoded, registrar.at_last))
     if best.modes is not None:
         spent = time.perf_counter() - started - best.encoded.timings_s["encode"]
         best = replace(best, modes=replace(best.modes, seconds=spent))
     return best, likelier
+
+
+def search_hypotheses(
+    seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None
+) -> tuple[Candidate, EncodedFrame]:
+    """Search the object without a network, in the likelier hypothesis, and in the other where that explains too little.
+
+    Takes the arguments of ``answer_frame``, and raises as it does for unusable clouds. Returns the best candidate and
+    the likelier hypothesis.
+    """
+    unit, axes = registrar.stated_scene_unit(seen.frame.unit_m) if scene_unit is None else scene_unit, seen.frame.axes
+    likelier, *others = (encode_frame(one, None, axes) for one in readings(seen.cloud, axes, keep_all))
+    best = _searched(likelier, registrar, unit)
+    for other in others:
+        if best.is_accepted:
+            break
+        best = better(best, _searched(other, registrar, unit))
+    return best, likelier
+
+
+def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None) -> Candidate:
+    """Candidate of one hypothesis by a search."""
+    dropped = frame.reading.whole.points[~frame.reading.keep]
+    doubtful = transform_points(frame.T_camera_input, dropped) if len(dropped) else None
+    try:
+        check_size(frame, registrar.model, scene_unit)
+        # lines: where the observation knows its lines of sight, they go here
+        modes = search_modes(
+            frame.seen.points, registrar.model, scene_unit, registrar.config, doubtful=doubtful, lines=None
+        )
+    except ValueError as error:
+        return Candidate(frame, error=error, found_by="search")
+    return Candidate(frame, modes, found_by="search")
+
+
+def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float | None) -> None:
+    """Raise ``ValueError`` for a cloud that is no view of an object of this size, where the size is known."""
+    if scene_unit is None:
+        return
+    seen, whole = float(np.ptp(frame.points, axis=0).max()), 2 * model.half * scene_unit
+    if SMALLEST <= seen / whole <= LARGEST:
+        return
+    raise ValueError(
+        f"what was seen is {seen:.3g} long in the frame's unit and the object {whole:.3g}, a factor of "
+        f"{max(seen / whole, whole / seen):.3g}; a view shows from {SMALLEST:.0%} to {LARGEST:.0%} of it: correct the "
+        "unit of the frame (--unit-m 0.001 for millimetres, --depth-scale for images) or that of the object's files "
+        "(--units), or leave out of the cloud what is not the object"
+    )
 
 
 def _are_object(everything: Candidate, surfaces: Candidate) -> bool:
@@ -185,7 +158,7 @@ def _most_explained(everything: Candidate, surfaces: Candidate, again: Candidate
     return again if by_again >= by_surfaces - AS_WELL else surfaces
 
 
-def _better(first: Candidate, second: Candidate) -> Candidate:
+def better(first: Candidate, second: Candidate) -> Candidate:
     """Choose the fit that explains the greater share of all points; the first where both do."""
     if first.modes is None or second.modes is None:
         return first if second.modes is None else second

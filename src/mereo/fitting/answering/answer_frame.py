@@ -1,0 +1,126 @@
+"""The answer to one frame: the one way that every command and every public function goes.
+
+Observation -find-> Candidate (by network, by search, or the better of both) -fit draws-> Registration
+-recognize-> Recognition -> Answer
+"""
+
+import time
+from dataclasses import replace
+
+from mereo.fitting.answering.hypotheses import fit_hypotheses, search_hypotheses
+from mereo.fitting.registration.answer import Answer, Candidate
+from mereo.fitting.registration.recognition import Recognition, recognize
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
+from mereo.io.progress import stage
+from mereo.models.trained import Trained
+from mereo.reconstruction.observation import Observation
+from mereo.reconstruction.pipeline import EncodedFrame
+
+
+def answer_frame(
+    seen: Observation,
+    model: Trained | None,
+    registrar: Registrar | None,
+    *,
+    keep_all: bool = False,
+    scene_unit: float | None = None,
+    resolution: int = 128,
+    label_points: bool = False,
+) -> Answer:
+    """Answer to a frame, wherever it comes from.
+
+    Args:
+        seen: the object in the frame, outliers among its points.
+        model: the weights; None of an object without.
+        registrar: of the same object, set up once for many frames; None leaves the network alone. With "auto" a
+            registration that does not explain the frame leaves the answer to the network, with other choices, and
+            without a network, it is taken all the same.
+        keep_all: take every point for the object's.
+        scene_unit: length of a scene unit in the frame's unit, where it is known for certain. Otherwise it follows
+            from the frame's unit (where a network's estimate agrees), or is found together with the pose.
+        resolution: cells along the longest side of the object's box in ``Answer.reconstruction``.
+        label_points: let ``Answer.reconstruction`` also say on which segment each observed point lies.
+
+    Raises ``ValueError`` for unusable clouds, and where nothing is found and no network can answer.
+    """
+    started = time.perf_counter()
+    with stage("register the model"):
+        candidate, likelier = find(seen, model, registrar, keep_all, scene_unit)
+    if candidate.error is not None and model is None:
+        raise candidate.error
+    registration = None
+    if registrar is not None and candidate.modes is not None:
+        with stage("fit the parameters of the scene"):
+            registration = registrar.finish(candidate.modes)
+    answer = answer_of(seen, model, registrar, candidate, likelier, registration)
+    seconds = time.perf_counter() - started
+    return replace(answer, resolution=resolution, label_points=label_points, seconds=seconds)
+
+
+def answer_of(
+    seen: Observation,
+    model: Trained | None,
+    registrar: Registrar | None,
+    candidate: Candidate,
+    likelier: EncodedFrame,
+    registration: Registration | None,
+) -> Answer:
+    """Answer from the best candidate and its registration: recognize the object, and choose who answers."""
+    displaced = None if registration is None else candidate.displaced(registration)
+    stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
+    refusal = None if candidate.error is None else str(candidate.error)
+    recognition = recognize(registration, None if model is None else model.calibration, displaced, stated, refusal)
+    taken = registrar is not None and registration is not None and registrar.takes(registration)
+    hypothesis = candidate.hypothesis if taken else likelier.reading
+    if taken and registrar is not None and registration is not None:
+        seen = in_found_unit(seen, registrar, registration, recognition)
+    return Answer(
+        seen=seen.read_as(hypothesis),
+        model=model,
+        registrar=registrar,
+        hypothesis=hypothesis,
+        T_camera_input=candidate.encoded.T_camera_input if taken else likelier.T_camera_input,
+        candidate=candidate,
+        registration=registration,
+        taken=taken,
+        recognition=recognition,
+        likelier=likelier,
+        found_by=candidate.found_by if taken else "network",
+    )
+
+
+def in_found_unit(
+    seen: Observation, registrar: Registrar, registration: Registration, recognition: Recognition
+) -> Observation:
+    """Observation in the unit that a registration finds, where the frame knows none; another object's says nothing."""
+    return seen if recognition.known is False else seen.in_unit(registrar.unit_of(registration))
+
+
+# --- who finds the object ---------------------------------------------------------------------------------------------
+
+
+def find(
+    seen: Observation, model: Trained | None, registrar: Registrar | None, keep_all: bool, scene_unit: float | None
+) -> tuple[Candidate, EncodedFrame]:
+    """Best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
+
+    A network starts the fit where there is one, in tenths of a second; where that does not explain the frame, a search
+    is asked too, and the fit with the greater evidence is taken. Takes the arguments of ``answer_frame``, and raises as
+    it does for unusable clouds.
+    """
+    if registrar is not None and not registrar.asks_network:
+        return search_hypotheses(seen, registrar, keep_all, scene_unit)
+    assert model is not None
+    found, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
+    if registrar is None or not registrar.asks_search or found.is_accepted:
+        return found, likelier
+    searched, _ = search_hypotheses(seen, registrar, keep_all, scene_unit)
+    return more_evident(found, searched), likelier
+
+
+def more_evident(first: Candidate, second: Candidate) -> Candidate:
+    """The candidate whose state has the lower misfit in the problem of the first; the first where both do."""
+    if first.modes is None or second.modes is None:
+        return first if second.modes is None else second
+    return second if second.modes.misfit_in(first.modes) < first.modes.misfit_in(first.modes) else first

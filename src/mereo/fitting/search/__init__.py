@@ -1,0 +1,1 @@
+"""Pose and state of the statistical model that explain a frame, searched without a network."""

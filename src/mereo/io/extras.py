@@ -1,0 +1,22 @@
+"""The extra `network`: what torch is needed for, said in one sentence where it is not installed."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+CURE = "run pip install 'mereo[network]', or leave the weights out: an object's meshes or its scene are enough"
+
+
+@contextmanager
+def network_needed() -> Iterator[None]:
+    """Turn the lack of torch in the block into a sentence that names the extra."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if not is_torch(error):
+            raise
+        raise ImportError(f"PyTorch is not installed; networks need the extra `network`: {CURE}") from None
+
+
+def is_torch(error: BaseException) -> bool:
+    """Whether an error says that torch is not installed."""
+    return isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "torch"
