@@ -106,7 +106,8 @@ def facts_of(name: str, frame: Frame) -> dict[str, Any]:
     surfaces, registration = found.reconstruction.surfaces, found.registration
     grid = truth_grid(frame.truth, CELLS)
     labels = labels_on(surfaces, grid.grid)
-    model = object_of(name).model
+    model = object_of(name).network
+    assert model is not None
     scores = intersection_over_union(grid_confusion(grid, labels, len(model.names)), model.segmented)
     facts: dict[str, Any] = {
         "answer": "network" if not found.taken or registration is None else registration.method,

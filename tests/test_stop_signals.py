@@ -91,7 +91,7 @@ def test_a_stream_ends_with_its_summary(
 ) -> None:
     (tmp_path / "a.npy").touch()
     with monkeypatch.context() as patched:
-        patched.setattr("mereo.cli.stream.load_for", lambda *_: None)
+        patched.setattr("mereo.models.weights.load_for", lambda *_: None)
         patched.setattr("mereo.cli.stream.registrar_for", lambda *_: None)
         patched.setattr("mereo.cli.stream.Answering", lambda *_: None)
         patched.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(lambda: os.kill(os.getpid(), STOPPING[0]), 1))

@@ -116,7 +116,7 @@ class Object:
 
 @python_words()
 def load_object(
-    source: Source,
+    source: Source | None = None,
     scene: Scene | str | Path | None = None,
     *,
     weights: Trained | str | Path | None = None,
@@ -132,7 +132,7 @@ def load_object(
             shipped name, a file, or some that are loaded already. A name that both weights and a scene have means the
             weights, which know that scene.
         scene: of weights: the object's scene, its name or its file, where it is not the built-in one of the weights.
-        weights: to start the fit with, where ``source`` is meshes or a scene.
+        weights: to start the fit with, where ``source`` is meshes or a scene, or none of them.
         units: of meshes: "mm", "cm", "m" or "in"; guessed where not given.
         device: where a network computes; "auto" takes a CUDA device where there is one.
         precision: of its products; "float32" is exact.
@@ -142,12 +142,14 @@ def load_object(
     other files and for meshes without volume, ``ImportError`` for weights without the extra `network`.
     """
     inference = InferenceConfig(device, precision)
-    own = _own_weights(source)
+    own = weights if source is None else _own_weights(source)
     if own is not None:
-        if weights is not None:
+        if source is not None and weights is not None:
             raise ValueError(f"{source} has weights, and weights are named too: name one of them")
-        named = _learned_scene(source) if scene is None else scene
+        named = _learned_scene(own) if scene is None else scene
         return Object(load_weights(own, inference), _scene_of(named))
+    if source is None:
+        raise ValueError("no object is given; name its meshes, its scene or its weights")
     if scene is not None:
         raise ValueError(f"{source} is no weights and has its own scene, but another one is named: leave it out")
     found = _scene(source, units)
@@ -171,7 +173,7 @@ def _own_weights(source: Source) -> Trained | str | Path | None:
     return source if isinstance(source, str | Path) and is_weights(source) else None
 
 
-def _learned_scene(source: Source) -> Path | None:
+def _learned_scene(source: Trained | str | Path) -> Path | None:
     """Scene file in the folder that ``mereo learn`` has written."""
     path = Path(source) / SCENE if isinstance(source, str | Path) else None
     return path if path is not None and path.is_file() else None

@@ -12,10 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.api.carry import registration_of
-from mereo.api.objects import Object, load_object
+from mereo.api.objects import Object
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Result
 from mereo.cli.explain import explain, print_sure, wish_of
+from mereo.cli.object_option import MeshUnits, check_named, files_read, loaded_object
 from mereo.cli.outcome import NOT_RECOGNIZED, Outcome
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer import Answer
@@ -45,7 +46,7 @@ class FrameJob:
     """Options of ``mereo reconstruct``, and what all its frames share, which is read and loaded once.
 
     Attributes:
-        weights: a shipped name or a file.
+        weights: a shipped name or a file; None of an object without.
         resolution: cells along the longest side of the object's box.
         reading: how a frame is read.
         isolation: what of a frame is left out.
@@ -58,9 +59,11 @@ class FrameJob:
         force: replace an existing folder that mereo wrote.
         explain: segments and places of which it is told what decides them.
         options: what config.json of the results says, with the frame's own name as its only input; without any, none.
+        looked_for: meshes or scene of the object, where more than its weights is named (``--object``).
+        units: of its meshes.
     """
 
-    weights: str | Path
+    weights: str | Path | None = None
     resolution: int = 128
     reading: InputConfig = field(default_factory=InputConfig)
     isolation: IsolationConfig = field(default_factory=IsolationConfig)
@@ -73,12 +76,15 @@ class FrameJob:
     force: bool = False
     explain: tuple[str, ...] = ()
     options: Mapping[str, Any] | None = field(default=None, compare=False)
+    looked_for: tuple[str, ...] = ()
+    units: MeshUnits = None
 
     def check(self) -> None:
         """Raise for options that fit together with no frame: before the work, not after.
 
         ``ImportError`` for a missing extra, ``ValueError`` and ``OSError`` for files that cannot be carried.
         """
+        check_named("reconstruct", self.looked_for, self.weights)
         chosen_formats(self.files.formats)
         if self.carry_frame != "source" and not self.attachments:
             raise ValueError(f"--carry-frame is {self.carry_frame!r} and nothing is carried: name a file with --carry")
@@ -93,7 +99,13 @@ class FrameJob:
     def read(self) -> tuple[str | Path, ...]:
         """Files that are read beside the frames."""
         named = () if self.scene is None else files_of(self.scene)
-        given = (self.weights, *named, self.reading.intrinsics, self.reading.mask, *self.carry)
+        given = (
+            *files_read(self.looked_for, self.weights),
+            *named,
+            self.reading.intrinsics,
+            self.reading.mask,
+            *self.carry,
+        )
         return tuple(path for path in given if path is not None)
 
     @cached_property
@@ -103,9 +115,8 @@ class FrameJob:
 
     @cached_property
     def object(self) -> Object:
-        """Weights on their device, with the object's scene; what is carried needs a deformation model."""
-        inference = self.inference
-        loaded = load_object(self.weights, self.scene, device=inference.device, precision=inference.precision)
+        """What is looked for, its weights on their device; what is carried needs a deformation model."""
+        loaded = loaded_object(self.looked_for, self.weights, self.scene, self.units, self.inference)
         return loaded.with_deformation_model() if self.attachments else loaded
 
     @cached_property

@@ -14,7 +14,7 @@ from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.moments import owned_centroids
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.reconstruction.strays import Reading
@@ -107,13 +107,13 @@ class Answering:
 
     def __init__(
         self,
-        model: Model,
+        model: Trained | None,
         registrar: Registrar | None,
         resolution: int,
         keep_all: bool = False,
         uncertainty: bool = False,
     ) -> None:
-        """Answering with a model; without a registrar the network alone answers each frame."""
+        """Answering with a network, a registrar or both; without a registrar the network alone answers each frame."""
         self.model, self.resolution, self.keep_all, self.uncertainty = model, resolution, keep_all, uncertainty
         self.tracker = None if registrar is None else Tracker(registrar)
 

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from mereo.cli.object_option import MeshUnits
 from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
 from mereo.fitting.tracking.config import StreamMethod
@@ -79,7 +80,9 @@ class ViewCommand:
         input: a point cloud or depth image, as for `mereo reconstruct`, or a result of it (the folder, or its
             state.json; the YAML scene file that it was made with is found again); a GLB file; a folder of `mereo scene
             record`, which is played; without it (and --scene) a shipped frame.
+        object: what is looked for in the frame, as for `mereo reconstruct`: its meshes or its scene.
         weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
+        units: of the object's meshes; guessed where not given.
         scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
         state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
         port: where the page is; 0 takes any that is free.
@@ -92,7 +95,9 @@ class ViewCommand:
     """
 
     input: InputOrNone = None
+    object: tuple[str, ...] = ()
     weights: str | None = None
+    units: MeshUnits = None
     scene: str | None = None
     state: Path | None = None
     port: Port = 8080
@@ -104,6 +109,11 @@ class ViewCommand:
 
     def run(self) -> None:
         """Open the page of a frame or of a scene, and keep it until Ctrl-C."""
+        if self.object:
+            from mereo.cli.view_object import view_object
+
+            view_object(self)
+            return
         from mereo.visualization.viewer.serve import view
 
         view(
@@ -126,16 +136,19 @@ class StreamCommand:
     """Reconstruct frames as they come: the latest one wins, a bad one is reported and passed over.
 
     Each answer is one line of JSON on standard output, in the input's frame and units; rate and latency come at the
-    end, on standard error. Where the weights carry the object's own deformation model, it is followed: each frame's fit
-    starts from the last one's state, and the network is asked at first and where the object is lost. The exit status is
+    end, on standard error. Where the object's own deformation model is known, it is followed: each frame's fit starts
+    from the last one's state, and network or search are asked at first and where the object is lost. The exit status is
     0 where any frame was answered and the sequence was whole, else 2.
 
     Attributes:
         input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
-        weights: a shipped name or a file.
+        object: what is looked for, as for `mereo reconstruct`: its meshes or its scene.
+        weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
+        units: of the object's meshes; guessed where not given.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
-            the network; network asks it alone, for each frame anew; modes takes the model in any case.
+            the network; network asks it alone, for each frame anew; search leaves it out; modes takes the model in any
+            case.
         uncertainty: say how sure the registered model is: radii, in the input's unit, that hold the true places of the
             surface and of each segment's centroid with probability 0.95, and intervals of its volume; takes some 30 ms.
         rate: frames per second at which a folder was recorded.
@@ -151,7 +164,9 @@ class StreamCommand:
     """
 
     input: InputName
-    weights: str
+    object: tuple[str, ...] = ()
+    weights: str | None = None
+    units: MeshUnits = None
     resolution: Cells = 48
     method: StreamMethod = "auto"
     uncertainty: bool = False
@@ -175,6 +190,8 @@ class StreamCommand:
         stream_reconstructions(
             self.input,
             self.weights,
+            looked_for=self.object,
+            units=self.units,
             resolution=self.resolution,
             rate_hz=self.rate,
             every_frame=self.every_frame,

@@ -102,9 +102,10 @@ class Loaded:
 
 def ready_weights(weights: str, name: str, inference: InferenceConfig) -> Trained:
     """Weights under the name that clients use, made ready for the first question."""
-    model: Any = load_weights(weights, inference)
+    loaded: Any = load_weights(weights, inference)
+    model = replace(loaded, name=name)
     _ = model.inference
-    return replace(model, name=name)
+    return model
 
 
 @dataclass(eq=False)

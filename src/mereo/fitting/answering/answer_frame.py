@@ -8,7 +8,9 @@ import time
 from dataclasses import replace
 
 from mereo.fitting.answering.hypotheses import fit_hypotheses, search_hypotheses
+from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Answer, Candidate
+from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.recognition import Recognition, recognize
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
@@ -123,4 +125,13 @@ def more_evident(first: Candidate, second: Candidate) -> Candidate:
     """The candidate whose state has the lower misfit in the problem of the first; the first where both do."""
     if first.modes is None or second.modes is None:
         return first if second.modes is None else second
-    return second if second.modes.misfit_in(first.modes) < first.modes.misfit_in(first.modes) else first
+    return second if misfit_in(first.modes, second.modes) < misfit_in(first.modes, first.modes) else first
+
+
+def misfit_in(frame: ModesFit, fitted: ModesFit) -> float:
+    """Misfit of a fit's state in the problem of another fit to the frame, without the network's term."""
+    model, surface = frame.problem.model, fitted.surface
+    if fitted.unit != frame.unit:
+        surface = Surface.through(model, surface.material * (fitted.unit / frame.unit))
+    z = fitted.posed.z if fitted.rest is None else model.rest_z
+    return frame.problem.misfit(replace(fitted.posed, z=z), surface).without_network

@@ -118,14 +118,6 @@ class ModesFit:
         """Distances, in scene units, of points of the camera frame in the cloud's unit from the facing surface."""
         return self.surface.nearest(points / self.unit)[0]
 
-    def misfit_in(self, other: "ModesFit") -> float:
-        """Misfit of this fit's state in the problem of another fit to the frame, without the network's term."""
-        model, surface = other.problem.model, self.surface
-        if self.unit != other.unit:
-            surface = Surface.through(model, surface.material * (self.unit / other.unit))
-        z = self.posed.z if self.rest is None else model.rest_z
-        return other.problem.misfit(replace(self.posed, z=z), surface).without_network
-
     @cached_property
     def surface(self) -> Surface:
         """The posed model in scene units: by its modes, or at rest where the frame speaks for that."""

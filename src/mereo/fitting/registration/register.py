@@ -120,7 +120,8 @@ class Registrar:
     @property
     def asks_search(self) -> bool:
         """Whether a search is asked too where the network's fit does not explain the frame: seconds a frame."""
-        return self.method == "auto" and self.config.turned
+        is_one = self.network is not None and self.network.names == self.model.rest.names
+        return self.method == "auto" and self.config.turned and is_one
 
     @property
     def is_lenient(self) -> bool:

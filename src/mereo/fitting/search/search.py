@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.config import FitConfig
 from mereo.fitting.modes.fit import Judged, explored, fit_cloud, refine
 from mereo.fitting.modes.rest import fit_rest, is_at_rest
-from mereo.fitting.modes.understood import as_noisy
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
@@ -53,7 +52,11 @@ def search_modes(
         fine = [fit_cloud(problem, p, whole, config.start_sigma, config.last_steps, 0.05) for p in narrow[:3]]
         judged = [Judged.of(problem, posed).better(problem, refine(problem, posed)) for posed in fine]
         best = explored(problem, min(judged, key=lambda one: one.misfit.total))
-        problem, _, best = as_noisy((problem, none, best), points / unit, None)
+        noisy = problem.as_noisy_as(best.surface)
+        if noisy is not None:
+            refit = Judged.of(noisy, refine(noisy, best.posed))
+            if noisy.leaves_noise(refit.surface):
+                problem, best = noisy, refit
         rest = fit_rest(problem, none, best.posed)
         at_rest = is_at_rest(problem, best, rest)
     return ModesFit(problem, none, unit, best.posed, time.perf_counter() - started, rest if at_rest else None)
