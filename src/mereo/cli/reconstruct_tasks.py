@@ -134,7 +134,7 @@ def answer_in_tasks(
         from mereo.models.elsewhere import sent
 
         job = job.asking(sent(job.object.network, cluster))
-    if job.registrar is not None and job.method != "modes":
+    if job.registrar is not None and job.registrar.fits_draws:
         _ = job.registrar.at_hand  # the states in which a fit begins are drawn once, here, and not in every task
     work = _Answering(job, cluster.gpus > 0)
     with closing(spread(work, frames(), cluster=cluster)) as answers:

@@ -1,4 +1,4 @@
-"""The commands for one tool each: ``align``, ``view``, ``stream``, ``bench``, ``experiment``, ``release``.
+"""The commands for one tool each: ``align``, ``stream``, ``bench``, ``experiment``, ``release``.
 
 See ``mereo.cli.commands`` for how commands are written.
 """
@@ -11,10 +11,10 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mereo.cli.object_option import MeshUnits
-from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
+from mereo.cli.positionals import InputName, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
 from mereo.fitting.tracking.config import StreamMethod
-from mereo.io.bounds import Cells, Count, CountOrNone, Port, Positive, PositiveOrUnknown, Threads, Workers
+from mereo.io.bounds import Cells, Count, CountOrNone, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
 from mereo.io.cores import workers_for
 from mereo.models.config import Device, InferenceConfig, Precision
@@ -69,65 +69,6 @@ class Align:
             as_one=self.as_one,
             hold=self.hold,
             force=self.force,
-        )
-
-
-@dataclass(frozen=True)
-class ViewCommand:
-    """Look at a frame and its reconstruction in a browser, or move a scene by hand (--scene): needs the extra `view`.
-
-    Attributes:
-        input: a point cloud or depth image, as for `mereo reconstruct`, or a result of it (the folder, or its
-            state.json; the YAML scene file that it was made with is found again); a GLB file; a folder of `mereo scene
-            record`, which is played; without it (and --scene) a shipped frame.
-        object: what is looked for in the frame, as for `mereo reconstruct`: its meshes or its scene.
-        weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
-        units: of the object's meshes; guessed where not given.
-        scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
-        state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
-        port: where the page is; 0 takes any that is free.
-        host: address of this machine that the page is at. Only this machine reaches the default. Another one needs the
-            token of the address that is printed, and others on the network can read along: ssh -L is safer.
-        resolution: grid cells along the longest side.
-        reading: how the frame is read.
-        isolation: what of the frame is left out.
-        inference: where and how exactly the network computes.
-    """
-
-    input: InputOrNone = None
-    object: tuple[str, ...] = ()
-    weights: str | None = None
-    units: MeshUnits = None
-    scene: str | None = None
-    state: Path | None = None
-    port: Port = 8080
-    host: str = "127.0.0.1"
-    resolution: Cells = 128
-    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
-    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
-
-    def run(self) -> None:
-        """Open the page of a frame or of a scene, and keep it until Ctrl-C."""
-        if self.object:
-            from mereo.cli.view_object import view_object
-
-            view_object(self)
-            return
-        from mereo.visualization.viewer.serve import view
-
-        view(
-            self.input,
-            self.weights,
-            scene=self.scene,
-            state=self.state,
-            port=self.port,
-            host=self.host,
-            resolution=self.resolution,
-            reading=self.reading,
-            isolation=self.isolation,
-            inference=self.inference,
-            block=True,
         )
 
 

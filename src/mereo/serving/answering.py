@@ -64,7 +64,7 @@ class Loaded:
             found = load_object(ready_weights(served.weights, served.name, setup.inference), served.scene)
         loaded = cls(served, found, setup.method)
         registrar = loaded.registrar
-        if registrar is not None and registrar.method != "modes":
+        if registrar is not None and registrar.fits_draws:
             _ = registrar.at_hand  # takes seconds, once
         return loaded
 

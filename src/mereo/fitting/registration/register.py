@@ -41,7 +41,8 @@ class Registrar:
         network: the weights, from whose correspondences a fit starts; None of an object without, which is searched.
         model: statistical model of the same object.
         method: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
-            misfit; "auto" does the same where the scene is at hand, and else fits the modes.
+            misfit; "auto" does the same where the scene is at hand, and else, and without a network, fits the modes;
+            "search" fits the modes and does not ask the network.
         given: the object's scene, where it is not the built-in one that the weights were trained on.
         config: constants of the fit of the modes.
     """
@@ -92,7 +93,7 @@ class Registrar:
     def scene(self) -> Scene | None:
         """Scene whose draws can be played: the given one, or the built-in one of the weights; None where neither is.
 
-        Also None, with a ``ChangedSceneWarning``, where ``is_lenient`` and the scene that the weights were
+        Also None, with a ``ChangedSceneWarning``, where ``method`` is "auto" and the scene that the weights were
         trained on has other meshes since. Raises ``ValueError`` for such a scene with other choices and for a given
         scene of another object, and ``AssetUnavailable`` where its mesh cannot be had.
         """
@@ -101,7 +102,7 @@ class Registrar:
         fault = None if scene is None else other_mesh(scene, self.model)
         if scene is None or fault is None:
             return scene
-        if self.is_lenient and scene.name == name:
+        if self.method == "auto" and scene.name == name:
             warnings.warn(
                 f"{fault}: it has changed since they were trained, so only the modes of that model are fitted; train "
                 "them again for the fit of its draws",
@@ -124,9 +125,9 @@ class Registrar:
         return self.method == "auto" and self.config.turned and is_one
 
     @property
-    def is_lenient(self) -> bool:
-        """Whether the scene's draws are fitted where that can be had, and not in any case."""
-        return self.method in ("auto", "search")
+    def fits_draws(self) -> bool:
+        """Whether the scene's draws are fitted too, for which its states are simulated once, in seconds."""
+        return self.method == "full" or (self.method == "auto" and self.network is not None)
 
     @property
     def at_once(self) -> "Registrar":
@@ -193,12 +194,12 @@ class Registrar:
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer from a fit of the modes: the draws too where ``method`` asks for them.
 
-        Where ``is_lenient`` not where the modes do not explain the frame: the draws, which begin there and take longest
+        With "auto" not where the modes do not explain the frame: the draws, which begin there and take longest
         on such frames, did not explain one of them either (experiments, entry 62), and the network answers.
         """
         modes = fitted.registration()
-        hopeless = self.is_lenient and not modes.accepted
-        states = None if self.method == "modes" or hopeless or not fitted.asks_draws else self.at_hand
+        hopeless = self.method == "auto" and not modes.accepted
+        states = None if not self.fits_draws or hopeless or not fitted.asks_draws else self.at_hand
         return modes if states is None else fitted.with_draws(states)
 
     def takes(self, registration: Registration) -> bool:
@@ -211,7 +212,7 @@ class Registrar:
         try:
             return self.states
         except AssetUnavailable:
-            if self.is_lenient:
+            if self.method == "auto":
                 return None
             raise
 
