@@ -92,7 +92,10 @@ def __getattr__(name: str) -> Any:
             return "0+unknown"
     if name not in _HOME:
         raise AttributeError(f"module 'mereo' has no attribute {name!r}")
-    return getattr(import_module(f"mereo.{_HOME[name]}"), name)
+    from mereo.io.extras import network_needed
+
+    with network_needed():
+        return getattr(import_module(f"mereo.{_HOME[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -218,12 +218,8 @@ def print_source(found: Answer) -> None:
     if registration is None:
         print(f"the network's answer, as no registration was found: {found.refusal}")
         return
-    by = " by search" if found.taken and found.found_by == "search" else ""
-    explained = (
-        f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method}; found{by})"
-        if by
-        else f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
-    )
+    by = "; found by search" if found.taken and found.found_by == "search" else ""
+    explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method}{by})"
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
         cure = "look at the result" if found.model is None else "--method auto keeps the network's answer"

@@ -171,6 +171,8 @@ def line(outcome: Outcome[FrameAnswer]) -> dict[str, Any]:
     found = outcome.result
     where: dict[str, Any] = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
     where |= {"known": found.recognition.known, "reason": found.recognition.reason}
+    if found.found_by is not None:
+        where["found_by"] = found.found_by
     if found.radius95 is not None:
         where["radius95"] = found.radius95
     return {**facts, **where, "strays": found.strays, "segments": found.segments}

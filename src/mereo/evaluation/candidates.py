@@ -14,7 +14,6 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.solids import label_grid
-from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 from mereo.reconstruction.observation import observe
@@ -37,7 +36,7 @@ class Candidate:
     seconds: float
     registration: Registration | None = None
 
-    def labels_on(self, grid: LabelGrid, model: Model, code: EncodedCloud) -> UInt8[np.ndarray, "x y z"]:
+    def labels_on(self, grid: LabelGrid, model: Trained, code: EncodedCloud) -> UInt8[np.ndarray, "x y z"]:
         """Labels on another grid."""
         if self.registration is None:
             return network_labels(model, code, grid)
@@ -83,7 +82,7 @@ def network_labels(model: Trained, code: EncodedCloud, grid: LabelGrid) -> UInt8
 
 
 def find_candidates(
-    model: Model, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
+    model: Trained, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
 ) -> Candidates:
     """Answers to a frame, scored on a grid: the one that a user gets, and all others that led to it."""
     answer = answer_frame(observe(cloud), model, registrar, scene_unit=scene_unit)

@@ -3,7 +3,10 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-CURE = "run pip install 'mereo[network]', or leave the weights out: an object's meshes or its scene are enough"
+NEEDED = (
+    "PyTorch is not installed; networks and their training need the extra `network`: run pip install 'mereo[network]', "
+    "or leave the weights out, as an object's meshes or its scene are enough to find it"
+)
 
 
 @contextmanager
@@ -14,7 +17,7 @@ def network_needed() -> Iterator[None]:
     except ModuleNotFoundError as error:
         if not is_torch(error):
             raise
-        raise ImportError(f"PyTorch is not installed; networks need the extra `network`: {CURE}") from None
+        raise ImportError(NEEDED) from None
 
 
 def is_torch(error: BaseException) -> bool:

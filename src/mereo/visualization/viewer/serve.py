@@ -32,8 +32,6 @@ from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom, ModeShapes
 from mereo.visualization.viewer.guard import LOOPBACK, Entry
 from mereo.visualization.viewer.kept_result import KeptResult, is_kept
-from mereo.visualization.viewer.lab_page import LabPage
-from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.mesh_page import view_glb, view_kept
 from mereo.visualization.viewer.open_page import OpenPage, is_interactive
 from mereo.visualization.viewer.panels import DepthPicture
@@ -199,6 +197,9 @@ def view_scene(
     Without ``weights`` it takes those of the state, or the shipped ones where there are any.
     """
     import_viser()
+    from mereo.visualization.viewer.lab_page import LabPage  # these score, for which they load torch
+    from mereo.visualization.viewer.laboratory import Laboratory
+
     scene = load_scene(name)
     chosen = None if state is None else read_state(state)
     known = weights_of(chosen, weights) if chosen is not None else weights
