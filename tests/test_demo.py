@@ -25,7 +25,7 @@ from mereo.visualization.viewer.laboratory import QuickRegistrar
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> list[EncodedCloud]:
     """One case, coarsely; and every cloud that is encoded for it."""
-    monkeypatch.setattr(demo, "_inputs", lambda: iter([partial(demo._frame_case, "rope")]))
+    monkeypatch.setattr(demo, "_inputs", lambda _: iter([partial(demo._frame_case, "rope")]))
     monkeypatch.setattr(demo, "RESOLUTION", 32)
     encoded: list[EncodedCloud] = []
     encode = Model.encode
@@ -79,7 +79,7 @@ def test_the_result_of_an_earlier_version_is_kept_and_stops_no_demo(
         return {}
 
     case = SimpleNamespace(name="rope")
-    monkeypatch.setattr(demo, "_inputs", lambda: iter([lambda: case]))
+    monkeypatch.setattr(demo, "_inputs", lambda _: iter([lambda: case]))
     monkeypatch.setattr(demo, "_show", show)
     (tmp_path / "rope").mkdir()
     (tmp_path / "rope/summary.json").write_text("old")

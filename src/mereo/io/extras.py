@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 NEEDED = (
     "PyTorch is not installed; networks and their training need the extra `network`: run pip install 'mereo[network]', "
@@ -18,6 +19,14 @@ def network_needed() -> Iterator[None]:
         if not is_torch(error):
             raise
         raise ImportError(NEEDED) from None
+
+
+def has_network() -> bool:
+    """Whether torch is installed."""
+    try:
+        return find_spec("torch") is not None
+    except ModuleNotFoundError:
+        return False
 
 
 def is_torch(error: BaseException) -> bool:

@@ -20,12 +20,9 @@ from mereo.models.encoders.autodecoder import CODES
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights_header import CURE, FORMAT_VERSION, Header, check_tensors, read_config, read_header
-from mereo.models.weights_place import find_weights
+from mereo.models.weights_place import STATES, find_weights
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.scenes.statistical_model_file import pack_model, unpack_model
-
-STATES = "states."
-"""Beginning of the names of a statistical model's tensors."""
 
 PACKED = "decoder.lookup.distance"
 """The template's signed distances: with ten segments more than half of a float16 file."""

@@ -1,12 +1,20 @@
 """Where weights are, and loading them only then: what names them needs no torch, what loads them does."""
 
+import json
 from pathlib import Path
+
+from safetensors import safe_open
 
 from mereo.io.extras import network_needed
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.statistical_model_file import unpack_model
 
 SHIPPED = Path(__file__).parents[1] / "weights"
+
+STATES = "states."
+"""Beginning of the names of a statistical model's tensors."""
 
 WEIGHTS = "weights.safetensors"
 """File of weights in a folder of `mereo train` or `mereo learn`."""
@@ -51,3 +59,13 @@ def load_weights(given: Trained | str | Path, inference: InferenceConfig) -> Tra
     with network_needed():
         from mereo.models.weights import load_for
     return load_for(given, inference)
+
+
+def statistical_model_in(name: str | Path) -> StatisticalModel:
+    """Statistical model that weights carry, read without their network; ``ValueError`` where they carry none."""
+    with safe_open(find_weights(name), framework="numpy") as file:
+        tensors = {key.removeprefix(STATES): file.get_tensor(key) for key in file.keys() if key.startswith(STATES)}  # noqa: SIM118 (no mapping)
+        header = json.loads((file.metadata() or {})["mereo"])
+    if not tensors:
+        raise ValueError(f"the weights {str(name)!r} carry no statistical model: take newer ones")
+    return unpack_model(tensors, header["states"])
