@@ -27,7 +27,6 @@ STAGES = {
 SAID_ELSEWHERE = frozenset(
     {
         "title",
-        "found_by",
         "recognition",
         "radius95",
         "unit",
@@ -134,9 +133,10 @@ def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
     explained = _number(registration.get("explained"))
     if registration.get("answer") != "registration":
         return "the network's own answer"
+    found = "your model, found by a search" if registration.get("found_by") == "search" else "your model, registered"
     if explained is None or verdict.level in ("yes", "unchecked"):  # which say it themselves
-        return "your model, registered"
-    return f"your model, registered: it explains {explained:.1%} of the points"
+        return found
+    return f"{found}: it explains {explained:.1%} of the points"
 
 
 def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:
