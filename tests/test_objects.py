@@ -1,13 +1,12 @@
-"""Objects without weights: meshes and a frame are enough, torch is not asked for, and bad input is one sentence."""
+"""Objects without weights: meshes and a frame are enough, and bad input is one sentence."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from angle import write_angle, write_part
 from scene_files import write_mesh
 from shapes import box
 
@@ -17,41 +16,24 @@ from mereo.cli.object_option import loaded_object
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import intersection_over_union
 from mereo.evaluation.results import grid_confusion, labels_on
+from mereo.io.config import InputConfig
+from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import ClustersWarning
 from mereo.scenes.kept_model import CACHE_VARIABLE, kept_model
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
+from mereo.serving.answering import Answerer
+from mereo.serving.messages import JSON, FrameRequest, Served, Setup
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-
-HIDDEN = """
-import sys
-
-class Hidden:
-    asked = []
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] == "torch":
-            self.asked.append(name)
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-sys.meta_path.insert(0, Hidden())
-"""
-"""Beginning of a program for which torch is not installed."""
-
-
-def write_part(folder: Path, name: str, low: tuple[float, ...], high: tuple[float, ...]) -> Path:
-    part = box(low, high, name)
-    fine = trimesh.Trimesh(part.vertices, part.faces).subdivide().subdivide().subdivide()
-    fine.export(folder / f"{name}.stl")
-    return folder / f"{name}.stl"
+from mereo.visualization.viewer.open_page import OpenPage
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of an angle of two unequal arms, in millimetres, and what is made of it."""
     found = tmp_path_factory.mktemp("angle")
-    write_part(found, "long", (0, 0, 0), (120, 30, 25))
-    write_part(found, "short", (0, 30, 0), (40, 95, 25))
+    write_angle(found)
     return found
 
 
@@ -149,77 +131,27 @@ def test_what_is_defined_in_the_meshes_is_carried(found: mereo.Result, scene: Sc
     assert np.abs(corners - found.surfaces.merged()[0]).max() < 0.02 * np.ptp(corners, axis=0).max()
 
 
-# --- without torch ----------------------------------------------------------------------------------------------------
+def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: np.ndarray) -> None:
+    answerer = Answerer.of(Setup((Served("angle", object=tuple(meshes)),)))
+    (facts,) = answerer.ready().facts
+    assert (facts["scene"], facts["device"], facts["calibrated"]) == ("long", None, False)
+    assert [segment["name"] for segment in facts["segments"]] == ["long", "short"]
+    asked = FrameRequest("angle", folder, "frame.npy", InputConfig(unit_m=1.0), IsolationConfig(), 24, JSON)
+    reply = answerer(asked)
+    assert reply.status == 200 and json.loads(reply.body)["registration"]["found_by"] == "search"
 
 
-def hidden(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a program for which torch is not installed."""
-    end = "\nassert not Hidden.asked, Hidden.asked\n"
-    return subprocess.run(
-        [sys.executable, "-c", HIDDEN + program + end], cwd=folder, capture_output=True, text=True, timeout=300
-    )
+def test_its_page_opens(folder: Path, meshes: list[str], points: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[OpenPage] = []
+    monkeypatch.setattr(OpenPage, "stay", lambda page, _: opened.append(page))
+    frame = [str(folder / "frame.npy"), "--unit-m", "1", "--port", "0", "--resolution", "24"]
+    assert command_line.main(["view", *frame, "--object", *meshes, "--units", "mm"]) == 0
+    opened[0].close()
 
 
-def test_python_needs_no_torch(folder: Path, points: np.ndarray) -> None:
-    program = """
-import mereo
-known = mereo.load_object(["long.stl", "short.stl"], units="mm")
-frame = mereo.load_frame("frame.npy", unit_m=1.0)
-found = mereo.reconstruct(frame, known, resolution=24)
-found.save("hidden", overwrite=True)
-found.save("hidden.html", overwrite=True)
-found.carry("long.stl").save("carried.stl", overwrite=True)
-print(mereo.Tracker(known).follow(frame, 0.0).found_by, found.found_by)
-import mereo.visualization.viewer.result_page
-import mereo.visualization.viewer.serve
-"""
-    ran = hidden(program, folder)
-    assert ran.returncode == 0, ran.stderr
-    assert ran.stdout.split() == ["search", "search"] and (folder / "hidden/report.html").is_file()
-
-
-def test_the_command_line_needs_no_torch(folder: Path, points: np.ndarray) -> None:
-    program = """
-from mereo.__main__ import main
-known = ["--object", "long.stl", "short.stl", "--units", "mm"]
-options = ["--unit-m", "1", "--resolution", "24", "--force"]
-assert main(["reconstruct", "frame.npy", *known, *options, "--output", "command"]) == 0
-assert main(["stream", "frames", *known, "--unit-m", "1"]) == 0
-assert main(["doctor"]) == 0
-"""
-    (folder / "frames").mkdir(exist_ok=True)
-    np.save(folder / "frames/a.npy", points)
-    ran = hidden(program.replace('assert main(["doctor"]) == 0\n', ""), folder)
-    assert ran.returncode == 0, ran.stderr
-    assert "found by search" in ran.stdout and '"found_by": "search"' in ran.stdout
-    assert (folder / "command/summary.json").is_file()
-
-
-@pytest.mark.parametrize(
-    "program",
-    [
-        "mereo.load_object('bunny')",
-        "mereo.load_model('bunny')",
-        "mereo.learn('rope', 'out')",
-        "mereo.reconstruct('bun000', 'bunny')",
-    ],
-)
-def test_what_needs_torch_says_which_extra(program: str, tmp_path: Path) -> None:
-    told = f"import mereo\ntry:\n    {program}\nexcept ImportError as error:\n    print(error)\nHidden.asked.clear()\n"
-    ran = hidden(told, tmp_path)
-    assert "run pip install 'mereo[network]'" in ran.stdout, ran.stderr
-
-
-def test_a_command_that_needs_torch_says_which_extra(tmp_path: Path) -> None:
-    told = "from mereo.__main__ import main\nprint(main(['train', 'data', '--output', 'run']))\nHidden.asked.clear()"
-    ran = hidden(told, tmp_path)
-    assert ran.stdout.strip() == "2" and "run pip install 'mereo[network]'" in ran.stderr
-    assert ran.stderr.startswith("mereo: error: PyTorch is not installed") and ran.stderr.count("\n") == 1
-
-
-def test_the_doctor_speaks_without_torch(tmp_path: Path) -> None:
-    ran = hidden("from mereo.cli.doctor import diagnose\ndiagnose()\nHidden.asked.clear()", tmp_path)
-    assert ran.returncode == 0 and "objects are found by search" in ran.stdout
+def test_a_page_needs_a_frame(meshes: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line.main(["view", "--object", *meshes]) == 2
+    assert "no frame is given; --object is looked for in one" in capsys.readouterr().err
 
 
 # --- what cannot be found ---------------------------------------------------------------------------------------------
