@@ -35,8 +35,8 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.probability_scaling import ece_of
 from mereo.evaluation.reliability import AskedCells
 from mereo.evaluation.scoring import trained_scene
-from mereo.fitting.answering.answer_frame import answer_frame
 from mereo.fitting.config import AnswerMethod
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Recognition
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from mereo.fitting.answering.answer_frame import answer_frame
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes

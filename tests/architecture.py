@@ -34,9 +34,7 @@ ROOMS = (
 )
 """From the ground up: a room imports only from itself and from those before it."""
 
-SUBROOMS = {
-    "fitting": ("config", "problem", "modes", "draws", "uncertainty", "registration", "search", "answering", "tracking")
-}
+SUBROOMS = {"fitting": ("config", "problem", "modes", "search", "draws", "uncertainty", "registration", "tracking")}
 """Rooms whose sub-rooms, and modules beside them, have an order too: all of the room lies in one of these."""
 
 DATA_FOLDERS = ("frames", "states", "weights")

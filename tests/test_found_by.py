@@ -8,16 +8,16 @@ import pytest
 from answers import answer_to
 
 from mereo.evaluation.sample_views import load_view
-from mereo.fitting.answering.answer_frame import misfit_in, more_evident
 from mereo.fitting.problem import correspondences
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import misfit_in, more_evident
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.search.search import search_modes
+from mereo.fitting.registration.search_modes import search_modes
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 
-HYPOTHESES = "mereo.fitting.answering.hypotheses"
+HYPOTHESES = "mereo.fitting.registration.hypotheses"
 
 
 @pytest.fixture(scope="module")

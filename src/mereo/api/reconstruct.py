@@ -11,8 +11,8 @@ from mereo.api.frames import load_frame
 from mereo.api.objects import Object, Source, object_of
 from mereo.api.result import Result
 from mereo.api.words import SPEAKS_OPTIONS, in_python, python_words
-from mereo.fitting.answering.answer_frame import answer_frame
 from mereo.fitting.config import AnswerMethod
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.io.point_arrays import is_frame_list
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import IsolationConfig

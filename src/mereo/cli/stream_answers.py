@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.answering.answer_frame import answer_frame
 from mereo.fitting.config import FoundBy
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking.tracker import Tracker

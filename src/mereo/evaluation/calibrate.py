@@ -20,8 +20,8 @@ from mereo.evaluation.probability_gauge import ProbabilityGauge
 from mereo.evaluation.radius_gauge import RadiusGauge
 from mereo.evaluation.recognition_gauge import RecognitionGauge
 from mereo.evaluation.scoring import check_names, trained_scene
-from mereo.fitting.answering.answer_frame import answer_frame
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import registrar_for
 from mereo.io.progress import progress
 from mereo.models.calibration import Calibration

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from mereo.fitting.answering.answer_frame import answer_frame
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration

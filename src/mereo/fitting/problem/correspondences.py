@@ -61,12 +61,6 @@ class Correspondences:
         """Correspondences in a camera frame that is turned about its origin."""
         return replace(self, points=self.points @ rotation.T)
 
-    @classmethod
-    def none(cls) -> "Correspondences":
-        """No correspondences: of a frame that no network was asked about."""
-        places = np.empty((0, 3))
-        return cls(places, places, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))
-
     def displaced(self, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> float | None:
         """How far the places of the object are from where a model's state has them, as a share of half its length.
 
@@ -88,6 +82,12 @@ class Correspondences:
             if len(rows):
                 chosen.append(rows[spread(self.points[rows], each)])
         return self.rows(np.concatenate(chosen))
+
+
+def nothing() -> Correspondences:
+    """No correspondences, of a frame of which no network was asked."""
+    none = np.empty((0, 3))
+    return Correspondences(none, none, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))
 
 
 def find_correspondences(

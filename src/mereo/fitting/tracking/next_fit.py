@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, in_space
 from mereo.fitting.problem.noise import constants_for
@@ -145,7 +145,7 @@ def next_fit(
         passed = max(time_s - track.time_s, 0.0)
         posed = descend(problem, start, Expectation.of(track, start, passed, config), config)
     seconds = time.perf_counter() - started
-    fitted = ModesFit(problem, Correspondences.none(), track.unit, posed, seconds, calibration=track.calibration)
+    fitted = ModesFit(problem, nothing(), track.unit, posed, seconds, calibration=track.calibration)
     return fitted, followed(track, fitted, time_s, config)
 
 

@@ -12,9 +12,9 @@ from functools import cached_property
 
 import numpy as np
 
-from mereo.fitting.answering.answer_frame import answer_of, find, in_found_unit
 from mereo.fitting.config import FitConfig, FoundBy
 from mereo.fitting.registration.answer import Answer, Candidate
+from mereo.fitting.registration.answer_frame import answer_of, find, in_found_unit
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import Registrar

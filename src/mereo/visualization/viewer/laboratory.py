@@ -17,8 +17,8 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
 from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scoring import check_names, predict_grid
-from mereo.fitting.answering.answer_frame import answer_frame
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.register import Registrar, registrar_for
 from mereo.fitting.registration.registration import Registration

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from mereo.evaluation.sample_views import shipped_frame, shipped_views
-from mereo.fitting.answering.answer_frame import answer_frame
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import registrar_for, statistical_model_of
 from mereo.fitting.registration.state import played_state, restored
 from mereo.fitting.registration.state_file import RegistrationState, is_state, read_state

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.config import FitConfig
 from mereo.fitting.modes.fit import Judged, explored, fit_cloud, refine
 from mereo.fitting.modes.rest import fit_rest, is_at_rest
-from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.priors import Prior
@@ -38,7 +38,7 @@ def search_modes(
     """Fit of the modes to a cloud in the camera frame, in its unit; the unit is found where it is None."""
     started = time.perf_counter()
     unit = float(np.ptp(points, axis=0).max()) / (1.8 * model.half) if scene_unit is None else scene_unit
-    none, whole = Correspondences.none(), Prior.whole(model)
+    none, whole = nothing(), Prior.whole(model)
     with one_blas_thread():
         evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit)
         std = UNSURE if scene_unit is None else KNOWN_SCALE_STD

@@ -7,10 +7,10 @@ Observation -find-> Candidate (by network, by search, or the better of both) -fi
 import time
 from dataclasses import replace
 
-from mereo.fitting.answering.hypotheses import fit_hypotheses, search_hypotheses
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.registration.hypotheses import fit_hypotheses, search_hypotheses
 from mereo.fitting.registration.recognition import Recognition, recognize
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration

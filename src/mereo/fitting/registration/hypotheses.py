@@ -15,7 +15,7 @@ import numpy as np
 
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.search.search import search_modes
+from mereo.fitting.registration.search_modes import search_modes
 from mereo.geometry.transforms import transform_points
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import Observation
