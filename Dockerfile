@@ -9,7 +9,7 @@ COPY src src
 # torch without 3 GB of CUDA libraries; nothing is compiled, and no build tools are in the image
 RUN python -m venv /opt/mereo && \
     /opt/mereo/bin/pip install --no-cache-dir --extra-index-url https://download.pytorch.org/whl/cpu \
-        -c constraints.txt ".[cad,medical,sensors,serve]"
+        -c constraints.txt ".[network,cad,medical,sensors,serve]"
 
 FROM python:3.13-slim
 LABEL org.opencontainers.image.title="mereo" org.opencontainers.image.licenses="MIT"

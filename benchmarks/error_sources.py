@@ -29,7 +29,8 @@ from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over
 from mereo.evaluation.scoring import predict_grid, trained_scene
 from mereo.models.model import Model
 from mereo.models.rigid_alignment import Alignment, fit_rigid
-from mereo.models.weights import load_model, shipped_names
+from mereo.models.weights import load_model
+from mereo.models.weights_place import shipped_names
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig

@@ -15,7 +15,8 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import intersection_over_union
 from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scoring import predict_grid, trained_scene
-from mereo.models.weights import load_model, shipped_names
+from mereo.models.weights import load_model
+from mereo.models.weights_place import shipped_names
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import isolate
 from mereo.scenes.registry import load_scene

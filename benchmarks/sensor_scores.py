@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mereo.evaluation.metrics import format_score
-from mereo.models.weights import shipped_names
+from mereo.models.weights_place import shipped_names
 
 CAMERAS = {
     "clean": "--method network",

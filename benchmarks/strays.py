@@ -17,7 +17,7 @@ import numpy as np
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.solids import Solids
 from mereo.geometry.surface_patches import longest_side, surface_points
-from mereo.models.weights import shipped_names
+from mereo.models.weights_place import shipped_names
 from mereo.reconstruction.strays import readings
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene

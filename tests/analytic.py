@@ -8,8 +8,9 @@ import torch
 from scipy.special import softmax
 
 from mereo.geometry.mesh import PALETTE
-from mereo.models.model import Answer, EncodedCloud, Model
+from mereo.models.model import Model
 from mereo.models.network import Network
+from mereo.models.trained import Answer, EncodedCloud
 from mereo.training.config import PRESETS
 
 Points = np.ndarray

@@ -35,7 +35,7 @@ from mereo.evaluation.results import grid_confusion, labels_on
 from mereo.evaluation.scans import SCANS, bunny_posed
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import fit_rigid
-from mereo.models.weights import shipped_names
+from mereo.models.weights_place import shipped_names
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
@@ -106,7 +106,8 @@ def facts_of(name: str, frame: Frame) -> dict[str, Any]:
     surfaces, registration = found.reconstruction.surfaces, found.registration
     grid = truth_grid(frame.truth, CELLS)
     labels = labels_on(surfaces, grid.grid)
-    model = object_of(name).model
+    model = object_of(name).network
+    assert model is not None
     scores = intersection_over_union(grid_confusion(grid, labels, len(model.names)), model.segmented)
     facts: dict[str, Any] = {
         "answer": "network" if not found.taken or registration is None else registration.method,

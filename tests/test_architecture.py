@@ -152,7 +152,7 @@ def test_each_subroom_is_later_than_the_one_before(tmp_path: Path) -> None:
         package = package_of(tmp_path, {f"{room}/{name}/x.py": code for name in order})
         assert len(upward_imports(package)) == len(order) * (len(order) - 1) / 2
         first = f"{room}/{order[0]}/x.py:2 imports {room}.{order[1]}.x, a later room"
-        assert differences(upward_imports(package), ())[0] == first
+        assert first in differences(upward_imports(package), ())
 
 
 def test_exceptions_pass_until_they_are_stale(tmp_path: Path) -> None:

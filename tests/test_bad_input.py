@@ -50,7 +50,7 @@ def cloud(count: int = 200) -> np.ndarray:
 
 BAD_CLOUDS = {
     "missing": (None, "missing.npy"),
-    "too few": (cloud(20), "has 20 points; the encoder needs at least 32"),
+    "too few": (cloud(20), "has 20 points; a reconstruction needs at least 32"),
     "nan": (np.where(np.arange(600).reshape(-1, 3) == 7, np.nan, cloud()), "NaN"),
     "behind": (cloud() - [0.0, 0.0, 40.0], "behind the camera"),
     "one place": (np.ones((100, 3)), "all points coincide"),

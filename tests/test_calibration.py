@@ -17,6 +17,7 @@ from mereo.evaluation.probability_scaling import GOOD_ENOUGH, ece_of, fit_scalin
 from mereo.evaluation.reliability import BINS, AskedCells, Reliability
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model
+from mereo.models.scaled_logits import scaled_logits
 from mereo.models.weights import load_model, save_model, with_calibration
 from mereo.reconstruction.segment_statistics import segment_points
 from mereo.scenes.registry import load_scene
@@ -90,7 +91,7 @@ def test_labels_stay_and_probabilities_are_scaled() -> None:
     np.testing.assert_allclose(after.probability, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
     assert scaled.calibrates and not plain.calibrates
     own = torch.tensor([[1.0, 2.0, 3.0]])
-    assert Calibration(seed=0, views=8).scaling.scaled(own) is own
+    assert scaled_logits(Calibration(seed=0, views=8).scaling, own) is own
 
 
 def test_observed_points_have_the_calibrated_probability_of_their_own_segment() -> None:

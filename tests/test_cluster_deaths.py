@@ -23,7 +23,7 @@ from mereo import __main__ as command_line
 from mereo.models.model import Model
 from mereo.synthesis import shards
 from mereo.synthesis.shards import generate
-from mereo.visualization.result_files import evaluate_weights
+from mereo.visualization.evaluation_files import evaluate_weights
 from mereo.workers.cluster import connected
 from mereo.workers.config import Cluster
 

@@ -9,7 +9,7 @@ from shapes import ball
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 from mereo.geometry.solids import Solids
-from mereo.models.model import Answer
+from mereo.models.trained import Answer
 from mereo.visualization.vertex_colors import (
     ColorScale,
     confidence,

@@ -136,7 +136,12 @@ def test_train_options_override_the_preset() -> None:
 def test_reconstruct_options() -> None:
     text = "reconstruct scan.ply --weights bunny --output out --frame scanner --resolution 64 --drop-invalid --force"
     assert command_line.parse(text.split()) == ReconstructCommand(
-        (Path("scan.ply"),), "bunny", Path("out"), 64, InputConfig(frame="scanner", drop_invalid=True), force=True
+        (Path("scan.ply"),),
+        weights="bunny",
+        output=Path("out"),
+        resolution=64,
+        reading=InputConfig(frame="scanner", drop_invalid=True),
+        force=True,
     )
 
 

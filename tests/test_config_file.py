@@ -122,7 +122,7 @@ def test_a_file_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_result_is_made_again_from_its_own_options(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: scene("camera")[1])
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: scene("camera")[1])
     monkeypatch.chdir(tmp_path)
     np.save("cloud.npy", scene("camera")[0])
     line = "reconstruct cloud.npy --weights any --output first --resolution 12 --formats npz --keep-all"

@@ -16,7 +16,8 @@ from mereo.fitting.registration.state import load_state
 from mereo.fitting.registration.state_file import STATE
 from mereo.geometry.solids import Solids
 from mereo.io.output_folders import MARKER, new_directory
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud
 from mereo.models.weights import load_model
 from mereo.visualization.viewer.laboratory import QuickRegistrar
 
@@ -24,7 +25,7 @@ from mereo.visualization.viewer.laboratory import QuickRegistrar
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> list[EncodedCloud]:
     """One case, coarsely; and every cloud that is encoded for it."""
-    monkeypatch.setattr(demo, "_inputs", lambda: iter([partial(demo._frame_case, "rope")]))
+    monkeypatch.setattr(demo, "_inputs", lambda _: iter([partial(demo._frame_case, "rope")]))
     monkeypatch.setattr(demo, "RESOLUTION", 32)
     encoded: list[EncodedCloud] = []
     encode = Model.encode
@@ -78,7 +79,7 @@ def test_the_result_of_an_earlier_version_is_kept_and_stops_no_demo(
         return {}
 
     case = SimpleNamespace(name="rope")
-    monkeypatch.setattr(demo, "_inputs", lambda: iter([lambda: case]))
+    monkeypatch.setattr(demo, "_inputs", lambda _: iter([lambda: case]))
     monkeypatch.setattr(demo, "_show", show)
     (tmp_path / "rope").mkdir()
     (tmp_path / "rope/summary.json").write_text("old")

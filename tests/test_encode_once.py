@@ -11,7 +11,8 @@ from mereo.evaluation.sample_views import load_view
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import transform_points
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud
 from mereo.models.weights import load_model
 from mereo.scenes.parameters import random_state
 from mereo.scenes.registry import load_scene

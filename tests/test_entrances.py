@@ -138,7 +138,7 @@ def test_a_depth_image_has_one_answer(tmp_path: Path) -> None:
 def test_the_command_writes_what_python_finds(
     unit_m: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: MODEL)
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: MODEL)
     unit = [] if unit_m is None else ["--unit-m", str(unit_m)]
     arguments = ["reconstruct", str(npy(tmp_path / "cloud.npy")), "--weights", "any", "--method", "network"]
     assert main([*arguments, "--resolution", str(RESOLUTION), "--output", str(tmp_path / "out"), *unit]) == 0

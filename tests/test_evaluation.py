@@ -27,7 +27,7 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.visualization.result_files import evaluate_weights
+from mereo.visualization.evaluation_files import evaluate_weights
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 

@@ -6,7 +6,8 @@ from analytic import Distance, ball, half, logits_of, plate, union
 
 from mereo.evaluation.scoring import trained_scene
 from mereo.geometry.mesh import PALETTE, Segment
-from mereo.models.weights import load_model, shipped_names
+from mereo.models.weights import load_model
+from mereo.models.weights_place import shipped_names
 from mereo.reconstruction.coarse_to_fine import Field, sample_coarse_to_fine, sample_dense
 from mereo.reconstruction.isosurfaces import Extraction, _grid, extract, extract_whole, locate
 from mereo.scenes.assets import AssetUnavailable

@@ -113,7 +113,7 @@ def test_few_pixels_are_repeated_and_too_few_refused() -> None:
                 frames.ask(points)[1], model.query(code, points).distance, atol=2e-3 / code.normalizer.scale
             )
         else:
-            with pytest.raises(ValueError, match=f"the object has {count} pixels; the encoder needs at least"):
+            with pytest.raises(ValueError, match=f"the object has {count} pixels; a reconstruction needs at least"):
                 frames.ask(points)
 
 

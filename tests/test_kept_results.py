@@ -33,8 +33,8 @@ def stream(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: tuple[str, .
     """Exit code of a stream in which every frame is answered with the same surfaces."""
     answered = SimpleNamespace(surfaces=segments())
     outcomes = [Outcome(name, 0.0, answered, "", 0.1, 0.1, 0) for name in frames]
-    monkeypatch.setattr("mereo.cli.stream.load_for", lambda *_: None)
-    monkeypatch.setattr("mereo.cli.stream.registrar_for", lambda *_: None)
+    nothing = SimpleNamespace(network=None, registrar=lambda _: None)
+    monkeypatch.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
     monkeypatch.setattr("mereo.cli.stream.Answering", lambda *_: None)
     monkeypatch.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(outcomes))
     monkeypatch.setattr("mereo.cli.stream.line", lambda outcome: {"error": outcome.error})

@@ -79,7 +79,7 @@ def contents(folder: Path) -> dict[str, Any]:
 
 def test_a_result_is_saved_as_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
-    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: MODEL)
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: MODEL)
     reconstruct_file(tmp_path / "cloud.npy", tmp_path / "command", FrameJob("any", 24))
     found = mereo.reconstruct(tmp_path / "cloud.npy", MODEL, resolution=24)
     assert found.save(tmp_path / "python") == tmp_path / "python"

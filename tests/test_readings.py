@@ -14,7 +14,7 @@ from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.noise import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, noise_of, shared
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Candidate
-from mereo.fitting.registration.answer_frame import fit_hypotheses
+from mereo.fitting.registration.hypotheses import fit_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
@@ -91,7 +91,7 @@ def test_a_part_that_looks_like_strays_is_given_back(
         keep = cloud.points[:, 0] < np.quantile(cloud.points[:, 0], 0.9)
         return Reading(cloud, keep), Reading.of_all(cloud)
 
-    monkeypatch.setattr("mereo.fitting.registration.answer_frame.readings", wrong)
+    monkeypatch.setattr("mereo.fitting.registration.hypotheses.readings", wrong)
     found, likelier = candidates(model, registrar, points)
     assert found.hypothesis.dropped == 0 and likelier.reading.dropped > 0
 
@@ -107,7 +107,7 @@ def test_points_that_a_fit_explains_are_given_back_beside_strays(
         keep[lost] = False
         return Reading(cloud, keep), Reading.of_all(cloud)
 
-    monkeypatch.setattr("mereo.fitting.registration.answer_frame.readings", hasty)
+    monkeypatch.setattr("mereo.fitting.registration.hypotheses.readings", hasty)
     keep = fitted(model, registrar, contaminated).hypothesis.keep
     assert keep[lost].all() and not keep[len(points) :].any()
 

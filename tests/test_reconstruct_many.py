@@ -26,7 +26,7 @@ def loads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         loaded.append(weights)
         return replace(scene("camera")[1], provenance={})
 
-    monkeypatch.setattr("mereo.api.objects.load_for", load)
+    monkeypatch.setattr("mereo.models.weights.load_for", load)
     return loaded
 
 

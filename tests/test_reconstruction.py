@@ -163,7 +163,7 @@ def test_from_file_to_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cloud, model = scene("camera")
-    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
     np.save(tmp_path / "cloud.npy", cloud)
     found = reconstruct_file(tmp_path / "cloud.npy", tmp_path / "out", FrameJob("any", 16))
     assert summary_of(found)["segments"][0]["name"] == "big"
@@ -179,7 +179,7 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     """Something else beside the object is left out when asked; the summary says so."""
     cloud, model = scene("camera")
     np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
-    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
     read = partial(reconstruct_file, tmp_path / "cloud.npy")
     job = FrameJob("any", 16, InputConfig(unit_m=1.0))
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
@@ -207,7 +207,9 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     """The answer is that to the object's own points, bit for bit."""
     cloud, own, model = with_strays()
     np.save(tmp_path / "cloud.npy", cloud)
-    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]}))
+    monkeypatch.setattr(
+        "mereo.models.weights.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]})
+    )
     read = partial(reconstruct_file, tmp_path / "cloud.npy")
     job = FrameJob("any", 16, InputConfig(unit_m=1.0))
     result = read(tmp_path / "out", job).reconstruction
@@ -240,7 +242,7 @@ def test_a_stream_drops_strays_and_counts_them(
 ) -> None:
     cloud, _, model = with_strays()
     np.save(tmp_path / "cloud.npy", cloud)
-    monkeypatch.setattr("mereo.cli.stream.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
     isolation = IsolationConfig(keep_all=keep_all)
     stream_reconstructions(str(tmp_path), "any", resolution=16, every_frame=True, isolation=isolation)
     assert json.loads(capsys.readouterr().out)["strays"] == strays
@@ -249,7 +251,7 @@ def test_a_stream_drops_strays_and_counts_them(
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     save_model(untrained(NAMES), tmp_path / "w.safetensors")
     np.save(tmp_path / "cloud.npy", scene("camera")[0][:5])
-    with pytest.raises(ValueError, match="the cloud has 5 points; the encoder needs at least 32"):
+    with pytest.raises(ValueError, match="the cloud has 5 points; a reconstruction needs at least 32"):
         reconstruct_file(tmp_path / "cloud.npy", tmp_path / "deep/out", FrameJob(tmp_path / "w.safetensors"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.npy", "w.safetensors"]
 

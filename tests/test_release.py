@@ -12,7 +12,8 @@ from safetensors.torch import load_file
 
 from mereo import __main__ as command_line
 from mereo.evaluation.tables import read_metrics
-from mereo.models.weights import PACKED, _pack, _unpack, find_weights, load_model, save_model, shipped_names
+from mereo.models.weights import PACKED, _pack, _unpack, load_model, save_model
+from mereo.models.weights_place import find_weights, shipped_names
 from mereo.synthesis.config import SENSORS, SensorConfig
 from mereo.training.examples_seen import seen_by, told
 from mereo.training.model_card import card, release

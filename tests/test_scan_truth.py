@@ -26,7 +26,7 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.visualization.result_files import evaluate_on_scans
+from mereo.visualization.evaluation_files import evaluate_on_scans
 
 pytest.importorskip("small_gicp", reason="the extra align is not installed")
 

@@ -33,16 +33,16 @@ EXACT = InferenceConfig(precision="float32")
 
 @pytest.fixture(autouse=True)
 def analytic(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.serving.answering.load_for", balls)
+    monkeypatch.setattr("mereo.models.weights.load_for", balls)
 
 
 @pytest.fixture
 def rope_only(rope: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.serving.answering.load_for", lambda *_: rope)
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: rope)
 
 
 def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.api.objects.load_for", lambda *_: replace(balls(), name="balls"))
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: replace(balls(), name="balls"))
     np.save(tmp_path / "frame.npy", CLOUD)
     reconstruct_file(tmp_path / "frame.npy", tmp_path / "out", FrameJob("any", 12, inference=EXACT, method="network"))
     expected = figures((tmp_path / "out/summary.json").read_bytes())
@@ -66,7 +66,7 @@ def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.M
 def test_what_is_told_is_in_the_words_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whose options are the parameters of the address."""
     large = replace(balls(), provenance={"visible_m": [2, 3]})
-    monkeypatch.setattr("mereo.serving.answering.load_for", lambda *_: large)
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: large)
 
     async def ask() -> None:
         async with running(tmp_path) as server:

@@ -27,7 +27,7 @@ from mereo.cli.serve_command import ServeCommand
 from mereo.serving.answering import Answerer
 from mereo.serving.config import ServeConfig
 from mereo.serving.messages import Served
-from mereo.serving.names import served_weights
+from mereo.serving.names import served_objects
 from mereo.visualization.viewer.guard import bound_socket
 
 ROOT = Path(__file__).parents[1]
@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(autouse=True)
 def analytic(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.serving.answering.load_for", balls)
+    monkeypatch.setattr("mereo.models.weights.load_for", balls)
 
 
 def moved(metres: float) -> np.ndarray:
@@ -253,16 +253,21 @@ def test_the_client_of_the_documentation_works(
 
 def test_weights_are_called_by_what_tells_them_apart(tmp_path: Path) -> None:
     given = ("bunny", "learned/weights.safetensors", "old/liver.safetensors", "x=a/b.safetensors")
-    found = served_weights(given, ("x=scene.yaml",))
+    found = served_objects(given, ("x=scene.yaml",))
     assert [one.name for one in found] == ["bunny", "learned", "liver", "x"]
     assert found[3] == Served("x", "a/b.safetensors", "scene.yaml") and found[1].weights == given[1]
+    bare = served_objects((), (), ("liver=liver.stl,tumor.stl", "parts/arm.stl,parts/hand.stl"))
+    assert [(one.name, one.object) for one in bare] == [
+        ("liver", ("liver.stl", "tumor.stl")),
+        ("arm", ("parts/arm.stl", "parts/hand.stl")),
+    ]
 
 
 @pytest.mark.parametrize(
     "weights, scenes, words",
     [
-        ((), (), "no weights are given"),
-        (("bunny", "bunny"), (), "two weights are called 'bunny'"),
+        ((), (), "no object is given"),
+        (("bunny", "bunny"), (), "two objects are called 'bunny'"),
         (("a b=bunny",), (), "'a b' cannot be a part of an address"),
         (("x=",), (), "'x=' is no NAME=FILE"),
         (("bunny",), ("liver=a.yaml",), "--scene is for 'liver', which is not served"),
@@ -270,7 +275,7 @@ def test_weights_are_called_by_what_tells_them_apart(tmp_path: Path) -> None:
 )
 def test_weights_that_cannot_be_served_are_a_sentence(weights: Any, scenes: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        served_weights(weights, scenes)
+        served_objects(weights, scenes)
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

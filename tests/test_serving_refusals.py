@@ -29,7 +29,7 @@ HOLES = np.where(CLOUD > 0.58, np.nan, CLOUD)[::2]
 
 @pytest.fixture(autouse=True)
 def analytic(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.serving.answering.load_for", balls)
+    monkeypatch.setattr("mereo.models.weights.load_for", balls)
 
 
 @pytest.fixture

@@ -91,8 +91,8 @@ def test_a_stream_ends_with_its_summary(
 ) -> None:
     (tmp_path / "a.npy").touch()
     with monkeypatch.context() as patched:
-        patched.setattr("mereo.cli.stream.load_for", lambda *_: None)
-        patched.setattr("mereo.cli.stream.registrar_for", lambda *_: None)
+        nothing = SimpleNamespace(network=None, registrar=lambda _: None)
+        patched.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
         patched.setattr("mereo.cli.stream.Answering", lambda *_: None)
         patched.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(lambda: os.kill(os.getpid(), STOPPING[0]), 1))
         assert run(lambda: stream_reconstructions(str(tmp_path), "rope") and None, patched) == 0

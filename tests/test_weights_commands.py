@@ -9,8 +9,9 @@ from analytic import untrained
 
 from mereo import __main__ as command_line
 from mereo.evaluation.metrics import format_score
-from mereo.models.weights import SHIPPED, load_model, save_model, shipped_names
+from mereo.models.weights import load_model, save_model
 from mereo.models.weights_facts import read_facts
+from mereo.models.weights_place import SHIPPED, shipped_names
 from mereo.training.model_card import card, card_results
 
 

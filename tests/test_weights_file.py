@@ -14,7 +14,8 @@ from mereo import __main__ as command_line
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model
 from mereo.models.network import Network
-from mereo.models.weights import SHIPPED, load_model, save_model, trained_steps, weights_bytes
+from mereo.models.weights import load_model, save_model, trained_steps, weights_bytes
+from mereo.models.weights_place import SHIPPED
 from mereo.training.config import PRESETS
 
 WITH_STATES = SHIPPED / "rope.safetensors"

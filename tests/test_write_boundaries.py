@@ -18,7 +18,8 @@ from toy_data import write_toy_dataset
 from write_boundaries import Case, check_boundaries
 
 from mereo.evaluation.sample_views import load_view
-from mereo.models.weights import find_weights, save_model
+from mereo.models.weights import save_model
+from mereo.models.weights_place import find_weights
 from mereo.scenes.registry import load_scene
 
 TRAIN = (

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mereo.api.frames import load_frame as load_frame
+    from mereo.api.generate import generate as generate
     from mereo.api.objects import Object as Object
     from mereo.api.objects import load_object as load_object
     from mereo.api.reconstruct import reconstruct as reconstruct
     from mereo.api.result import Result as Result
     from mereo.api.steps import evaluate as evaluate
     from mereo.api.steps import export as export
-    from mereo.api.steps import generate as generate
     from mereo.api.steps import learn as learn
     from mereo.api.steps import train as train
     from mereo.api.tracker import Tracker as Tracker
@@ -63,7 +63,7 @@ _HOME = {
     "TrainConfig": "training.config",
     "evaluate": "api.steps",
     "export": "api.steps",
-    "generate": "api.steps",
+    "generate": "api.generate",
     "learn": "api.steps",
     "load_frame": "api.frames",
     "load_model": "models.weights",
@@ -92,7 +92,10 @@ def __getattr__(name: str) -> Any:
             return "0+unknown"
     if name not in _HOME:
         raise AttributeError(f"module 'mereo' has no attribute {name!r}")
-    return getattr(import_module(f"mereo.{_HOME[name]}"), name)
+    from mereo.io.extras import network_needed
+
+    with network_needed():
+        return getattr(import_module(f"mereo.{_HOME[name]}"), name)
 
 
 def __dir__() -> list[str]:

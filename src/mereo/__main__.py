@@ -28,6 +28,7 @@ from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.cli.serve_command import ServeCommand
 from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.cli.usage import noted_events, usage_sentence
+from mereo.cli.view_command import ViewCommand
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import FreeCores, use_free_cores, use_threads
 from mereo.io.foreseen import is_foreseen, printable_line, words_of
@@ -52,7 +53,7 @@ ANSWERING = (
     tool_commands.Align,
     tool_commands.BenchCommand,
     tool_commands.StreamCommand,
-    tool_commands.ViewCommand,
+    ViewCommand,
 )
 """Commands that compute on the cores that are free. Not what trains: it outlives what is busy as it starts, and the
 same command gives the same weights."""
@@ -233,7 +234,7 @@ def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | Non
         | Annotated[CalibrateCommand, subcommand("calibrate")]
         | starting(ReconstructCommand, "reconstruct")
         | Annotated[tool_commands.Align, subcommand("align")]
-        | Annotated[tool_commands.ViewCommand, subcommand("view")]
+        | Annotated[ViewCommand, subcommand("view")]
         | Annotated[tool_commands.StreamCommand, subcommand("stream")]
         | Annotated[ServeCommand, subcommand("serve")]
         | Annotated[commands.Export, subcommand("export")]

@@ -1,21 +1,33 @@
 """Objects that can be found in frames, with what is needed for it loaded once.
 
-weights, scene -load_object-> Object -registrar-> Registrar of a method
+meshes, scene, folder or weights -load_object-> Object -registrar-> Registrar of a method
+
+Meshes are enough: their scene bends them as if they were of rubber, and a search finds the object. Weights, where there
+are any, start the fit at once and tell segments apart that look alike; only they need torch.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import get_args
 
 from mereo.api.words import python_words
 from mereo.fitting.config import AnswerMethod
-from mereo.fitting.registration.register import Registrar, registrar_for, statistical_model_of
-from mereo.learning.object_files import SCENE
+from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.mesh_formats import MESH_SUFFIXES
+from mereo.io.volume_files import is_volume
+from mereo.learning.object_files import SCENE, scene_of_meshes
 from mereo.models.config import Device, InferenceConfig, Precision
-from mereo.models.model import Model
-from mereo.models.weights import load_for
-from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene
+from mereo.models.trained import Trained
+from mereo.models.weights_place import is_weights, load_weights, shipped_names
+from mereo.scenes.kept_model import kept_model
+from mereo.scenes.registry import is_yaml, load_scene
+from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.statistical_model import StatisticalModel
+
+Source = Scene | Trained | str | Path | Sequence[str | Path]
+"""What an object is loaded from."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -23,21 +35,44 @@ class Object:
     """Object that can be found in frames.
 
     Attributes:
-        model: its network, with the statistical model of its states where the weights carry one.
+        network: its weights; None of an object without, which is searched.
         scene: how it deforms, where that is not the built-in scene that the weights were trained on.
+        model: statistical model of its states; by default that of the weights, None where these carry none.
     """
 
-    model: Model
+    network: Trained | None
     scene: Scene | None = None
     _registrars: dict[str, Registrar | None] = field(default_factory=dict)
+    model: StatisticalModel | None = None
+
+    def __post_init__(self) -> None:
+        if self.network is None and self.model is None:
+            raise ValueError("an object has neither weights nor a statistical model; it needs one: use load_object")
+        if self.network is not None and self.model is None:
+            object.__setattr__(self, "model", self.network.statistical_model)
 
     def __repr__(self) -> str:
-        return f"Object({self.model.name!r}: {', '.join(self.model.names)})"
+        return f"Object({self.name!r}: {', '.join(self.names)})"
+
+    @property
+    def name(self) -> str:
+        """Name of its weights, or of its scene."""
+        if self.network is not None:
+            return self.network.name
+        return "" if self.scene is None else self.scene.name
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the segments, in the order of their labels."""
-        return self.model.names
+        return self.segments.names
+
+    @property
+    def segments(self) -> "Trained | SegmentedMesh":
+        """What has their names, colours and nesting."""
+        if self.network is not None:
+            return self.network
+        assert self.model is not None
+        return self.model.rest
 
     def registrar(self, method: AnswerMethod = "auto") -> Registrar | None:
         """Registrar of the object's deformation model for a method, set up once; None where the network alone answers.
@@ -47,49 +82,136 @@ class Object:
         if method not in get_args(AnswerMethod):
             known = ", ".join(get_args(AnswerMethod))
             raise ValueError(f"the method is {method!r}; it must be one of {known}: correct the spelling")
+        if method == "network" and self.network is None:
+            raise ValueError(
+                "the method is network, but the object has no weights: name them with --weights, or leave it out"
+            )
         if method not in self._registrars:
-            self._registrars[method] = registrar_for(self.model, method, self.scene)
+            self._registrars[method] = self._registrar(method)
         return self._registrars[method]
+
+    def _registrar(self, method: AnswerMethod) -> Registrar | None:
+        if self.network is not None:
+            return registrar_for(self.network, method, self.scene)
+        assert self.model is not None
+        return Registrar(None, self.model, method, self.scene).checked()
 
     def with_deformation_model(self) -> "Object":
         """The same with a statistical model; weights that carry none get that of their built-in scene, in seconds.
 
         Raises ``ValueError`` where it cannot be had.
         """
-        return Object(replace(self.model, statistical_model=statistical_model_of(self.model)), self.scene)
+        if self.network is None:
+            return self
+        from mereo.models.model import Model  # torch is there, as the network is
 
-    def asking(self, model: Model) -> "Object":
+        assert isinstance(self.network, Model)
+        return Object(replace(self.network, statistical_model=statistical_model_of(self.network)), self.scene)
+
+    def asking(self, network: Trained | None) -> "Object":
         """The same with the same weights on another device; registrars that are set up stay so."""
-        moved = {name: None if one is None else one.asking(model) for name, one in self._registrars.items()}
-        return Object(model, self.scene, moved)
+        moved = {name: None if one is None else one.asking(network) for name, one in self._registrars.items()}
+        return Object(network, self.scene, moved, self.model)
 
 
 @python_words()
 def load_object(
-    weights: str | Path | Model,
+    source: Source | None = None,
     scene: Scene | str | Path | None = None,
     *,
+    weights: Trained | str | Path | None = None,
+    units: str | None = None,
     device: Device = "auto",
     precision: Precision = "auto",
 ) -> Object:
     """Load an object that can be found in frames.
 
     Args:
-        weights: a shipped name, a file of weights, or the folder that ``mereo learn`` has written, whose scene is taken
-            too; or weights that are loaded already.
-        scene: the object's scene, its name or its file, where it is not the built-in one of the weights.
-        device: where the network computes; "auto" takes a CUDA device where there is one.
+        source: its meshes, one file for each segment, one file of named parts, a folder of either, or a label volume;
+            a scene file, a built-in scene's name or a scene; the folder that ``mereo learn`` has written; or weights: a
+            shipped name, a file, or some that are loaded already. A name that both weights and a scene have means the
+            weights, which know that scene.
+        scene: of weights: the object's scene, its name or its file, where it is not the built-in one of the weights.
+        weights: to start the fit with, where ``source`` is meshes or a scene, or none of them.
+        units: of meshes: "mm", "cm", "m" or "in"; guessed where not given.
+        device: where a network computes; "auto" takes a CUDA device where there is one.
         precision: of its products; "float32" is exact.
 
-    Raises ``FileNotFoundError`` where there is no such file or name, and ``ValueError`` for other files.
+    Objects without weights get a statistical model of their scene's random states, in seconds, which is kept in the
+    user's cache for the next time. Raises ``FileNotFoundError`` where there is no such file or name, ``ValueError`` for
+    other files and for meshes without volume, ``ImportError`` for weights without the extra `network`.
     """
-    if not isinstance(weights, Model):
-        own = Path(weights) / SCENE
-        scene = own if scene is None and own.is_file() else scene
-        weights = load_for(weights, InferenceConfig(device, precision))
-    return Object(weights, load_scene(str(scene)) if isinstance(scene, str | Path) else scene)
+    inference = InferenceConfig(device, precision)
+    own = weights if source is None else _own_weights(source)
+    if own is not None:
+        if source is not None and weights is not None:
+            raise ValueError(f"{source} has weights, and weights are named too: name one of them")
+        named = _learned_scene(own) if scene is None else scene
+        return Object(load_weights(own, inference), _scene_of(named))
+    if source is None:
+        raise ValueError("no object is given; name its meshes, its scene or its weights")
+    if scene is not None:
+        raise ValueError(f"{source} is no weights and has its own scene, but another one is named: leave it out")
+    found = _scene(source, units)
+    if weights is None:
+        return Object(None, found, model=kept_model(found))
+    network = load_weights(weights, inference)
+    if network.statistical_model is not None and (fault := other_mesh(found, network.statistical_model)):
+        raise ValueError(f"{fault}; both must be of one object: name the weights of this one, or leave them out")
+    return Object(network, found)
 
 
-def object_of(given: Object | Model | str | Path) -> Object:
+def object_of(given: Object | Source) -> Object:
     """Object of whatever a caller has of it."""
     return given if isinstance(given, Object) else load_object(given)
+
+
+def _own_weights(source: Source) -> Trained | str | Path | None:
+    """Weights that a source is, or holds; None where it has none."""
+    if isinstance(source, Trained):
+        return source
+    return source if isinstance(source, str | Path) and is_weights(source) else None
+
+
+def _learned_scene(source: Trained | str | Path) -> Path | None:
+    """Scene file in the folder that ``mereo learn`` has written."""
+    path = Path(source) / SCENE if isinstance(source, str | Path) else None
+    return path if path is not None and path.is_file() else None
+
+
+def _scene_of(scene: Scene | str | Path | None) -> Scene | None:
+    return load_scene(str(scene)) if isinstance(scene, str | Path) else scene
+
+
+def _scene(source: Source, units: str | None) -> Scene:
+    """Scene of what has no weights."""
+    if isinstance(source, Scene):
+        return source
+    assert not isinstance(source, Trained)
+    files = [Path(one) for one in ([source] if isinstance(source, str | Path) else source)]
+    if len(files) == 1 and files[0].is_dir():
+        learned = files[0] / SCENE
+        files = [learned] if learned.is_file() else _shapes_in(files[0])
+    if not files:
+        raise ValueError("no object is given; name its meshes, one file for each segment, or its scene file")
+    if len(files) == 1 and (str(files[0]) in SCENES or is_yaml(files[0]) or files[0].suffix == ".py"):
+        if units is not None:
+            raise ValueError(f"the units are {units}, but {files[0]} says its own: leave them out")
+        return load_scene(files[0] if files[0].suffix else str(files[0]))
+    if len(files) == 1 and files[0].suffix == "" and not files[0].exists():
+        raise FileNotFoundError(
+            f"there is no object {str(files[0])!r}: name its meshes, its scene file, a folder of mereo learn, a "
+            f"built-in scene ({', '.join(SCENES)}), or weights ({', '.join(shipped_names())}, or a .safetensors file)"
+        )
+    return scene_of_meshes(files, units)
+
+
+def _shapes_in(folder: Path) -> list[Path]:
+    """Meshes, or the label volume, in a folder; raises ``ValueError`` where there are none."""
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES or is_volume(path))
+    if not found:
+        raise ValueError(
+            f"{folder} holds no meshes ({', '.join(sorted(MESH_SUFFIXES))}), no label volume, no {SCENE} and no "
+            "weights: name the folder of an object, or its files"
+        )
+    return found

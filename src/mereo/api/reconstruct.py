@@ -5,26 +5,32 @@ frame -load_frame-> SensorFrame -find_object-> Observation -answer_frame-> Answe
 
 import warnings
 from functools import partial
-from pathlib import Path
 from typing import Any, overload
 
 from mereo.api.frames import load_frame
-from mereo.api.objects import Object, object_of
+from mereo.api.objects import Object, Source, object_of
 from mereo.api.result import Result
 from mereo.api.words import SPEAKS_OPTIONS, in_python, python_words
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.io.point_arrays import is_frame_list
 from mereo.io.sensor_frame import SensorFrame
-from mereo.models.model import Model
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import Observation, SizeWarning, find_object, size_warning
+from mereo.reconstruction.observation import (
+    ClustersWarning,
+    FrameWarning,
+    Observation,
+    SizeWarning,
+    clusters_warning,
+    find_object,
+    size_warning,
+)
 
 
 @overload
 def reconstruct(
     frame: list[Any] | tuple[Any, ...],
-    object: Object | Model | str | Path,
+    object: Object | Source,
     method: AnswerMethod = ...,
     *,
     resolution: int = ...,
@@ -37,7 +43,7 @@ def reconstruct(
 @overload
 def reconstruct(
     frame: Any,
-    object: Object | Model | str | Path,
+    object: Object | Source,
     method: AnswerMethod = ...,
     *,
     resolution: int = ...,
@@ -49,7 +55,7 @@ def reconstruct(
 
 def reconstruct(
     frame: Any,
-    object: Object | Model | str | Path,
+    object: Object | Source,
     method: AnswerMethod = "auto",
     *,
     resolution: int = 128,
@@ -61,16 +67,17 @@ def reconstruct(
 
     Args:
         frame: whatever ``load_frame`` takes, or what it has returned; a list of frames is answered as a list.
-        object: from ``load_object``; or weights, their shipped name or file.
+        object: from ``load_object``, or whatever that takes.
         method: "auto" takes the registered model where it explains the frame, else the network's surfaces; "network"
-            leaves the network alone; "modes" and "full" take the registered model in any case, "full" by fitting the
-            parameters of its scene as well.
+            leaves the network alone; "search" leaves it out; "modes" and "full" take the registered model in any case,
+            "full" by fitting the parameters of its scene as well. Without weights, "auto" is "search".
         resolution: cells along the longest side of the object's box.
         isolation: what of the frame is left out; lengths in metres, or in the frame's unit where that is not known.
         label_points: also say on which segment each observed point lies (``Result.reconstruction.observed``).
         reading: arguments of ``load_frame``: ``axes``, ``unit_m``, ``intrinsics``, ``drop_invalid`` and others.
 
-    Warns with ``SizeWarning`` where the visible part cannot be the object. Raises ``ValueError`` for unusable frames,
+    Warns with ``SizeWarning`` where the visible part cannot be the object of the weights, and without weights with
+    ``ClustersWarning`` where the cloud may be two objects. Raises ``ValueError`` for unusable frames,
     where nothing is found, and for methods other than "auto" where the model cannot be registered.
     """
     isolation = isolation or IsolationConfig()
@@ -104,7 +111,7 @@ def reconstruct_observation(
     """
     answer = answer_frame(
         seen,
-        object.model,
+        object.network,
         object.registrar(method),
         keep_all=isolation.keep_all,
         resolution=resolution,
@@ -114,9 +121,14 @@ def reconstruct_observation(
         raise answer.error
     result = Result.of(answer)
     _ = result.reconstruction  # raises where nothing is found
-    warning = size_warning(seen.read_as(answer.hypothesis), object.model.provenance)
+    used = seen.read_as(answer.hypothesis)
+    kind: type[FrameWarning] = SizeWarning
+    if object.network is None:
+        warning, kind = clusters_warning(used), ClustersWarning
+    else:
+        warning = size_warning(used, object.network.provenance)
     if warning is not None:
-        warnings.warn(warning if SPEAKS_OPTIONS.get() else in_python(warning), SizeWarning, stacklevel=3)
+        warnings.warn(warning if SPEAKS_OPTIONS.get() else in_python(warning), kind, stacklevel=3)
     return result
 
 

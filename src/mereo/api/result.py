@@ -202,7 +202,7 @@ class Result(Answer):
 
     def _read(self) -> list[Path]:
         """Files that this was made from."""
-        paths = [self.seen.frame.path, Path(self.model.name)]
+        paths = [self.seen.frame.path, *([] if self.model is None else [Path(self.model.name)])]
         return [path for path in paths if path.is_file() or is_recording(path)]
 
     def __repr__(self) -> str:

@@ -25,7 +25,8 @@ class SegmentResult:
         mesh: its closed surface; without faces where it was not found.
         centroid: of its volume, NaN where it was not found.
         volume: inside its surface, less what is nested in it; 0 where it was not found.
-        confidence: mean probability that the network gives it over its volume, NaN where it was not found.
+        confidence: mean probability that the network gives it over its volume, NaN where it was not found, and
+            without a network.
         error_radius: radius around the centroid that holds the true one with probability 0.95; None where the answer
             is the network's.
         pose: best rigid motion from the object's own files to the frame, as ``Result.pose``; None likewise.
@@ -66,5 +67,6 @@ class SegmentResult:
         return mesh
 
     def __repr__(self) -> str:
-        found = f"volume {self.volume:.3g}, confidence {self.confidence:.2f}" if self.is_found else "not found"
+        sure = "" if np.isnan(self.confidence) else f", confidence {self.confidence:.2f}"
+        found = f"volume {self.volume:.3g}{sure}" if self.is_found else "not found"
         return f"SegmentResult({self.name!r}, {found})"

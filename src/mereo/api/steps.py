@@ -1,7 +1,7 @@
 """Steps from an object to weights as functions: what the commands of the same names do, with what they leave returned.
 
-    scene -generate-> dataset -train-> weights -evaluate-> Evaluation
-                                          '-----export---> graphs for other runtimes
+    dataset -train-> weights -evaluate-> Evaluation
+                        '-----export---> graphs for other runtimes
     scene or meshes -learn-> all of it, in so many minutes
 
 They print their progress as the commands do, and raise the sentences that those print.
@@ -19,7 +19,7 @@ from mereo.evaluation.metrics import format_score
 from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.fitting.config import AnswerMethod
-from mereo.io.object_storage import ObjectPath, Place, place_of
+from mereo.io.object_storage import ObjectPath, place_of
 from mereo.learning import learn as learning
 from mereo.learning.example_frame import FRAME
 from mereo.learning.object_files import scene_for
@@ -27,68 +27,17 @@ from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.models.elsewhere import for_tasks
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
-from mereo.models.weights import WEIGHTS, load_for
+from mereo.models.weights import load_for
+from mereo.models.weights_place import WEIGHTS
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
-from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.training import trainer
 from mereo.training.config import PRESETS, PresetName, TrainConfig
-from mereo.visualization.result_files import evaluate_on_scans, evaluate_weights
+from mereo.visualization.evaluation_files import evaluate_on_scans, evaluate_weights
 from mereo.workers.cluster import joined_first
 from mereo.workers.config import Cluster, cluster_of
-
-
-def generate(
-    scene: str | Path | Scene,
-    output: str | Path | ObjectPath,
-    settings: GenerateConfig | None = None,
-    *,
-    examples: int,
-    seed: int = 0,
-    workers: int = 1,
-    shard: tuple[int, int] = (0, 1),
-    resume: bool = False,
-    test: bool = False,
-    ray: str | None = None,
-) -> Place:
-    """Labelled examples of a scene in a folder, which is returned: `mereo generate`.
-
-    Args:
-        scene: a built-in scene's name, a scene file, or a scene.
-        output: folder to create; a text may be its URL in an object storage, s3://BUCKET/FOLDER or gs://BUCKET/FOLDER.
-        settings: how one example is made; ``SENSORS`` of ``mereo.synthesis.config`` has those of depth cameras.
-        examples: how many.
-        seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
-        workers: processes, on which the examples do not depend; 0 means one per core. More than one needs a main module
-            that can be imported (``if __name__ == "__main__":``).
-        shard: part i of n, as (i, n), to share the work between machines.
-        resume: go on with what is there.
-        test: allow a test seed.
-        ray: make them in tasks of a Ray cluster: "local", one of so many workers for this call; "auto" or "HOST:PORT",
-            the one that this machine is a node of.
-
-    Raises as ``synthesis.shards.generate`` does.
-    """
-    made = str(scene) if isinstance(scene, Path) else scene
-    place = place_of(output)
-    processes = workers or os.cpu_count() or 1
-    cluster = cluster_of(ray, processes)
-    with python_words(), joined_first(cluster):
-        shards.generate(
-            made,
-            place,
-            settings or GenerateConfig(),
-            examples=examples,
-            seed=seed,
-            workers=processes,
-            shard=shard,
-            resume=resume,
-            test=test,
-            cluster=cluster,
-        )
-    return place
 
 
 def train(

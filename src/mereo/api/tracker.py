@@ -3,16 +3,14 @@
 frame, time -Tracker.follow-> Result
 """
 
-from pathlib import Path
 from typing import Any
 
-from mereo.api.objects import Object, object_of
+from mereo.api.objects import Object, Source, object_of
 from mereo.api.reconstruct import observation_of
 from mereo.api.result import Result
 from mereo.api.words import python_words
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.tracking import tracker
-from mereo.models.model import Model
 from mereo.reconstruction.config import IsolationConfig
 
 
@@ -20,14 +18,14 @@ class Tracker:
     """Follow one object through a sequence of frames; not safe for use by several threads at once.
 
     Each frame is fitted from the last one's state, in milliseconds; the network is asked first, and when the object is
-    lost.
+    lost; without weights a search, which takes seconds.
     """
 
-    def __init__(self, object: Object | Model | str | Path, method: AnswerMethod = "auto") -> None:
+    def __init__(self, object: Object | Source, method: AnswerMethod = "auto") -> None:
         """Follow an object.
 
         Args:
-            object: from ``load_object``; or weights, their shipped name or file.
+            object: from ``load_object``, or whatever that takes.
             method: "auto", or "modes" to take the registered model even where it does not explain the frame.
 
         Raises ``ValueError`` for other methods, and for weights without a deformation model.

@@ -5,7 +5,8 @@ from pathlib import Path
 from mereo.evaluation.calibrate import calibrate
 from mereo.io.atomic_files import atomic_file
 from mereo.models.calibration import calibration_rows
-from mereo.models.weights import find_weights, load_model, with_calibration
+from mereo.models.weights import load_model, with_calibration
+from mereo.models.weights_place import find_weights
 from mereo.scenes.registry import files_of
 
 

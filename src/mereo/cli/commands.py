@@ -122,7 +122,7 @@ class Generate:
 
     def run(self) -> None:
         """Write the folder of labelled examples."""
-        from mereo.api.steps import generate
+        from mereo.api.generate import generate
         from mereo.io.atomic_files import json_text
         from mereo.io.places import write_whole
 

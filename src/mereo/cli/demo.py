@@ -1,6 +1,7 @@
 """``mereo demo``: a real range scan and two rendered depth frames, back to segments, compared with the truth.
 
-Network and registered model stand side by side; what is written is the answer that `mereo reconstruct` gives.
+First the scan by its object's meshes alone, with nothing trained. Where torch is installed, all three with shipped
+weights then, network and registered model side by side. What is written is the answer that `mereo reconstruct` gives.
 """
 
 import time
@@ -24,27 +25,34 @@ from mereo.evaluation.results import grid_confusion, labels_on
 from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view, shipped_frame
 from mereo.evaluation.scans import BUNNY_SCAN_POSES
 from mereo.fitting.config import AnswerMethod
-from mereo.fitting.registration.register import statistical_model_of
-from mereo.io.output_folders import check_new_directory
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.extras import has_network
+from mereo.io.output_folders import check_new_directory, new_directory
 from mereo.io.progress import shown_stages
 from mereo.io.scratch_folders import check_place
 from mereo.io.sensor_frame import SensorFrame
-from mereo.reconstruction.pipeline import segment_names
+from mereo.io.writers.stl import write_surface_stl
+from mereo.models.weights_place import statistical_model_in
 from mereo.visualization.report_words import confidence_title
 from mereo.visualization.units import Unit
 
 FRAMES = ("liver", "rope")
 RESOLUTION = 100
 
-OWN_OBJECT = """[bold]On your own data[/bold]
-  mereo reconstruct cloud.ply --weights bunny --output result
-  mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --weights bunny --output result
+OWN_OBJECT = """[bold]On your own object[/bold], from its meshes: nothing is trained; docs/own-object.md has joints
+  mereo reconstruct cloud.ply --object PART.stl PART.stl --output result
+  mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --object PART.stl PART.stl --output result
 
-[bold]On your own object[/bold], from its meshes; docs/own-object.md has joints, and each step by itself
+[bold]At once, and telling look-alike parts apart[/bold]: with a network, ten minutes once for an object
   mereo learn PART.stl PART.stl --output learned --minutes 10
-  mereo reconstruct frame.ply --weights learned/weights.safetensors --scene learned/scene.yaml --output result
+  mereo reconstruct frame.ply --object learned --output result
 
 In another shell, first: source .venv/bin/activate"""
+
+WITHOUT = (
+    "PyTorch is not installed, so nothing is shown of networks, which start the fit at once: run pip install "
+    "'mereo[network]' and this again."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +91,15 @@ def main(output: str | Path = Path("out/demo")) -> dict[str, Any]:
     check_place(Path(output), may_be_link=True)
     console, started = Console(markup=False, emoji=False), time.perf_counter()
     scores: dict[str, Any] = {}
-    for make in _inputs():
-        case = make()
+    for make in _inputs(Path(output)):
+        with shown_stages():
+            case = make()
         folder = _folder(Path(output) / case.name)
         with shown_stages():
             columns = _show(case, folder, console)
         scores[case.name] = {"output": str(folder), **{name: column.facts() for name, column in columns.items()}}
+    if not has_network():
+        console.print(f"{WITHOUT}\n", highlight=False, soft_wrap=True)
     console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
     console.print(OWN_OBJECT, markup=True, highlight=False, soft_wrap=True)
     return scores
@@ -111,20 +122,43 @@ def _folder(wanted: Path) -> Path:
     raise FileExistsError(f"{wanted}, and every name up to {folder}, is taken: choose another --output")
 
 
-def _inputs() -> Iterator[Callable[[], Case]]:
-    """Inputs of the demo: the real scan first, then frames of other objects."""
+def _inputs(output: Path) -> Iterator[Callable[[], Case]]:
+    """Inputs of the demo: the real scan by meshes; with a network the scan again, then frames of other objects."""
+    yield partial(_mesh_case, output)
+    if not has_network():
+        return
     yield _scan_case
     for name in FRAMES:
         yield partial(_frame_case, name)
 
 
+def _mesh_case(output: Path) -> Case:
+    """The scan by nothing but the bunny's meshes, which are written beside the results: a user has such files."""
+    files, rest = [], _bunny_at_rest()
+    with new_directory(output / "bunny-meshes", force=True) as folder:
+        for part in rest.segments:
+            write_surface_stl(folder / f"{part.name}.stl", SegmentedMesh((part,)))
+            files.append(output / "bunny-meshes" / f"{part.name}.stl")
+    known = load_object(files, units="m")
+    title = f"{SHIPPED_SCAN}: a real range scan of the Stanford bunny, by its meshes alone, nothing trained"
+    return Case(f"{SHIPPED_SCAN}-meshes", title, known, shipped_frame(SHIPPED_SCAN), _scan_truth(rest))
+
+
 def _scan_case() -> Case:
-    frame, known = shipped_frame(SHIPPED_SCAN), load_object("bunny")
-    model = statistical_model_of(known.model)
+    known = load_object("bunny")
+    title = f"{SHIPPED_SCAN}: the same scan, with weights"
+    return Case(SHIPPED_SCAN, title, known, shipped_frame(SHIPPED_SCAN), _scan_truth(_bunny_at_rest()))
+
+
+def _bunny_at_rest() -> SegmentedMesh:
+    """The bunny in its own files' frame, metres."""
+    model = statistical_model_in("bunny")
     assert model.source_frame is not None
-    truth = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source @ BUNNY_SCAN_POSES[SHIPPED_SCAN]))
-    title = f"{SHIPPED_SCAN}: a real range scan of the Stanford bunny"
-    return Case(SHIPPED_SCAN, title, known, frame, truth_grid(truth))
+    return model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source))
+
+
+def _scan_truth(rest: SegmentedMesh) -> TruthGrid:
+    return truth_grid(rest.transformed(np.linalg.inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
 
 
 def _frame_case(name: str) -> Case:
@@ -137,9 +171,12 @@ def _frame_case(name: str) -> Case:
 def _show(case: Case, folder: Path, console: Console) -> dict[str, Column]:
     """Reconstruct a case, print network and registered model beside the truth, and write the default answer."""
     columns: dict[str, Column] = {}
-    result, columns["network"] = _answer(case, "network")
     registrar = case.object.registrar()
-    if registrar is not None:
+    if case.object.network is None:
+        result, columns["search"] = _answer(case, "auto")
+    else:
+        result, columns["network"] = _answer(case, "network")
+    if registrar is not None and case.object.network is not None:
         result, columns["fit"] = _answer(case, "auto")
     console.print(_table(case, result, columns))
     if registrar is None:
@@ -160,10 +197,10 @@ def _answer(case: Case, method: AnswerMethod) -> tuple[Result, Column]:
     started = time.perf_counter()
     result = reconstruct(case.frame, case.object, method, resolution=RESOLUTION)
     seconds = time.perf_counter() - started
-    model = case.object.model
     labels = labels_on(result.surfaces, case.truth.grid)
-    confusion = grid_confusion(case.truth, labels, len(segment_names(model)[0]))
-    return result, Column(intersection_over_union(confusion, model.segmented), seconds)
+    network = case.object.network
+    confusion = grid_confusion(case.truth, labels, len(result.names))
+    return result, Column(intersection_over_union(confusion, network is None or network.segmented), seconds)
 
 
 def _table(case: Case, result: Result, columns: dict[str, Column]) -> Table:
@@ -171,11 +208,14 @@ def _table(case: Case, result: Result, columns: dict[str, Column]) -> Table:
     unit = Unit(result.unit_m)
     table = Table(title=case.title, title_justify="left")
     table.add_column("IoU with the truth")
-    for column in (*columns, confidence_title(result.reconstruction.calibrated), f"volume ({unit.volume_name})"):
+    known = not all(np.isnan(segment.confidence) for segment in result)
+    sure = [confidence_title(result.reconstruction.calibrated)] if known else []
+    for column in (*columns, *sure, f"volume ({unit.volume_name})"):
         table.add_column(column, justify="right")
     each = [column.scores.per_segment for column in columns.values()]
     for segment, *ious in zip(result, *each, strict=True):
-        row = (*(f"{iou:.3f}" for iou in ious), f"{segment.confidence:.2f}", unit.volume(segment.volume))
+        told = [f"{segment.confidence:.2f}"] if known else []
+        row = (*(f"{iou:.3f}" for iou in ious), *told, unit.volume(segment.volume))
         table.add_row(segment.name, *row)
     table.add_section()
     table.add_row("all as one (IoU)", *(f"{column.scores.iou:.3f}" for column in columns.values()))

@@ -8,12 +8,10 @@ import shlex
 import sys
 from collections.abc import Iterator
 
-import torch
-
-from mereo.io.cores import threads_for
-from mereo.models.device import bfloat16_gain, cpu_features, pick_device, pick_precision
+from mereo.io.cores import cores, threads_for
 
 PURPOSES: dict[str, str] = {
+    "network": "weights: training them, and fits that start from them",
     "view": "the pages of `mereo view`",
     "rerun": "streams as Rerun recordings",
     "track": "training curves in TensorBoard",
@@ -92,6 +90,15 @@ def _version(name: str) -> str | None:
 
 def _device() -> Iterator[str]:
     yield ""
+    try:
+        import torch
+    except ModuleNotFoundError:
+        yield _row("device", "cpu; objects are found by search, as the extra `network` is not installed")
+        if hasattr(os, "getloadavg"):
+            yield _row("load", describe_load(os.getloadavg()[0], os.cpu_count() or 1, cores()))
+        return
+    from mereo.models.device import cpu_features
+
     if torch.cuda.is_available():
         free, total = torch.cuda.mem_get_info()
         memory = f"{free / 2**30:.1f} of {total / 2**30:.1f} GiB free"
@@ -129,6 +136,8 @@ def describe_load(load: float, cores: int, threads: int) -> str:
 
 
 def _bfloat16() -> str:
+    from mereo.models.device import bfloat16_gain, pick_device, pick_precision
+
     device = pick_device()
     verdict = "does not pay here" if pick_precision("auto", device) is None else "pays here"
     return verdict if device.type == "cuda" else f"{verdict}: {bfloat16_gain():.1f} times float32"

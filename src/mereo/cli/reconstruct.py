@@ -7,14 +7,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from mereo.api.carry import registration_of
-from mereo.api.objects import Object, load_object
+from mereo.api.objects import Object
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Result
 from mereo.cli.explain import explain, print_sure, wish_of
+from mereo.cli.object_option import MeshUnits, check_named, files_read, loaded_object
 from mereo.cli.outcome import NOT_RECOGNIZED, Outcome
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer import Answer
@@ -30,7 +32,7 @@ from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.medical import MM_PER_M
 from mereo.models.config import InferenceConfig
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import files_of
@@ -44,7 +46,7 @@ class FrameJob:
     """Options of ``mereo reconstruct``, and what all its frames share, which is read and loaded once.
 
     Attributes:
-        weights: a shipped name or a file.
+        weights: a shipped name or a file; None of an object without.
         resolution: cells along the longest side of the object's box.
         reading: how a frame is read.
         isolation: what of a frame is left out.
@@ -57,9 +59,11 @@ class FrameJob:
         force: replace an existing folder that mereo wrote.
         explain: segments and places of which it is told what decides them.
         options: what config.json of the results says, with the frame's own name as its only input; without any, none.
+        looked_for: meshes or scene of the object, where more than its weights is named (``--object``).
+        units: of its meshes.
     """
 
-    weights: str | Path
+    weights: str | Path | None = None
     resolution: int = 128
     reading: InputConfig = field(default_factory=InputConfig)
     isolation: IsolationConfig = field(default_factory=IsolationConfig)
@@ -72,12 +76,15 @@ class FrameJob:
     force: bool = False
     explain: tuple[str, ...] = ()
     options: Mapping[str, Any] | None = field(default=None, compare=False)
+    looked_for: tuple[str, ...] = ()
+    units: MeshUnits = None
 
     def check(self) -> None:
         """Raise for options that fit together with no frame: before the work, not after.
 
         ``ImportError`` for a missing extra, ``ValueError`` and ``OSError`` for files that cannot be carried.
         """
+        check_named("reconstruct", self.looked_for, self.weights)
         chosen_formats(self.files.formats)
         if self.carry_frame != "source" and not self.attachments:
             raise ValueError(f"--carry-frame is {self.carry_frame!r} and nothing is carried: name a file with --carry")
@@ -92,7 +99,13 @@ class FrameJob:
     def read(self) -> tuple[str | Path, ...]:
         """Files that are read beside the frames."""
         named = () if self.scene is None else files_of(self.scene)
-        given = (self.weights, *named, self.reading.intrinsics, self.reading.mask, *self.carry)
+        given = (
+            *files_read(self.looked_for, self.weights),
+            *named,
+            self.reading.intrinsics,
+            self.reading.mask,
+            *self.carry,
+        )
         return tuple(path for path in given if path is not None)
 
     @cached_property
@@ -102,9 +115,8 @@ class FrameJob:
 
     @cached_property
     def object(self) -> Object:
-        """Weights on their device, with the object's scene; what is carried needs a deformation model."""
-        inference = self.inference
-        loaded = load_object(self.weights, self.scene, device=inference.device, precision=inference.precision)
+        """What is looked for, its weights on their device; what is carried needs a deformation model."""
+        loaded = loaded_object(self.looked_for, self.weights, self.scene, self.units, self.inference)
         return loaded.with_deformation_model() if self.attachments else loaded
 
     @cached_property
@@ -112,12 +124,12 @@ class FrameJob:
         """Registrar of the object's model; None where the network alone answers."""
         return self.object.registrar(self.method)
 
-    def asking(self, model: Model) -> "FrameJob":
+    def asking(self, network: Trained | None) -> "FrameJob":
         """The same, asking the same weights on another device; what is known of scene and attachments stays so."""
         _ = self.registrar  # set up once, before it is moved
         moved = copy(self)
         vars(moved).pop("registrar", None)
-        vars(moved).update(object=self.object.asking(model))
+        vars(moved).update(object=self.object.asking(network))
         return moved
 
     @cached_property
@@ -206,10 +218,12 @@ def print_source(found: Answer) -> None:
     if registration is None:
         print(f"the network's answer, as no registration was found: {found.refusal}")
         return
-    explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method})"
+    by = "; found by search" if found.taken and found.found_by == "search" else ""
+    explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method}{by})"
     print(explained if found.taken else f"{explained}: too little, the network's answer is kept")
     if found.taken and not registration.accepted:
-        print("that is too little to believe it: --method auto keeps the network's answer")
+        cure = "look at the result" if found.model is None else "--method auto keeps the network's answer"
+        print(f"that is too little to believe it: {cure}")
     if found.recognition.told is not None:
         print(found.recognition.told)
 
@@ -222,12 +236,15 @@ def print_segments(answered: Result) -> None:
     table = Table(title=f"{seen.frame.source}, {len(seen.cloud)} points", title_justify="left")
     table.add_column("segment")
     volume, centroid = f"volume ({unit.volume_name})", f"centroid ({unit.length_name})"
-    for column in (volume, confidence_title(result.calibrated), "components", centroid):
+    known = not all(np.isnan(found.confidence) for found in result.segments)
+    sure_of = [confidence_title(result.calibrated)] if known else []
+    for column in (volume, *sure_of, "components", centroid):
         table.add_column(column, justify="right")
     for found in result.segments:
         # the radius gives the digits; it is in the report, and would break the lines of 80 columns
         place = unit.place(found.centroid, radii.get(found.name)).partition(" ±")[0]
-        row = (unit.volume(found.volume), f"{found.confidence:.2f}", str(found.components), place)
+        told = [f"{found.confidence:.2f}"] if known else []
+        row = (unit.volume(found.volume), *told, str(found.components), place)
         table.add_row(found.name, *(row if found.voxels else ("0", "not found", "0", "")))
     console = Console(markup=False, emoji=False)
     console.print(table)

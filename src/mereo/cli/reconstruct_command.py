@@ -7,6 +7,7 @@ from typing import Annotated
 from tyro.conf import UseAppendAction, arg
 
 from mereo.cli.config_file import ConfigFile, options_of
+from mereo.cli.object_option import MeshUnits
 from mereo.cli.outcome import Outcome
 from mereo.cli.positionals import Inputs
 from mereo.fitting.config import AnswerMethod
@@ -30,7 +31,10 @@ class ReconstructCommand:
     Attributes:
         inputs: depth images (PNG, TIFF, EXR, NPY), point clouds (PLY, PCD, XYZ, NPY, NPZ, ZDF), ROS recordings (bag,
             MCAP; one frame of each), or folders of images and clouds; results are in each one's frame and units.
-        weights: a shipped name or a file.
+        object: what is looked for: its meshes, one file for each segment, one file of named parts or a label volume; a
+            scene file, a built-in scene's name, or the folder of `mereo learn`. Nothing is trained for it.
+        weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
+        units: of the object's meshes; guessed where not given.
         output: folder to create, by default result, result2, ...; of several frames, the folder in which each one's is
             created.
         resolution: grid cells along the longest side.
@@ -39,8 +43,8 @@ class ReconstructCommand:
         inference: where and how exactly the network computes.
         files: which files, and in which unit.
         method: register the object's own deformation model to the frame: auto takes the registered model where it
-            explains the frame, if the weights carry one; network leaves the network's answer; modes and full take the
-            model in any case, full by fitting the draws of the scene as well.
+            explains the frame, if the weights carry one; network leaves the network's answer, search the network out;
+            modes and full take the model in any case, full by fitting the draws of the scene as well.
         scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
         carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
             glTF), points (PLY, PCD, XYZ, NPY), CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses) or volume (NIfTI,
@@ -60,7 +64,9 @@ class ReconstructCommand:
     """
 
     inputs: Inputs
-    weights: str
+    object: tuple[str, ...] = ()
+    weights: str | None = None
+    units: MeshUnits = None
     output: Path | None = None
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
@@ -84,16 +90,20 @@ class ReconstructCommand:
         from mereo.api.result import free_folder
         from mereo.cli.reconstruct import FrameJob
         from mereo.cli.reconstruct_many import reconstruct_inputs
-        from mereo.models.elsewhere import for_tasks
         from mereo.workers.cluster import joined_first
 
         cluster = cluster_of(self.ray, self.threads, self.task)
+        inference = self.inference
+        if cluster is not None and self.weights is not None:
+            from mereo.models.elsewhere import for_tasks
+
+            inference = for_tasks(inference, cluster)
         job = FrameJob(
             self.weights,
             self.resolution,
             self.reading,
             self.isolation,
-            for_tasks(self.inference, cluster),
+            inference,
             self.files,
             self.method,
             self.scene,
@@ -102,6 +112,8 @@ class ReconstructCommand:
             self.force,
             self.explain,
             options_of(self, "reconstruct"),
+            looked_for=self.object,
+            units=self.units,
         )
         with joined_first(cluster):
             return reconstruct_inputs(self.inputs, self.output or free_folder(), job, cluster)

@@ -21,7 +21,7 @@ from mereo.io.output_folders import MARKER
 from mereo.io.progress import duration
 from mereo.io.ros_recordings import is_recording
 from mereo.io.scratch_folders import check_place
-from mereo.reconstruction.observation import SizeWarning
+from mereo.reconstruction.observation import FrameWarning
 from mereo.reconstruction.stream import frame_error
 from mereo.reconstruction.stream_sources import frames_in
 from mereo.workers.config import Cluster
@@ -120,7 +120,7 @@ def reconstruct_frames(
         print(f"\n[{len(found) + 1}/{len(files)}] {file}{left}", flush=True)
 
     with warnings.catch_warnings():
-        warnings.filterwarnings("always", category=SizeWarning)  # for each frame, also in the same words
+        warnings.filterwarnings("always", category=FrameWarning)  # for each frame, also in the same words
         for file, told in (
             _answer_here(files, folders, job, heading)
             if cluster is None

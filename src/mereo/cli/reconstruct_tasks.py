@@ -19,8 +19,7 @@ from mereo.cli.reconstruct import FrameJob, answer_frame, print_segments, writte
 from mereo.cli.reconstruct_told import Told
 from mereo.io.output_folders import check_new_directory, new_directory
 from mereo.io.sensor_frame import SensorFrame, read_frame
-from mereo.models.elsewhere import arrived, sent
-from mereo.reconstruction.observation import SizeWarning
+from mereo.reconstruction.observation import FrameWarning
 from mereo.workers.config import Cluster
 from mereo.workers.spread import spread
 
@@ -74,7 +73,12 @@ class _Answering:
     @cached_property
     def here(self) -> FrameJob:
         """The job with its weights where this is called, moved there once."""
-        return self.job.asking(arrived(self.job.object.model, self.gpu))
+        network = self.job.object.network
+        if network is None:
+            return self.job
+        from mereo.models.elsewhere import arrived
+
+        return self.job.asking(arrived(network, self.gpu))
 
     def __call__(self, frame: Frame, cancelled: Callable[[], bool]) -> _Answered | Exception:
         """Answer to a frame, or why there is none: a bad frame stops no other."""
@@ -86,7 +90,7 @@ class _Answering:
                 redirect_stdout(printed),
                 warnings.catch_warnings(record=True) as warned,
             ):
-                warnings.simplefilter("always", SizeWarning)
+                warnings.simplefilter("always", FrameWarning)
                 found = answer_frame(frame.read, Path(folder), self.here, frame.absolute)
                 files = {
                     path.relative_to(folder).as_posix(): path.read_bytes()
@@ -98,7 +102,7 @@ class _Answering:
         segments = io.StringIO()
         with redirect_stdout(segments):
             print_segments(found)
-        sizes = tuple(str(one.message) for one in warned if issubclass(one.category, SizeWarning))
+        sizes = tuple(str(one.message) for one in warned if issubclass(one.category, FrameWarning))
         return _Answered(Told.of(found), files, printed.getvalue(), sizes, segments.getvalue())
 
 
@@ -126,8 +130,11 @@ def answer_in_tasks(
                 failed(path, problem)
                 lost.append(path)
 
-    job = job.asking(sent(job.object.model, cluster))
-    if job.registrar is not None and job.method != "modes":
+    if job.object.network is not None:
+        from mereo.models.elsewhere import sent
+
+        job = job.asking(sent(job.object.network, cluster))
+    if job.registrar is not None and job.registrar.fits_draws:
         _ = job.registrar.at_hand  # the states in which a fit begins are drawn once, here, and not in every task
     work = _Answering(job, cluster.gpus > 0)
     with closing(spread(work, frames(), cluster=cluster)) as answers:
@@ -146,7 +153,7 @@ def _written(frame: Frame, found: _Answered | Exception, job: FrameJob, failed: 
         return None
     print(found.printed, end="")
     for text in found.warned:
-        warnings.warn(text, SizeWarning, stacklevel=2)
+        warnings.warn(text, FrameWarning, stacklevel=2)
     try:
         with new_directory(frame.folder, job.force, [frame.path, *job.read]) as directory:
             for name, content in found.files.items():

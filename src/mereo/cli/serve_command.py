@@ -23,12 +23,14 @@ class ServeCommand:
     what is begun and refuse the rest.
 
     Attributes:
-        weights: a shipped name or a file, once for each object; NAME=FILE says what clients call it.
+        object: meshes, joined by commas, or a scene, once for each object that has no weights; NAME=FILE,FILE says what
+            clients call it.
+        weights: a shipped name or a file, once for each object that has them; NAME=FILE says what clients call it.
         scene: NAME=FILE of the scene whose draws are fitted, where it is not the built-in one of the weights; once for
             each.
         method: register the object's own deformation model to the frames: auto takes the registered model where it
-            explains the frame, if the weights carry one; network leaves the network's answer; modes and full take the
-            model in any case, full by fitting the draws of the scene as well.
+            explains the frame, if the weights carry one; network leaves the network's answer, search the network out;
+            modes and full take the model in any case, full by fitting the draws of the scene as well.
         port: where it listens; 0 takes any that is free.
         host: address of this machine. Only this machine reaches the default. Another one needs the token of the address
             that is printed, and others on the network can read along: a proxy that encrypts is safer.
@@ -39,6 +41,7 @@ class ServeCommand:
             of them at least.
     """
 
+    object: UseAppendAction[tuple[str, ...]] = ()
     weights: UseAppendAction[tuple[str, ...]] = ()
     scene: UseAppendAction[tuple[str, ...]] = ()
     method: AnswerMethod = "auto"
@@ -58,6 +61,7 @@ class ServeCommand:
 
         serve(
             self.weights,
+            objects=self.object,
             scenes=self.scene,
             method=self.method,
             resolution=self.resolution,

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mereo.cli.object_option import MeshUnits, check_named, loaded_object
 from mereo.cli.stream_answers import Answering, FrameAnswer, Seen
 from mereo.cli.stream_rerun import RerunLog, RerunTarget
-from mereo.fitting.registration.register import registrar_for
 from mereo.fitting.tracking.config import StreamMethod
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.atomic_files import atomic_file, to_json
@@ -19,7 +19,6 @@ from mereo.io.config import InputConfig
 from mereo.io.scratch_folders import check_place, remove_all_abandoned
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import InferenceConfig
-from mereo.models.weights import load_for
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, Summary, frame_error, stream
@@ -29,8 +28,10 @@ from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 
 def stream_reconstructions(
     source: str,
-    weights: str,
+    weights: str | None = None,
     *,
+    looked_for: tuple[str, ...] = (),
+    units: MeshUnits = None,
     resolution: int = 48,
     rate_hz: float = 30.0,
     every_frame: bool = False,
@@ -49,21 +50,22 @@ def stream_reconstructions(
     Where the object's model is registered, it is followed from frame to frame (``fitting.tracking``). ``surfaces`` is a
     folder without content, or with ``force`` one in which files of the same name are replaced. ``rerun`` is a new
     recording's file or a viewer's address (``RerunTarget``). ``uncertainty`` says how sure each answer is that is the
-    registered model.
+    registered model. What is looked for is named as in ``FrameJob``.
 
     Raises ``ValueError`` where not one frame could be answered, and what broke the sequence off, where something did;
     ``FileExistsError`` for a folder of surfaces with content or a recording that is there, without ``force``; and as
     ``RerunTarget`` does.
     """
+    check_named("stream", looked_for, weights)
     source, reading = frames_of_recording(source, reading or InputConfig())
     folder = None if surfaces is None else SurfaceFolder(surfaces, force)
     target = None if rerun is None else RerunTarget(rerun, force)
     isolation = isolation or IsolationConfig()
-    model = load_for(weights, inference or InferenceConfig())
+    known = loaded_object(looked_for, weights, None, units, inference or InferenceConfig())
     frames: Iterable[StreamFrame[Observation] | None] = (
         watched_frames(source, reading, isolation) if watch else frames_of(source, reading, isolation, rate_hz)
     )
-    answer = Answering(model, registrar_for(model, method), resolution, isolation.keep_all, uncertainty)
+    answer = Answering(known.network, known.registrar(method), resolution, isolation.keep_all, uncertainty)
     # what is written to standard input or into a watched folder arrives when it does
     pace = not every_frame and not watch and source != STANDARD_INPUT
     timed = (None if frame is None else with_time(frame) for frame in frames)
@@ -169,6 +171,8 @@ def line(outcome: Outcome[FrameAnswer]) -> dict[str, Any]:
     found = outcome.result
     where: dict[str, Any] = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
     where |= {"known": found.recognition.known, "reason": found.recognition.reason}
+    if found.found_by is not None:
+        where["found_by"] = found.found_by
     if found.radius95 is not None:
         where["radius95"] = found.radius95
     return {**facts, **where, "strays": found.strays, "segments": found.segments}

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mereo.fitting.config import FoundBy
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
@@ -14,7 +15,7 @@ from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.moments import owned_centroids
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.reconstruction.strays import Reading
@@ -47,6 +48,7 @@ class FrameAnswer:
             where it was not asked for, or not known.
         observation: what was answered.
         seconds: of the answer alone, without decoding the frame.
+        found_by: who found the object when it began to be followed; None where the answer is the network's own.
     """
 
     surfaces: SegmentedMesh
@@ -59,6 +61,7 @@ class FrameAnswer:
     radius95: dict[str, float | bool] | None = None
     observation: Observation | None = None
     seconds: float = 0.0
+    found_by: FoundBy | None = None
 
     @property
     def strays(self) -> int:
@@ -95,7 +98,8 @@ class FrameAnswer:
             segments[one.name] |= {"centroid_radius95": round(one.centroid_radius95, DIGITS), "volume95": one.volume95}
         radius95 = None if sure is None else sure.summary(sure.outline)
         method, known = registration.method, found.recognition
-        return cls(mesh, segments, found.hypothesis, method, found.tracked, explained, known, radius95)
+        followed = cls(mesh, segments, found.hypothesis, method, found.tracked, explained, known, radius95)
+        return replace(followed, found_by=found.found_by)
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
@@ -107,13 +111,13 @@ class Answering:
 
     def __init__(
         self,
-        model: Model,
+        model: Trained | None,
         registrar: Registrar | None,
         resolution: int,
         keep_all: bool = False,
         uncertainty: bool = False,
     ) -> None:
-        """Answering with a model; without a registrar the network alone answers each frame."""
+        """Answering with a network, a registrar or both; without a registrar the network alone answers each frame."""
         self.model, self.resolution, self.keep_all, self.uncertainty = model, resolution, keep_all, uncertainty
         self.tracker = None if registrar is None else Tracker(registrar)
 

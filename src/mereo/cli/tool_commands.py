@@ -1,4 +1,4 @@
-"""The commands for one tool each: ``align``, ``view``, ``stream``, ``bench``, ``experiment``, ``release``.
+"""The commands for one tool each: ``align``, ``stream``, ``bench``, ``experiment``, ``release``.
 
 See ``mereo.cli.commands`` for how commands are written.
 """
@@ -10,10 +10,11 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mereo.cli.positionals import InputName, InputOrNone, ScanCloud, WeightsName
+from mereo.cli.object_option import MeshUnits
+from mereo.cli.positionals import InputName, ScanCloud, WeightsName
 from mereo.experiments.paper.scales import ExperimentName, ScaleName
 from mereo.fitting.tracking.config import StreamMethod
-from mereo.io.bounds import Cells, Count, CountOrNone, Port, Positive, PositiveOrUnknown, Threads, Workers
+from mereo.io.bounds import Cells, Count, CountOrNone, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
 from mereo.io.cores import workers_for
 from mereo.models.config import Device, InferenceConfig, Precision
@@ -72,70 +73,23 @@ class Align:
 
 
 @dataclass(frozen=True)
-class ViewCommand:
-    """Look at a frame and its reconstruction in a browser, or move a scene by hand (--scene): needs the extra `view`.
-
-    Attributes:
-        input: a point cloud or depth image, as for `mereo reconstruct`, or a result of it (the folder, or its
-            state.json; the YAML scene file that it was made with is found again); a GLB file; a folder of `mereo scene
-            record`, which is played; without it (and --scene) a shipped frame.
-        weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
-        scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
-        state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
-        port: where the page is; 0 takes any that is free.
-        host: address of this machine that the page is at. Only this machine reaches the default. Another one needs the
-            token of the address that is printed, and others on the network can read along: ssh -L is safer.
-        resolution: grid cells along the longest side.
-        reading: how the frame is read.
-        isolation: what of the frame is left out.
-        inference: where and how exactly the network computes.
-    """
-
-    input: InputOrNone = None
-    weights: str | None = None
-    scene: str | None = None
-    state: Path | None = None
-    port: Port = 8080
-    host: str = "127.0.0.1"
-    resolution: Cells = 128
-    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
-    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
-
-    def run(self) -> None:
-        """Open the page of a frame or of a scene, and keep it until Ctrl-C."""
-        from mereo.visualization.viewer.serve import view
-
-        view(
-            self.input,
-            self.weights,
-            scene=self.scene,
-            state=self.state,
-            port=self.port,
-            host=self.host,
-            resolution=self.resolution,
-            reading=self.reading,
-            isolation=self.isolation,
-            inference=self.inference,
-            block=True,
-        )
-
-
-@dataclass(frozen=True)
 class StreamCommand:
     """Reconstruct frames as they come: the latest one wins, a bad one is reported and passed over.
 
     Each answer is one line of JSON on standard output, in the input's frame and units; rate and latency come at the
-    end, on standard error. Where the weights carry the object's own deformation model, it is followed: each frame's fit
-    starts from the last one's state, and the network is asked at first and where the object is lost. The exit status is
+    end, on standard error. Where the object's own deformation model is known, it is followed: each frame's fit starts
+    from the last one's state, and network or search are asked at first and where the object is lost. The exit status is
     0 where any frame was answered and the sequence was whole, else 2.
 
     Attributes:
         input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
-        weights: a shipped name or a file.
+        object: what is looked for, as for `mereo reconstruct`: its meshes or its scene.
+        weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
+        units: of the object's meshes; guessed where not given.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
-            the network; network asks it alone, for each frame anew; modes takes the model in any case.
+            the network; network asks it alone, for each frame anew; search leaves it out; modes takes the model in any
+            case.
         uncertainty: say how sure the registered model is: radii, in the input's unit, that hold the true places of the
             surface and of each segment's centroid with probability 0.95, and intervals of its volume; takes some 30 ms.
         rate: frames per second at which a folder was recorded.
@@ -151,7 +105,9 @@ class StreamCommand:
     """
 
     input: InputName
-    weights: str
+    object: tuple[str, ...] = ()
+    weights: str | None = None
+    units: MeshUnits = None
     resolution: Cells = 48
     method: StreamMethod = "auto"
     uncertainty: bool = False
@@ -175,6 +131,8 @@ class StreamCommand:
         stream_reconstructions(
             self.input,
             self.weights,
+            looked_for=self.object,
+            units=self.units,
             resolution=self.resolution,
             rate_hz=self.rate,
             every_frame=self.every_frame,

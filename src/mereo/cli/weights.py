@@ -10,8 +10,8 @@ from rich.table import Table
 
 from mereo.io.atomic_files import to_json
 from mereo.models.calibration import calibration_rows
-from mereo.models.weights import SHIPPED, shipped_names
 from mereo.models.weights_facts import WeightsFacts, read_facts
+from mereo.models.weights_place import SHIPPED, shipped_names
 from mereo.training.examples_seen import seen_in_all, told
 from mereo.training.model_card import CardResult, card_results, nearest_preset
 

@@ -14,7 +14,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.solids import label_grid
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
 from mereo.reconstruction.observation import observe
 
@@ -36,7 +36,7 @@ class Candidate:
     seconds: float
     registration: Registration | None = None
 
-    def labels_on(self, grid: LabelGrid, model: Model, code: EncodedCloud) -> UInt8[np.ndarray, "x y z"]:
+    def labels_on(self, grid: LabelGrid, model: Trained, code: EncodedCloud) -> UInt8[np.ndarray, "x y z"]:
         """Labels on another grid."""
         if self.registration is None:
             return network_labels(model, code, grid)
@@ -71,7 +71,7 @@ class Candidates:
         return "network" if found is None else found.method
 
 
-def network_labels(model: Model, code: EncodedCloud, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
+def network_labels(model: Trained, code: EncodedCloud, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
     """Labels by the network at the voxels of a grid, evaluated coarse to fine."""
     x, y, z = grid.labels.shape
 
@@ -82,11 +82,11 @@ def network_labels(model: Model, code: EncodedCloud, grid: LabelGrid) -> UInt8[n
 
 
 def find_candidates(
-    model: Model, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
+    model: Trained, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
 ) -> Candidates:
     """Answers to a frame, scored on a grid: the one that a user gets, and all others that led to it."""
     answer = answer_frame(observe(cloud), model, registrar, scene_unit=scene_unit)
-    assert answer.likelier is not None and answer.candidate is not None
+    assert answer.likelier is not None and answer.candidate is not None and answer.likelier.code is not None
     started = time.perf_counter()
     code, encoding = answer.likelier.code, answer.likelier.timings_s["encode"]
     labels = network_labels(model, code, grid)

@@ -35,7 +35,7 @@ class ProbabilityGauge:
         if not view.clean:
             return
         cells = AskedCells.of(truth_grid(view.mesh, CELLS), ASKED)
-        assert answer.likelier is not None
+        assert answer.likelier is not None and answer.likelier.code is not None
         logits = self.model.logits(answer.likelier.code, cells.points)
         self.logits.append(logits)
         self.truth.append(np.minimum(cells.truth, logits.shape[1] - 1).astype(np.uint8))

@@ -14,6 +14,7 @@ from scipy.special import log_softmax, softmax
 
 from mereo.evaluation.reliability import Reliability
 from mereo.models.calibration import Scaling
+from mereo.models.scaled_logits import scaled_array
 
 GOOD_ENOUGH = 0.02
 """Expected calibration error up to which the temperature does alone: two thirds of what is wanted of unseen views."""
@@ -27,7 +28,7 @@ def ece_of(
     """Expected calibration error of the scaled probability of the most likely class by the logits as they are."""
     labels, rows = logits.argmax(axis=1), np.arange(len(logits))
     counted = Reliability()
-    counted.add(softmax(scaling.scaled_array(logits).astype(np.float64), axis=1)[rows, labels], labels == truth)
+    counted.add(softmax(scaled_array(scaling, logits).astype(np.float64), axis=1)[rows, labels], labels == truth)
     return counted.ece
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from mereo.evaluation.ground_truth import TruthGrid
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.trained import EncodedCloud, Trained
 
 BINS = 15
 """Bins of equal width, as in the papers."""
@@ -63,7 +63,7 @@ class Reliability:
         self.confidence += np.bincount(index, weights=confidence, minlength=BINS)
         self.right += np.bincount(index, weights=right, minlength=BINS)
 
-    def add_view(self, model: Model, code: EncodedCloud, truth: TruthGrid) -> None:
+    def add_view(self, model: Trained, code: EncodedCloud, truth: TruthGrid) -> None:
         """Count what a network answers about a view; one that tells no segments apart is asked for the whole."""
         cells = AskedCells.of(truth)
         found = model.query(code, cells.points)

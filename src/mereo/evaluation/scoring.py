@@ -25,7 +25,8 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.progress import progress as stage
 from mereo.models.elsewhere import sent
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.random_states import state_points
 from mereo.scenes.registry import load_scene
@@ -47,7 +48,7 @@ CELLS = 100
 # --- one cloud -------------------------------------------------------------------------------------------------------
 
 
-def predict_grid(model: Model, seen: PointCloud | EncodedCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
+def predict_grid(model: Trained, seen: PointCloud | EncodedCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
     """Labels by the network on the grid of ``truth``; ``seen`` is a cloud, or its code."""
     code = seen if isinstance(seen, EncodedCloud) else model.encode(seen)
     return network_labels(model, code, truth.grid)
@@ -64,7 +65,7 @@ def grid_scores(model: Model, seen: PointCloud | EncodedCloud, truth: SegmentedM
     return intersection_over_union(grid_confusion(grid, predict_grid(model, seen, grid), segments), model.segmented)
 
 
-def check_names(model: Model, names: Sequence[str]) -> None:
+def check_names(model: Trained, names: Sequence[str]) -> None:
     """Raise ``ValueError`` unless the model's labels mean the same as the truth's."""
     if tuple(names) != model.names:
         raise ValueError(

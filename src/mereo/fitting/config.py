@@ -3,9 +3,13 @@
 from dataclasses import dataclass
 from typing import Literal
 
-AnswerMethod = Literal["auto", "network", "modes", "full"]
+AnswerMethod = Literal["auto", "network", "search", "modes", "full"]
 """Source of the answer to a frame: the registered model where that explains the frame, else the network; the network
-alone; the registered model in any case, by its modes or by the draws of its scene as well."""
+alone; the registered model in any case, found by a search without the network, or by its modes or the draws of its
+scene as well."""
+
+FoundBy = Literal["search", "network"]
+"""Who found the object in a frame: a search over poses and states, or a trained network."""
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,8 @@ class SegmentedCloud:
         points: in the input's frame and units.
         labels: of the most likely segment, from 1 up. Empty space does not compete: a point on the surface is half in
             it, so it would win every second time.
-        confidence: probability of that segment among the segments.
+        confidence: probability of that segment among the segments; NaN of all points, as is the next, where no network
+            was asked.
         occupancy: probability of any segment against empty space: about a half on the surface of the object, near 0 at
             points that are not on it.
         names, colors: of the segments; ``names[k]`` has label k + 1.
@@ -67,3 +68,10 @@ class SegmentedCloud:
 
     def __repr__(self) -> str:
         return f"SegmentedCloud({counted(len(self.points), 'point')}; {listed(self.names)})"
+
+    @property
+    def chances(self) -> dict[str, Float[np.ndarray, " n"]]:
+        """``confidence`` and ``occupancy`` by their names; none where no network was asked."""
+        if len(self.points) and np.isnan(self.confidence).all():
+            return {}
+        return {"confidence": self.confidence, "occupancy": self.occupancy}

@@ -7,6 +7,8 @@ import sysconfig
 from pathlib import Path
 from traceback import walk_tb
 
+from mereo.io.extras import NEEDED, is_torch
+
 PACKAGE = Path(__file__).parents[1]
 
 LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
@@ -29,8 +31,10 @@ def is_foreseen(error: Exception) -> bool:
 def words_of(error: Exception) -> str:
     """Words of an error in one line: the sentence of a foreseen one, else its type and text.
 
-    An error of the operating system is told by its file and reason.
+    An error of the operating system is told by its file and reason, the lack of torch by the extra that brings it.
     """
+    if is_torch(error):
+        return NEEDED
     if not is_foreseen(error):
         text = printable_line(str(error))
         text = text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."

@@ -24,13 +24,14 @@ from mereo.learning.object_files import SCENE, check, names_scene, scene_for
 from mereo.learning.outcome import show_outcome
 from mereo.learning.probe import MADE_AS, measure
 from mereo.learning.schedule import OFFSET_EXAMPLES, Plan, Rates, epochs_for, holdout, plan_for, views_for
-from mereo.models.weights import WEIGHTS, find_weights, load_model, with_calibration
+from mereo.models.weights import load_model, with_calibration
+from mereo.models.weights_place import WEIGHTS, find_weights
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.shards import generate
 from mereo.training.config import PRESETS, TrainConfig
 from mereo.training.trainer import train
-from mereo.visualization.result_files import evaluate_weights
+from mereo.visualization.evaluation_files import evaluate_weights
 
 SETTINGS, PLAN = CONFIG, "plan.json"
 """What was asked for, and what was decided, with the measurements behind it."""

@@ -1,13 +1,19 @@
 """What is learnt: a scene, or meshes for which a scene file is written; and what is wrong with it before any work."""
 
 import shlex
+import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from mereo.geometry.brief import counted
+from mereo.geometry.mesh_check import examine
+from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.volume_files import is_volume
+from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON
 from mereo.scenes.files.template import write_scene_file
@@ -48,6 +54,28 @@ def scene_for(files: Sequence[Path], folder: Path, units: str | None, quiet: boo
             return str(path)
         print(told_of(path))
     return str(path)
+
+
+def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
+    """Scene of meshes as ``scene_for`` writes it, without a file.
+
+    Raises as ``write_scene_file`` does, and ``ValueError`` for a part without volume; a mesh that is no solid is used
+    with a ``MeshWarning``.
+    """
+    new = shlex.join(map(str, files))
+    cure = f"let `mereo scene new {new} --output object.yaml` and `mereo scene check object.yaml --repair` mend it"
+    for file in () if is_volume(files[0]) else files:
+        for part in read_segmented_mesh(file).segments:
+            if faults := examine(part).hopeless:
+                raise ValueError(f"segment {part.name!r} of {file} {faults[0]}; an object's parts are solids: {cure}")
+    with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", MeshWarning)
+        path = write_scene_file(files, Path(folder) / SCENE, units, name=files[0].name.split(".")[0])
+        scene = load_scene(path)
+    for one in told:  # which name the file that is gone
+        text = str(one.message).replace(f"{path}: ", "")
+        warnings.warn(text.replace(f"repair it with `mereo scene check {path} --repair`", cure), one.category, 2)
+    return replace(scene, file=None)
 
 
 def told_of(path: Path) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from mereo.evaluation.metrics import format_score
 from mereo.learning.example_frame import FRAME
-from mereo.models.weights import WEIGHTS
+from mereo.models.weights_place import WEIGHTS
 from mereo.scenes.scene import SCENES
 
 GOOD = 0.7

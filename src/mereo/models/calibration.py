@@ -1,14 +1,10 @@
 """Calibration of weights: what was measured, on training seeds, of how far their answers can be trusted."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
-from jaxtyping import Float
 from pydantic import BaseModel, Field, FiniteFloat, model_validator
-from torch import Tensor
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -99,17 +95,6 @@ class Scaling:
     temperature: float = 1.0
     biases: tuple[float, ...] | None = None
 
-    def scaled(self, logits: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
-        """Logits in single precision, divided and with their biases; as they are where neither changes anything."""
-        if self == Scaling():
-            return logits
-        divided = logits.float() / self.temperature
-        return divided if self.biases is None else divided + _on_device(self.biases, logits.device)
-
-    def scaled_array(self, logits: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-        """``scaled`` of logits that have left their device."""
-        return self.scaled(torch.from_numpy(logits)).numpy()
-
 
 class Calibration(BaseModel, frozen=True):
     """What views of training seeds showed about the answers of these weights; parts that were not measured are None.
@@ -158,12 +143,6 @@ class Calibration(BaseModel, frozen=True):
     def scaling(self) -> Scaling:
         """Scaling of logits; one that changes nothing where there is no temperature."""
         return Scaling() if self.temperature is None else Scaling(self.temperature, self.biases)
-
-
-@lru_cache(maxsize=16)
-def _on_device(biases: tuple[float, ...], device: torch.device) -> Float[Tensor, " c"]:
-    """Biases, made once: an upload for every chunk of queries would wait for the device."""
-    return torch.tensor(biases, device=device)
 
 
 def calibration_rows(found: Calibration | None) -> list[tuple[str, str]]:

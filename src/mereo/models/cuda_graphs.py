@@ -20,8 +20,9 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.models.config import MOST_ORDERED
 from mereo.models.decoder import Code
-from mereo.models.model import Model, check_enough
+from mereo.models.model import Model
 from mereo.models.ops.neighbors import gpu_kernels
+from mereo.models.trained import check_enough
 
 SIZES = (4096, 10_000, 40_000)
 """Numbers of queries at once; what is asked is padded to the next of them."""

@@ -11,6 +11,7 @@ import torch
 from mereo.models.config import InferenceConfig
 from mereo.models.device import find_device
 from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.workers.config import Cluster
 
 
@@ -28,8 +29,9 @@ def for_tasks(inference: InferenceConfig, cluster: Cluster | None) -> InferenceC
     return replace(inference, device="cpu")
 
 
-def sent(model: Model, cluster: Cluster) -> Model:
+def sent(model: Trained, cluster: Cluster) -> Model:
     """The same model on the CPU, with a precision that does not depend on which machine asks."""
+    assert isinstance(model, Model)
     precision = model.precision
     if precision == "auto":
         precision = "bfloat16" if cluster.gpus or model.working_dtype == torch.bfloat16 else "float32"
@@ -37,9 +39,10 @@ def sent(model: Model, cluster: Cluster) -> Model:
     return replace(model, network=network, precision=precision)
 
 
-def arrived(model: Model, gpu: bool) -> Model:
+def arrived(model: Trained, gpu: bool) -> Model:
     """The model on the GPU of this task; itself where tasks have none.
 
     Raises ``ValueError`` where torch sees no GPU here.
     """
+    assert isinstance(model, Model)
     return replace(model, network=model.network.to(find_device("cuda"))) if gpu else model

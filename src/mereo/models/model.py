@@ -11,12 +11,11 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.geometry.mesh import Color
@@ -24,10 +23,12 @@ from mereo.geometry.normalizer import Normalizer
 from mereo.models.batch_norm_fusion import fold_batch_norm
 from mereo.models.calibration import Calibration
 from mereo.models.config import Precision, Supervision
-from mereo.models.decoder import Code, Prediction
+from mereo.models.decoder import Prediction
 from mereo.models.device import pick_precision
 from mereo.models.network import Network
+from mereo.models.scaled_logits import scaled_logits
 from mereo.models.threads import MOST, in_threads
+from mereo.models.trained import Answer, EncodedCloud, checked_points
 from mereo.scenes.statistical_model import StatisticalModel
 
 SURE_LOGIT = 20.0
@@ -42,45 +43,6 @@ CPU_QUERY_CHUNK, CUDA_QUERY_CHUNK = 2048, 65536
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]
 """Lower and upper corner of a box, normalized."""
-
-
-@dataclass(frozen=True, eq=False)
-class EncodedCloud:
-    """Observed cloud, encoded and ready to be queried.
-
-    Attributes:
-        code: the network's side.
-        normalizer: between the user's frame and the network's.
-        cloud: the points the network saw, in the user's frame and units.
-    """
-
-    code: Code
-    normalizer: Normalizer
-    cloud: Float[np.ndarray, "n 3"]
-
-    def __repr__(self) -> str:
-        return f"EncodedCloud({counted(len(self.cloud), 'point')})"
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """Answers of a model at points, in the user's frame and units.
-
-    Attributes:
-        label: 0 for empty space, i + 1 for the model's segment i.
-        probability: of empty space and each segment; rows sum to one. Calibrated where ``Model.calibrates``: another
-            class than the label, which is decided without that, may then have a greater one.
-        distance: to the nearest segment surface, negative inside; NaN from a model that was not trained on distances.
-        direction: unit vector towards it; NaN from a model that was not trained on directions.
-    """
-
-    label: UInt8[np.ndarray, " n"]
-    probability: Float[np.ndarray, "n c"]
-    distance: Float[np.ndarray, " n"]
-    direction: Float[np.ndarray, "n 3"]
-
-    def __repr__(self) -> str:
-        return f"Answer({counted(len(self.label), 'point')}, {int((self.label > 0).sum()):,} in a segment)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +105,11 @@ class Model:
         return next(self.network.parameters()).device
 
     @property
+    def device_type(self) -> str:
+        """Kind of this device: "cpu" or "cuda"."""
+        return self.device.type
+
+    @property
     def working_dtype(self) -> torch.dtype:
         """Type of the products on this machine: float32 or bfloat16."""
         return pick_precision(self.precision, self.device) or torch.float32
@@ -182,7 +149,7 @@ class Model:
 
         def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             logits, distance, direction = self.respond(prediction, queries)
-            scaled = logits if self.calibration is None else self.calibration.scaling.scaled(logits)
+            scaled = logits if self.calibration is None else scaled_logits(self.calibration.scaling, logits)
             return logits.argmax(dim=-1).to(torch.uint8), scaled.softmax(dim=-1), distance, direction
 
         label, probability, distance, direction = self._chunked(code, points, answer)
@@ -274,23 +241,3 @@ class Model:
 
         chunks = in_threads(part, range(0, max(len(normalized), 1), size), most)
         return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
-
-
-def check_enough(count: int, said: str) -> None:
-    """Raise ``ValueError``, beginning with ``said``, where the encoder needs more points than ``count``."""
-    if count < MIN_POINTS:
-        raise ValueError(
-            f"{said}; the encoder needs at least {MIN_POINTS}: move closer, or check the mask and the depth range"
-        )
-
-
-def checked_points(cloud: PointCloud) -> Float[np.ndarray, "n 3"]:
-    """Points of a cloud as float64, or ``ValueError`` with one sentence on why they cannot be used."""
-    points = np.asarray(cloud.points, dtype=np.float64)
-    check_enough(len(points), f"the cloud has {len(points)} points")
-    if (points[:, 2] <= 0).any():
-        raise ValueError(
-            f"{int((points[:, 2] <= 0).sum())} of {len(points)} points have z <= 0, behind the camera; the cloud must "
-            "be in a camera frame (x right, y down, z forward): turn it, or pass --frame scanner for y-up scans"
-        )
-    return points

@@ -20,19 +20,15 @@ from mereo.models.encoders.autodecoder import CODES
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights_header import CURE, FORMAT_VERSION, Header, check_tensors, read_config, read_header
+from mereo.models.weights_place import STATES, find_weights
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.scenes.statistical_model_file import pack_model, unpack_model
-
-STATES = "states."
-"""Beginning of the names of a statistical model's tensors."""
 
 PACKED = "decoder.lookup.distance"
 """The template's signed distances: with ten segments more than half of a float16 file."""
 
 FINE = 0.1
 """Reach of a surface, where packed distances are finest: steps of 0.0008 at it, a fiftieth of the grid's, 0.1 at 1."""
-
-SHIPPED = Path(__file__).parents[1] / "weights"
 
 
 def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> None:
@@ -117,31 +113,6 @@ def _unpack(packed: Int8[Tensor, "*s"]) -> Float[Tensor, "*s"]:
     """Inverse of ``_pack`` up to rounding; no distance of the template is so large that it would be infinite."""
     share = packed.float() / 127.0
     return FINE * share / (1.0 - share.abs())
-
-
-def shipped_names() -> tuple[str, ...]:
-    """Names that ``load_model`` knows without a path."""
-    return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
-
-
-WEIGHTS = "weights.safetensors"
-"""File of weights in a folder of `mereo train` or `mereo learn`."""
-
-
-def find_weights(name: str | Path) -> Path:
-    """Path of weights that are given by a shipped name, as an existing file, or as the folder that holds them."""
-    path = Path(name)
-    shipped = SHIPPED / f"{name}.safetensors"
-    if path.suffix == "" and not path.is_file() and shipped.is_file():
-        return shipped
-    if (path / WEIGHTS).is_file():
-        return path / WEIGHTS
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"there are no weights {str(name)!r}; give a .safetensors file from mereo train or one of the shipped "
-            f"names: {', '.join(shipped_names()) or 'none'}"
-        )
-    return path
 
 
 def trained_steps(path: Path) -> int | None:

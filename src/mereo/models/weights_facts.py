@@ -10,8 +10,9 @@ from safetensors import SafetensorError, safe_open
 
 from mereo.io.errors import reason
 from mereo.models.config import NetworkConfig, Supervision
-from mereo.models.weights import PACKED, STATES, find_weights
+from mereo.models.weights import PACKED
 from mereo.models.weights_header import Header, read_config, read_header
+from mereo.models.weights_place import STATES, find_weights
 from mereo.scenes.source_frame import SourceFrame
 
 NOT_LEARNT = ("running_mean", "running_var", "num_batches_tracked")

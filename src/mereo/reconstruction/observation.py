@@ -12,14 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.conventions import MIN_POINTS, CloudAxes
+from mereo.geometry.downsampling import MAX_POINTS, random_subset
 from mereo.geometry.sight_lines import SightLines
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig
-from mereo.reconstruction.isolation import IsolationStep, Selection, select_object
+from mereo.reconstruction.isolation import IsolationStep, Selection, clusters, select_object
 from mereo.reconstruction.lines_of_sight import lines_of_frame
 from mereo.reconstruction.strays import Reading
 
@@ -31,7 +33,20 @@ CLOUD = Path("cloud")
 """Name of a frame that comes from no file."""
 
 
-class SizeWarning(UserWarning):
+LIKE_SIZE, APART = 0.4, 0.25
+"""Points of a second cluster, in those of the largest, and its distance from that, in its own size, from which on both
+may be objects."""
+
+
+class FrameWarning(UserWarning):
+    """Warning that what is seen may not be the object, or not the object alone."""
+
+
+class ClustersWarning(FrameWarning):
+    """Warning that two separate things of like size are seen."""
+
+
+class SizeWarning(FrameWarning):
     """Warning that what is seen is not as large as the object that a model was trained on."""
 
 
@@ -173,4 +188,22 @@ def size_warning(observation: Observation, provenance: Mapping[str, object]) -> 
         f"the visible part is {longest:.3g} m long, but {least:.3g} to {greatest:.3g} m in training: other things are "
         "in the cloud (crop with --box or --depth-range), or its unit is wrong (--unit-m 0.001 for clouds in "
         "millimetres, --depth-scale for images); results are in the cloud's unit all the same"
+    )
+
+
+def clusters_warning(observation: Observation) -> str | None:
+    """Sentence where the cloud is two separate clusters of like size, of which one may be another object; else None."""
+    points = random_subset(observation.cloud.points, MAX_POINTS)
+    label = clusters(points)
+    first, second = points[label == 0], points[label == 1]
+    if len(second) < max(MIN_POINTS, LIKE_SIZE * len(first)):
+        return None
+    gap, size = cKDTree(first).query(second)[0].min(), np.linalg.norm(np.ptp(second, axis=0))
+    if gap < APART * size:
+        return None
+    metres, name = observation.frame.metres, observation.frame.length_name
+    return (
+        f"the cloud has two separate clusters of like size ({len(first)} and {len(second)} of {len(points)} points, "
+        f"{gap * metres:.3g} {name} apart), and one object is looked for in all of it: if they are two, crop to one "
+        "with --box, or take the larger one with --largest-cluster"
     )

@@ -23,7 +23,7 @@ from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.trained import EncodedCloud, Trained, checked_points
 from mereo.reconstruction.coarse_to_fine import Field
 from mereo.reconstruction.isosurfaces import extract_whole, locate
 from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
@@ -45,7 +45,8 @@ class Reconstruction:
         timings_s: seconds of each stage.
         evaluated: points at which the network was asked for surfaces.
         clipped: whether a segment still reached the largest box and was closed there.
-        code: what the model made of the cloud; ask it for more with ``Model.query``, in the camera frame.
+        code: what the network made of the cloud; ask it for more with ``Model.query``, in the camera frame. None
+            without a network.
         T_camera_input: from the input's frame to the camera frame.
         reading: which of the input's points are taken for the object's; the others were dropped as strays.
         observed: the segment of each of these points, where it was asked for.
@@ -58,7 +59,7 @@ class Reconstruction:
     timings_s: dict[str, float]
     evaluated: int
     clipped: bool
-    code: EncodedCloud
+    code: EncodedCloud | None
     T_camera_input: Float[np.ndarray, "4 4"]
     reading: Reading
     observed: SegmentedCloud | None = None
@@ -84,14 +85,14 @@ class EncodedFrame:
         reading: the cloud, in the input's frame and unit, and which of its points were understood.
         axes: of that frame.
         T_camera_input: into the camera frame.
-        code: what the model made of the cloud.
+        code: what the network made of the cloud; None without one.
         timings_s: seconds of each stage so far.
     """
 
     reading: Reading
     axes: CloudAxes
     T_camera_input: Float[np.ndarray, "4 4"]
-    code: EncodedCloud
+    code: EncodedCloud | None
     timings_s: dict[str, float]
 
     @property
@@ -105,20 +106,24 @@ class EncodedFrame:
         return PointCloud(transform_points(self.T_camera_input, self.points))
 
 
-def encode_frame(reading: Reading, model: Model, axes: CloudAxes = "camera") -> EncodedFrame:
-    """Encode the points that a hypothesis takes for the object's.
+def encode_frame(reading: Reading, model: Trained | None, axes: CloudAxes = "camera") -> EncodedFrame:
+    """Encode the points that a hypothesis takes for the object's; without a network check them alone.
 
     Raises ``ValueError`` for unusable clouds.
     """
     points = reading.cloud.points
     T_camera_input = into_camera(points, axes)
     seconds: dict[str, float] = {}
+    seen = PointCloud(transform_points(T_camera_input, points))
+    if model is None:
+        checked_points(seen)
+        return EncodedFrame(reading, axes, T_camera_input, None, seconds)
     with timed(seconds, "encode"):
-        code = model.encode(PointCloud(transform_points(T_camera_input, points)))
+        code = model.encode(seen)
     return EncodedFrame(reading, axes, T_camera_input, code, seconds)
 
 
-def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_points: bool = False) -> Reconstruction:
+def extract(seen: EncodedFrame, model: Trained, resolution: int = 128, label_points: bool = False) -> Reconstruction:
     """All segments of the object in an encoded cloud, hidden side included, as the network alone finds them.
 
     Args:
@@ -131,6 +136,7 @@ def extract(seen: EncodedFrame, model: Model, resolution: int = 128, label_point
     """
     names, colors = segment_names(model)
     seconds, code = dict(seen.timings_s), seen.code
+    assert code is not None
     field: Field = partial(model.logits, code)
     with timed(seconds, "locate"):
         box = locate(field, code.normalizer.invert(SEARCH_BOX))
@@ -166,7 +172,7 @@ def timed(timings: dict[str, float], stage: str) -> Iterator[None]:
     timings[stage] = time.perf_counter() - start
 
 
-def segment_names(model: Model) -> tuple[tuple[str, ...], tuple[Color, ...]]:
+def segment_names(model: Trained) -> tuple[tuple[str, ...], tuple[Color, ...]]:
     """Names and colours of the classes that the model tells apart; one trained on distances knows only the whole."""
     return (model.names, model.colors) if model.segmented else (("object",), PALETTE[:1])
 

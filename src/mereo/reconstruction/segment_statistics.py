@@ -11,7 +11,7 @@ from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color, Segment
 from mereo.models.calibration import Calibration
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.isosurfaces import Extraction
 
 CONFIDENCE_VOXELS = 2000
@@ -27,7 +27,8 @@ class FoundSegment:
         volume: inside its surface, less what is nested in it; 0 where it was not found.
         centroid: mean of its voxels, NaN where it was not found.
         box: lower and upper corner of its surface, NaN where it was not found.
-        confidence: mean probability that the model gives it over its voxels, NaN where it was not found.
+        confidence: mean probability that the network gives it over its voxels; NaN where it was not found, and
+            without a network.
         voxels: how many of the label grid it has.
         components: connected groups of voxels (over faces); more than one may be a fleck, and nothing is removed.
     """
@@ -42,7 +43,8 @@ class FoundSegment:
     components: int
 
     def __repr__(self) -> str:
-        found = f"volume {self.volume:.3g}, confidence {self.confidence:.2f}" if self.voxels else "not found"
+        sure = "" if np.isnan(self.confidence) else f", confidence {self.confidence:.2f}"
+        found = f"volume {self.volume:.3g}{sure}" if self.voxels else "not found"
         return f"FoundSegment({self.name!r}, {found})"
 
 
@@ -65,7 +67,7 @@ def segment_points(
         labels: of the points, 1 or more, where another than the network says them.
     """
     labels = (logits[:, 1:].argmax(axis=1) + 1).astype(np.uint8) if labels is None else labels
-    scaled = logits if calibration is None else calibration.scaling.scaled_array(logits)
+    scaled = logits if calibration is None else _scaled(calibration, logits)
     parts = scaled[:, 1:].astype(np.float64)
     return SegmentedCloud(
         points=points,
@@ -77,8 +79,14 @@ def segment_points(
     )
 
 
-def measure(found: Extraction, model: Model, code: EncodedCloud) -> tuple[FoundSegment, ...]:
-    """Every segment of an extraction in numbers; ``code`` is what ``model`` made of the cloud."""
+def _scaled(calibration: Calibration, logits: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
+    from mereo.models.scaled_logits import scaled_array  # it needs torch, which whoever has logits has
+
+    return scaled_array(calibration.scaling, logits)
+
+
+def measure(found: Extraction, model: Trained | None, code: EncodedCloud | None) -> tuple[FoundSegment, ...]:
+    """Every segment of an extraction in numbers; ``code`` is what ``model`` made of the cloud, None without one."""
     owned = zip(found.surfaces.segments, found.surfaces.owned_volumes, strict=True)
     return tuple(
         _measure(found.grid, label, segment, float(volume), model, code)
@@ -87,14 +95,16 @@ def measure(found: Extraction, model: Model, code: EncodedCloud) -> tuple[FoundS
 
 
 def _measure(
-    grid: LabelGrid, label: int, segment: Segment, volume: float, model: Model, code: EncodedCloud
+    grid: LabelGrid, label: int, segment: Segment, volume: float, model: Trained | None, code: EncodedCloud | None
 ) -> FoundSegment:
     voxels = np.argwhere(grid.labels == label)
     if len(voxels) == 0:
         nothing = np.full((2, 3), np.nan)
         return FoundSegment(segment.name, label, 0.0, nothing[0], nothing, float("nan"), 0, 0)
-    chosen = random_subset(voxels, CONFIDENCE_VOXELS)
-    probability = model.query(code, grid.positions(chosen)).probability[:, label]
+    confidence = float("nan")
+    if model is not None and code is not None:
+        chosen = random_subset(voxels, CONFIDENCE_VOXELS)
+        confidence = float(model.query(code, grid.positions(chosen)).probability[:, label].mean())
     low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
     part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     return FoundSegment(
@@ -103,7 +113,7 @@ def _measure(
         volume=volume,
         centroid=grid.positions(voxels).mean(axis=0),
         box=segment.bounds,
-        confidence=float(probability.mean()),
+        confidence=confidence,
         voxels=len(voxels),
         components=int(ndimage.label(part == label)[1]),
     )

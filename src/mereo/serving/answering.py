@@ -26,9 +26,9 @@ from mereo.io.foreseen import is_foreseen, words_of
 from mereo.io.sensor_frame import read_frame
 from mereo.io.size_limits import SizeError
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
-from mereo.models.config import Precision
-from mereo.models.model import Model
-from mereo.models.weights import load_for
+from mereo.models.config import InferenceConfig, Precision
+from mereo.models.trained import Trained
+from mereo.models.weights_place import load_weights
 from mereo.reconstruction.observation import find_object
 from mereo.serving.messages import JSON, FrameRequest, Ready, Reply, Served, Setup
 from mereo.serving.refusals import FAULT, failed
@@ -43,11 +43,11 @@ class TooManyPoints(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """Weights that are ready.
+    """Object that is ready.
 
     Attributes:
-        served: as they are served.
-        object: its network on its device, known by the name that clients use.
+        served: as it is served.
+        object: with its network, if it has one, on its device, known by the name that clients use.
         method: who answers.
     """
 
@@ -57,19 +57,21 @@ class Loaded:
 
     @classmethod
     def of(cls, served: Served, setup: Setup) -> "Loaded":
-        """Load weights, and make what every frame needs; raises as ``load_for`` and ``registrar_for`` do."""
-        model = replace(load_for(served.weights, setup.inference), name=served.name)
-        loaded = cls(served, load_object(model, served.scene), setup.method)
+        """Load an object, and make what every frame needs; raises as ``load_object`` and ``registrar_for`` do."""
+        if served.weights is None:
+            found = load_object(served.object)
+        else:
+            found = load_object(ready_weights(served.weights, served.name, setup.inference), served.scene)
+        loaded = cls(served, found, setup.method)
         registrar = loaded.registrar
-        if registrar is not None and registrar.method != "modes":
+        if registrar is not None and registrar.fits_draws:
             _ = registrar.at_hand  # takes seconds, once
-        _ = model.inference
         return loaded
 
     @property
-    def model(self) -> Model:
-        """The network."""
-        return self.object.model
+    def model(self) -> Trained | None:
+        """The network, where there is one."""
+        return self.object.network
 
     @property
     def registrar(self) -> Registrar | None:
@@ -77,24 +79,33 @@ class Loaded:
         return self.object.registrar(self.method)
 
     def facts(self) -> dict[str, Any]:
-        """What clients may know of the weights."""
-        model, own = self.model, self.model.calibration
+        """What clients may know of the object."""
+        model, known = self.model, self.object.segments
+        own = None if model is None else model.calibration
         frame = None if self.registrar is None else self.registrar.model.source_frame
         return {
             "name": self.served.name,
             "segments": [
                 {"name": name, "label": number + 1, "color": list(color)}
-                for number, (name, color) in enumerate(zip(model.names, model.colors, strict=True))
+                for number, (name, color) in enumerate(zip(known.names, known.colors, strict=True))
             ],
-            "nested": [list(pair) for pair in model.nested],
-            "scene": model.provenance.get("scene"),
+            "nested": [list(pair) for pair in known.nested],
+            "scene": self.object.name if model is None else model.provenance.get("scene"),
             "method": "network" if self.registrar is None else self.registrar.method,
             "scene_unit_m": None if frame is None else frame.unit_m,
-            "calibrated": model.calibrates,
+            "calibrated": model is not None and model.calibrates,
             "recognition_calibrated": own is not None and own.recognizing is not None,
-            "device": model.device.type,
-            "precision": model.working_precision,
+            "device": None if model is None else model.device_type,
+            "precision": None if model is None else model.working_precision,
         }
+
+
+def ready_weights(weights: str, name: str, inference: InferenceConfig) -> Trained:
+    """Weights under the name that clients use, made ready for the first question."""
+    loaded: Any = load_weights(weights, inference)
+    model = replace(loaded, name=name)
+    _ = model.inference
+    return model
 
 
 @dataclass(eq=False)
@@ -103,7 +114,7 @@ class Answerer:
 
     Attributes:
         setup: what is served.
-        loaded: the weights, by name.
+        loaded: the objects, by name.
     """
 
     setup: Setup
@@ -117,8 +128,8 @@ class Answerer:
     def ready(self) -> Ready:
         """What is reported first."""
         facts = tuple(one.facts() for one in self.loaded.values())
-        precision = next(iter(self.loaded.values())).model.working_precision
-        return Ready(facts, cast(Precision, precision))
+        settled = [one.model.working_precision for one in self.loaded.values() if one.model is not None]
+        return Ready(facts, cast(Precision, settled[0]) if settled else "float32")
 
     def __call__(self, frame: FrameRequest) -> Reply:
         """Answer to a frame, or why there is none."""

@@ -24,17 +24,19 @@ GLB: Media = "model/gltf-binary"
 
 @dataclass(frozen=True)
 class Served:
-    """Weights that are served.
+    """Object that is served.
 
     Attributes:
-        name: by which clients know them.
-        weights: a shipped name or a file.
+        name: by which clients know it.
+        weights: a shipped name or a file; None of an object without.
         scene: whose draws are fitted, where it is not the built-in one that the weights were trained on.
+        object: its meshes or scene, where it has no weights.
     """
 
     name: str
-    weights: str
+    weights: str | None = None
     scene: str | None = None
+    object: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

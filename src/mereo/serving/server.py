@@ -20,7 +20,7 @@ from mereo.serving.config import ServeConfig
 from mereo.serving.dispatcher import Dispatcher
 from mereo.serving.messages import Setup
 from mereo.serving.metrics import Metrics
-from mereo.serving.names import served_weights
+from mereo.serving.names import served_objects
 from mereo.serving.workers import WorkerProcess
 from mereo.visualization.viewer.guard import LOOPBACK, Entry, bound_socket
 
@@ -31,6 +31,7 @@ CONNECTIONS = 256
 def serve(
     weights: Sequence[str],
     *,
+    objects: Sequence[str] = (),
     scenes: Sequence[str] = (),
     method: AnswerMethod = "auto",
     resolution: int = 128,
@@ -40,10 +41,11 @@ def serve(
     config: ServeConfig | None = None,
     inference: InferenceConfig | None = None,
 ) -> None:
-    """Serve weights until Ctrl-C, TERM or HUP: then what is begun is answered, and the rest refused.
+    """Serve objects until Ctrl-C, TERM or HUP: then what is begun is answered, and the rest refused.
 
     Args:
         weights: shipped names or files, each as it is or as NAME=FILE.
+        objects: scenes, or meshes joined by commas, each as it is or as NAME=FILE.
         scenes: NAME=FILE of the scenes whose draws are fitted, where they are not the weights' built-in ones.
         method: source of the answers.
         resolution: cells along the longest side where a request does not say.
@@ -57,7 +59,7 @@ def serve(
     taken or not this machine's.
     """
     config = config or ServeConfig()
-    served = served_weights(weights, scenes)
+    served = served_objects(weights, scenes, objects)
     setup = Setup(served, method, inference or InferenceConfig(), config.max_points, config.max_body)
     entry, metrics = Entry.of(host), Metrics()
     with ExitStack() as stack:

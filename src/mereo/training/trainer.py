@@ -22,7 +22,8 @@ from mereo.models.config import Device
 from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
 from mereo.models.encoders.autodecoder import Autodecoder
 from mereo.models.network import Network
-from mereo.models.weights import WEIGHTS, save_model, trained_steps
+from mereo.models.weights import save_model, trained_steps
+from mereo.models.weights_place import WEIGHTS
 from mereo.training.batch_normalization import adapt_momentum, share_statistics
 from mereo.training.batches import Batch, Draws
 from mereo.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint

@@ -10,7 +10,7 @@ import torch
 
 from mereo.io.progress import Progress
 from mereo.models.device import keep_freed_memory, pick_device
-from mereo.models.weights import shipped_names
+from mereo.models.weights_place import shipped_names
 from mereo.training.batches import Batch, Draws
 from mereo.training.config import TrainConfig
 from mereo.training.dataset import Dataset

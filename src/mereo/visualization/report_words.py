@@ -98,7 +98,8 @@ def _heads(summary: Mapping[str, Any], unit: Unit, confidence: str) -> list[str]
     sure = isinstance(summary.get("radius95"), Mapping)
     centre, volume = (", ± 95 %", ", 95 % range") if sure else ("", "")
     heads = [f"centre x, y, z{centre} ({unit.length_name})", f"volume{volume} ({unit.volume_name})"]
-    return ["segment", *heads, confidence]
+    known = any(_number(told.get("confidence")) is not None for told in summary.get("segments") or ())
+    return ["segment", *heads, *([confidence] if known or not summary.get("segments") else [])]
 
 
 def _facts(summary: Mapping[str, Any], unit: Unit, verdict: Trust) -> list[str]:
@@ -132,9 +133,10 @@ def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
     explained = _number(registration.get("explained"))
     if registration.get("answer") != "registration":
         return "the network's own answer"
+    found = "your model, found by a search" if registration.get("found_by") == "search" else "your model, registered"
     if explained is None or verdict.level in ("yes", "unchecked"):  # which say it themselves
-        return "your model, registered"
-    return f"your model, registered: it explains {explained:.1%} of the points"
+        return found
+    return f"{found}: it explains {explained:.1%} of the points"
 
 
 def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:

@@ -70,12 +70,14 @@ def _cropped(pictures: Sequence[Picture]) -> list[Picture]:
 
 
 def _table(segments: Sequence[FoundSegment], surfaces: SegmentedMesh, unit: Unit, calibrated: bool) -> str:
-    sure = confidence_title(calibrated)
-    heads = ("segment", f"volume, {unit.volume_name}", sure, f"centre, {unit.length_name}")
+    known = not all(np.isnan(found.confidence) for found in segments)
+    sure = [confidence_title(calibrated)] if known else []
+    heads = ("segment", f"volume, {unit.volume_name}", *sure, f"centre, {unit.length_name}")
     rows = []
     for found, (red, green, blue) in zip(segments, surfaces.colors, strict=True):
         swatch = f'<span style="color:rgb({red},{green},{blue})">&#9632;</span>'
-        values = (unit.volume(found.volume), f"{found.confidence:.2f}", unit.place(found.centroid))
+        told = [f"{found.confidence:.2f}"] if known else []
+        values = (unit.volume(found.volume), *told, unit.place(found.centroid))
         cells = "".join(f"<td>{value}</td>" for value in (values if found.voxels else ("0", "not found", "")))
         rows.append(f'<tr><td style="text-align:left">{swatch} {escape(found.name)}</td>{cells}</tr>')
     head = "".join(f"<th>{name}</th>" for name in heads)

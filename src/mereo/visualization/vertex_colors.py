@@ -11,7 +11,7 @@ from mereo.geometry.color_stops import between_stops
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii, level_told
 from mereo.geometry.solids import Solids
-from mereo.models.model import Answer
+from mereo.models.trained import Answer
 from mereo.visualization.error_maps import OVER, UNDER
 
 Ask = Callable[[Float[np.ndarray, "n 3"]], Answer]

@@ -26,7 +26,7 @@ from mereo.synthesis.dataset_files import MANIFEST
 from mereo.synthesis.shards import NOT_COMPARED, generate, make_manifest
 from mereo.training.config import TrainConfig
 from mereo.training.trainer import train
-from mereo.visualization.result_files import evaluate_weights
+from mereo.visualization.evaluation_files import evaluate_weights
 
 NETWORK: AnswerMethod = "network"
 """The paper's experiments are about networks: no registered model answers in their place."""

@@ -14,7 +14,8 @@ from mereo.experiments.speed.baseline import Rival
 from mereo.experiments.speed.roofline import Machine, Work, count_operations, seconds
 from mereo.geometry.normalizer import Normalizer
 from mereo.models.cuda_graphs import StaticFrames
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud
 from mereo.reconstruction.coarse_to_fine import changing_cells, over_corners, sample_coarse_to_fine, sample_dense
 from mereo.reconstruction.isosurfaces import extract, extract_whole, locate
 from mereo.reconstruction.pipeline import SEARCH_BOX

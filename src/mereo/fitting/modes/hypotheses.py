@@ -50,6 +50,8 @@ def robust_poses(
 def by_network(problem: Problem, count: int) -> list[Posed]:
     """The states of the library that explain the correspondences best, posed on them."""
     network, library = problem.network, problem.model.library
+    if len(network.target) == 0:
+        return []
     few = np.arange(0, len(network.target), max(1, len(network.target) // RANKED_BY))
     library = library[:: max(1, len(library) // SEARCHED)]
     motion = library @ network.modes[few].reshape(-1, library.shape[1]).T

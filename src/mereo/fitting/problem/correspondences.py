@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.statistical_model import StatisticalModel
 
 SIGHT_LINES = 256
@@ -91,7 +91,7 @@ def nothing() -> Correspondences:
 
 
 def find_correspondences(
-    model: Model, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
+    model: Trained, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
 ) -> Correspondences | None:
     """Correspondences: all that the network says about observed points and the lines of sight behind them.
 

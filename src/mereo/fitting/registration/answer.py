@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from mereo.fitting.config import FoundBy
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
 from mereo.fitting.registration.register import Registrar
@@ -17,7 +18,7 @@ from mereo.fitting.registration.surfaces import registered_reconstruction
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.progress import stage
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, encode_frame, extract
 from mereo.reconstruction.strays import Reading
@@ -31,16 +32,23 @@ class Candidate:
         encoded: these points, and what the network made of them.
         modes: the fit; None where none was wanted or none was found.
         error: why none was found.
+        found_by: who found the object there.
     """
 
     encoded: EncodedFrame
     modes: ModesFit | None = None
     error: ValueError | None = None
+    found_by: FoundBy = "network"
 
     @property
     def hypothesis(self) -> Reading:
         """Which of the points are taken for the object's."""
         return self.encoded.reading
+
+    @cached_property
+    def is_accepted(self) -> bool:
+        """Whether the fit explains the frame."""
+        return self.modes is not None and self.modes.registration().accepted
 
     @cached_property
     def off_surface(self) -> Float[np.ndarray, " n"]:
@@ -65,7 +73,7 @@ class Answer:
 
     Attributes:
         seen: the object in the frame: the points that the answer takes for its own, in the frame's axes and unit.
-        model: the weights.
+        model: the weights; None of an object without.
         registrar: of the object's deformation model; None where the network alone answers.
         hypothesis: all points that were given, and which of them ``seen`` has.
         T_camera_input: from the frame's axes to the camera frame.
@@ -77,10 +85,11 @@ class Answer:
         resolution: cells along the longest side of the object's box in ``reconstruction``.
         label_points: whether ``reconstruction`` also says on which segment each observed point lies.
         seconds: that it took, without ``reconstruction``.
+        found_by: who found the object; of a tracked answer, when it began to be followed.
     """
 
     seen: Observation
-    model: Model
+    model: Trained | None
     registrar: Registrar | None
     hypothesis: Reading
     T_camera_input: Float[np.ndarray, "4 4"]
@@ -92,6 +101,7 @@ class Answer:
     resolution: int = 128
     label_points: bool = False
     seconds: float = 0.0
+    found_by: FoundBy = "network"
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.seen.frame.source!r}: {self.source})"
@@ -137,7 +147,7 @@ class Answer:
                 return registered_reconstruction(
                     self.encoded, self.registration, self.model, self.resolution, self.label_points
                 )
-            assert self.likelier is not None
+            assert self.likelier is not None and self.model is not None  # else the registration is taken
             return extract(self.likelier, self.model, self.resolution, self.label_points)
 
     @cached_property
@@ -147,7 +157,7 @@ class Answer:
 
     @property
     def encoded(self) -> EncodedFrame:
-        """Observed points of the registered model, and what the network makes of them; a tracked answer asks it now."""
-        if self.candidate is not None:
+        """Observed points of the registered model, and what the network makes of them; asked now where it was not."""
+        if self.candidate is not None and (self.model is None or self.candidate.encoded.code is not None):
             return self.candidate.encoded
         return encode_frame(self.hypothesis, self.model, self.seen.frame.axes)

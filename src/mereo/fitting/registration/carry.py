@@ -199,13 +199,12 @@ def local_rotations(
 
 
 def _source_frame(registrar: Registrar) -> SourceFrame:
-    scene = str(registrar.network.provenance.get("scene"))
-    found = with_frame(registrar.model, scene).source_frame
+    found = with_frame(registrar.model, registrar.trained_scene).source_frame
     if found is None and registrar.given is not None:
         found = registrar.given.source_frame
     if found is None:
         raise ValueError(
-            f"the weights of {', '.join(registrar.network.names)} do not say how the object's own files lie in the "
+            f"the weights of {', '.join(registrar.model.rest.names)} do not say how the object's own files lie in the "
             "scene, as they are from before that was kept: name the object's scene file with --scene, or carry files "
             "in scene units with --carry-frame scene"
         )

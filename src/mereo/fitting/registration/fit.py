@@ -31,7 +31,7 @@ from mereo.fitting.uncertainty.optimum import DrawsOptimum, ModesOptimum, Optimu
 from mereo.geometry.camera import PointCloud
 from mereo.io.cores import one_blas_thread
 from mereo.models.calibration import Calibration
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.statistical_model import StatisticalModel
 
 
@@ -219,7 +219,7 @@ def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: Judged 
 
 def fit_frame(
     cloud: PointCloud,
-    network: Model,
+    network: Trained,
     model: StatisticalModel,
     scene_unit: float | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
@@ -260,7 +260,7 @@ def fit_frame(
     return replace(fitted, seconds=fitted.seconds + asked, calibration=network.calibration)
 
 
-def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
+def _asked(network: Trained, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
     """Correspondences that the network states for a cloud, evenly."""
     found = find_correspondences(network, code, model.rest_center, model.half)
     if found is None:
@@ -272,7 +272,7 @@ def _asked(network: Model, model: StatisticalModel, code: EncodedCloud) -> Corre
 
 def fit(
     cloud: PointCloud,
-    network: Model,
+    network: Trained,
     model: StatisticalModel,
     scene_unit: float | None = None,
     states: DrawnStates | None = None,

@@ -18,7 +18,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.brief import listed
 from mereo.geometry.camera import PointCloud
 from mereo.io.progress import stage
-from mereo.models.model import EncodedCloud, Model
+from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.random_states import built_in_model
 from mereo.scenes.registry import load_scene
@@ -38,22 +38,23 @@ class Registrar:
     """Registers one object's deformation model to frames.
 
     Attributes:
-        network: the weights, from whose correspondences a fit starts.
+        network: the weights, from whose correspondences a fit starts; None of an object without, which is searched.
         model: statistical model of the same object.
         method: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
-            misfit; "auto" does the same where the scene is at hand, and else fits the modes.
+            misfit; "auto" does the same where the scene is at hand, and else, and without a network, fits the modes;
+            "search" fits the modes and does not ask the network.
         given: the object's scene, where it is not the built-in one that the weights were trained on.
         config: constants of the fit of the modes.
     """
 
-    network: Model
+    network: Trained | None
     model: StatisticalModel
     method: AnswerMethod = "auto"
     given: Scene | None = None
     config: FitConfig = FitConfig()  # noqa: RUF009 (frozen)
 
     @classmethod
-    def of(cls, network: Model, method: AnswerMethod = "auto", scene: Scene | str | None = None) -> "Registrar":
+    def of(cls, network: Trained, method: AnswerMethod = "auto", scene: Scene | str | None = None) -> "Registrar":
         """Registrar of the model that the weights carry, or of that of their built-in scene, which takes seconds.
 
         Args:
@@ -65,13 +66,28 @@ class Registrar:
         ``method`` is "full" without a scene or with one of another object.
         """
         given = load_scene(scene) if isinstance(scene, str) else scene
-        result = cls(network, statistical_model_of(network), method, given)
-        if method == "full" and result.scene is None:
+        return cls(network, statistical_model_of(network), method, given).checked()
+
+    def checked(self) -> "Registrar":
+        """Itself; raises ``ValueError`` where ``method`` is "full" without a scene or with one of another object."""
+        if self.method == "full" and self.scene is None:
             raise ValueError(
-                f"the weights were trained on {network.provenance.get('scene')!r}, which is no built-in scene; the fit "
+                f"the weights were trained on {self.trained_scene!r}, which is no built-in scene; the fit "
                 "of a scene's draws plays it: name its file with --scene, or use --method modes"
             )
-        return result
+        return self
+
+    @property
+    def trained_scene(self) -> str:
+        """Name of the scene that the weights were trained on, or else of the object's own; "" where there is none."""
+        if self.network is not None:
+            return str(self.network.provenance.get("scene"))
+        return "" if self.given is None else self.given.name
+
+    @property
+    def asks_network(self) -> bool:
+        """Whether a fit starts from the network's correspondences, and not by a search."""
+        return self.network is not None and self.method != "search"
 
     @cached_property
     def scene(self) -> Scene | None:
@@ -81,7 +97,7 @@ class Registrar:
         trained on has other meshes since. Raises ``ValueError`` for such a scene with other choices and for a given
         scene of another object, and ``AssetUnavailable`` where its mesh cannot be had.
         """
-        name = str(self.network.provenance.get("scene"))
+        name = self.trained_scene
         scene = self.given if self.given is not None else load_scene(name) if name in SCENES else None
         fault = None if scene is None else other_mesh(scene, self.model)
         if scene is None or fault is None:
@@ -103,6 +119,17 @@ class Registrar:
             return None if self.scene is None else DrawnStates.of(self.scene, self.model)
 
     @property
+    def asks_search(self) -> bool:
+        """Whether a search is asked too where the network's fit does not explain the frame: seconds a frame."""
+        is_one = self.network is not None and self.network.names == self.model.rest.names
+        return self.method == "auto" and self.config.turned and is_one
+
+    @property
+    def fits_draws(self) -> bool:
+        """Whether the scene's draws are fitted too, for which its states are simulated once, in seconds."""
+        return self.method == "full" or (self.method == "auto" and self.network is not None)
+
+    @property
     def at_once(self) -> "Registrar":
         """The same without the patience to ask about a frame again with the camera turned."""
         return replace(self, config=replace(self.config, turned=False))
@@ -112,7 +139,7 @@ class Registrar:
         """The same, which asks about a frame with the camera turned however noisy it may be."""
         return replace(self, config=replace(self.config, turned_anyway=True))
 
-    def asking(self, network: Model) -> "Registrar":
+    def asking(self, network: Trained | None) -> "Registrar":
         """The same, asking the same weights on another device; scene and states that are known stay so."""
         if network is self.network:
             return self
@@ -141,7 +168,8 @@ class Registrar:
         is_certain: bool = True,
         doubtful: Float[np.ndarray, "d 3"] | None = None,
     ) -> ModesFit:
-        """Fit of the modes, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
+        """Fit of the modes from the network, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
+        assert self.network is not None
         return fit_frame(seen, self.network, self.model, scene_unit, self.config, code, is_certain, doubtful)
 
     def register(
@@ -166,17 +194,17 @@ class Registrar:
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer from a fit of the modes: the draws too where ``method`` asks for them.
 
-        With "auto" not where the modes do not explain the frame: the draws, which begin there and take longest on such
-        frames, did not explain one of them either (experiments, entry 62), and the network answers.
+        With "auto" not where the modes do not explain the frame: the draws, which begin there and take longest
+        on such frames, did not explain one of them either (experiments, entry 62), and the network answers.
         """
         modes = fitted.registration()
         hopeless = self.method == "auto" and not modes.accepted
-        states = None if self.method == "modes" or hopeless or not fitted.asks_draws else self.at_hand
+        states = None if not self.fits_draws or hopeless or not fitted.asks_draws else self.at_hand
         return modes if states is None else fitted.with_draws(states)
 
     def takes(self, registration: Registration) -> bool:
-        """Whether a registration is the answer: with "auto" one that explains its frame, with other choices any."""
-        return registration.accepted or self.method != "auto"
+        """Whether a registration is the answer: one that explains its frame; any where nobody else can answer."""
+        return registration.accepted or self.method != "auto" or self.network is None
 
     @cached_property
     def at_hand(self) -> DrawnStates | None:
@@ -189,7 +217,7 @@ class Registrar:
             raise
 
 
-def registrar_for(model: Model, method: AnswerMethod, scene: Scene | str | None = None) -> Registrar | None:
+def registrar_for(model: Trained, method: AnswerMethod, scene: Scene | str | None = None) -> Registrar | None:
     """Registrar for a method; None where the network alone answers: "auto" needs weights that carry a model."""
     if method == "network" or (method == "auto" and model.statistical_model is None):
         return None
@@ -218,7 +246,7 @@ def other_mesh(scene: Scene, model: StatisticalModel) -> str | None:
     return None
 
 
-def statistical_model_of(model: Model) -> StatisticalModel:
+def statistical_model_of(model: Trained) -> StatisticalModel:
     """Statistical model that the weights carry; older ones get that of their built-in scene, which takes seconds."""
     found = model.statistical_model or built_in_model(str(model.provenance.get("scene")), model.names)
     if found is None:

@@ -113,12 +113,12 @@ def write_state(directory: Path, answer: Answer) -> None:
     registrar = answer.registrar
     if registrar is None or answer.registration is None or not answer.taken:
         return
-    known = registrar.given.name if registrar.given is not None else str(registrar.network.provenance.get("scene"))
+    known = registrar.given.name if registrar.given is not None else registrar.trained_scene
     scene = registrar.scene if answer.registration.method == "draws" else None
     state = state_of(
         answer.registration,
         known if scene is None else scene,
-        weights=answer.model.name,
+        weights="" if answer.model is None else answer.model.name,
         frame=answer.seen.frame.axes,
         unit_m=answer.seen.frame.unit_m,
         T_camera_input=answer.T_camera_input,

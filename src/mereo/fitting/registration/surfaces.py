@@ -10,18 +10,23 @@ from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.reconstruction.isosurfaces import Extraction
 from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, timed, turned_back
 from mereo.reconstruction.segment_statistics import measure, segment_points
 
 
 def registered_reconstruction(
-    seen: EncodedFrame, registration: Registration, model: Model, resolution: int = 128, label_points: bool = False
+    seen: EncodedFrame,
+    registration: Registration,
+    model: Trained | None,
+    resolution: int = 128,
+    label_points: bool = False,
 ) -> Reconstruction:
     """Reconstruction that is the registered model itself, in the input's frame.
 
-    Confidence stays the network's: its mean probability of a segment over the voxels that the registration gives it.
+    Confidence stays the network's: its mean probability of a segment over the voxels that the registration gives it;
+    NaN without a network.
     """
     seconds = {**seen.timings_s, "fit": registration.seconds}
     mesh = registration.mesh
@@ -45,15 +50,18 @@ def registered_reconstruction(
         T_camera_input=seen.T_camera_input,
         reading=seen.reading,
         observed=observed,
-        calibrated=model.calibrates,
+        calibrated=model is not None and model.calibrates,
     )
     return result if seen.axes == "camera" else turned_back(result)
 
 
-def _observed(seen: EncodedFrame, registration: Registration, model: Model) -> SegmentedCloud:
-    """Segment of each observed point by the registration, with the network's probabilities of it."""
+def _observed(seen: EncodedFrame, registration: Registration, model: Trained | None) -> SegmentedCloud:
+    """Segment of each observed point by the registration, with a network's probabilities of it, or NaN."""
     points = seen.seen.points
     labels = nearest_labels(registration.solids, points)
+    if model is None or seen.code is None:
+        rest, unknown = registration.mesh, np.full(len(points), np.nan)
+        return SegmentedCloud(seen.points, labels, unknown, unknown, rest.names, rest.colors)
     logits = model.logits(seen.code, points)
     return segment_points(logits, seen.points, model.names, model.colors, model.calibration, labels)
 

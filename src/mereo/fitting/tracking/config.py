@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-StreamMethod = Literal["auto", "network", "modes"]
+StreamMethod = Literal["auto", "network", "search", "modes"]
 """Source of the answers to a sequence, as ``AnswerMethod``; draws take longer than the time between two frames."""
 
 MotionModel = Literal["pose", "velocity"]

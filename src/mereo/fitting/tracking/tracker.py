@@ -1,4 +1,4 @@
-"""An object followed from frame to frame: each fit starts where the last one ended, and asks the network when lost.
+"""An object followed from frame to frame: each fit starts where the last ended, and asks network or search when lost.
 
     Observation, time -Tracker.follow-> Answer (tracked from the last state, or of the frame by itself)
 
@@ -12,9 +12,9 @@ from functools import cached_property
 
 import numpy as np
 
-from mereo.fitting.config import FitConfig
+from mereo.fitting.config import FitConfig, FoundBy
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.answer_frame import answer_of, fit_hypotheses, in_found_unit
+from mereo.fitting.registration.answer_frame import answer_of, find, in_found_unit
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import Registrar
@@ -48,6 +48,7 @@ class Tracker:
         self._track: Track | None = None
         self._T_camera_input, self._axes = np.eye(4), "camera"
         self._best = 0.0
+        self._found_by: FoundBy = "network"
 
     def follow(
         self, seen: Observation, time_s: float, *, scene_unit: float | None = None, keep_all: bool = False
@@ -67,8 +68,9 @@ class Tracker:
         tracked = self._tracked(seen, time_s, keep_all)
         if tracked is not None and self._believed(tracked):
             return self._gone_on(seen, tracked, started)
-        found, likelier = fit_hypotheses(seen, self.registrar.network, self.registrar, keep_all, scene_unit)
-        if found.modes is None and tracked is None and self.registrar.method != "auto":
+        found, likelier = find(seen, self.registrar.network, self.registrar, keep_all, scene_unit)
+        must_register = self.registrar.method != "auto" or self.registrar.network is None
+        if found.modes is None and tracked is None and must_register:
             assert found.error is not None
             raise found.error
         own = None if found.modes is None else _Tracked.of_frame(found, time_s, self.config, self.registrar.config)
@@ -93,7 +95,9 @@ class Tracker:
         return _Tracked(fitted, after, Reading(seen.cloud, keep))
 
     def _believed(self, tracked: "_Tracked") -> bool:
-        """Whether the network need not be asked."""
+        """Whether the frame need not be fitted by itself."""
+        if not (tracked.registration.accepted or self.registrar.asks_network or self.registrar.method == "modes"):
+            return False  # a search's answer is taken in any case, as nobody else has one
         return self._takes(tracked) and tracked.score >= self._best - self.config.drop
 
     def _takes(self, candidate: "_Tracked") -> bool:
@@ -105,7 +109,8 @@ class Tracker:
         self._best = tracked.score if restart else max(self._best, tracked.score)
         model = self.registrar.network
         stated = self.registrar.stated_scene_unit(seen.frame.unit_m)
-        recognition = recognize(tracked.registration, model.calibration, stated_scene_unit=stated)
+        calibration = None if model is None else model.calibration
+        recognition = recognize(tracked.registration, calibration, stated_scene_unit=stated)
         seen = in_found_unit(seen, self.registrar, tracked.registration, recognition)
         return Answer(
             seen=seen.read_as(tracked.hypothesis),
@@ -116,6 +121,7 @@ class Tracker:
             registration=tracked.registration,
             taken=True,
             recognition=recognition,
+            found_by=self._found_by,
             seconds=time.perf_counter() - started,
         )
 
@@ -127,7 +133,7 @@ class Tracker:
         answer = answer_of(seen, self.registrar.network, self.registrar, found, likelier, registration)
         self._track = own.track if own is not None and answer.taken else None
         self._T_camera_input, self._axes = found.encoded.T_camera_input, seen.frame.axes
-        self._best = 0.0 if own is None else own.score
+        self._best, self._found_by = 0.0 if own is None else own.score, found.found_by
         return replace(answer, seconds=time.perf_counter() - started)
 
 

@@ -42,10 +42,10 @@ def write_segments_ply(path: str | Path, surfaces: SegmentedMesh, radii: Radii |
 def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
     """Write the observed points with ``label``, its colour, ``confidence`` and ``occupancy``, see ``SegmentedCloud``.
 
-    Positions are float32, in the cloud's frame and unit.
+    The last two are a network's; without one they are left out. Positions are float32, in the cloud's frame and unit.
     """
     colors = np.array(cloud.colors, dtype=np.uint8)[cloud.labels - 1]
-    sure = {"confidence": ("f4", cloud.confidence), "occupancy": ("f4", cloud.occupancy)}
+    sure = {name: ("f4", values) for name, values in cloud.chances.items()}
     vertices = _records(_positions(cloud.points) | _colors(colors) | _label(cloud.labels) | sure)
     _write(path, comment_lines(cloud.names, cloud.colors), {"vertex": vertices})
 

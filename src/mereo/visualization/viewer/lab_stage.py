@@ -168,7 +168,7 @@ class LabStage:
         if mode == "error":
             values, scale = surface_error(surfaces, Solids(view.mesh)), error_scale(view.mesh, "")
         elif mode == "confidence":
-            assert self.laboratory.model is not None
+            assert self.laboratory.model is not None and trial.reconstruction.code is not None
             values, scale = (
                 confidence(surfaces, partial(self.laboratory.model.query, trial.reconstruction.code)),
                 CONFIDENCE,

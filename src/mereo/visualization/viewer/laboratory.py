@@ -26,7 +26,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.transforms import inverse_rigid
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction, segment_names
 from mereo.scenes.scene import Scene
@@ -85,6 +85,11 @@ class Trial:
 class QuickRegistrar(Registrar):
     """Registrar for frames that change while they are looked at: it fits the modes alone."""
 
+    @property
+    def asks_search(self) -> bool:
+        """Whether a search is asked too; it takes seconds."""
+        return False
+
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer of the modes."""
         return fitted.registration()
@@ -103,7 +108,7 @@ class Laboratory:
     """
 
     scene: Scene
-    model: Model | None
+    model: Trained | None
     shapes: Freedom[Any] | None = None
 
     def __post_init__(self) -> None:
@@ -185,6 +190,7 @@ class Laboratory:
         if answer.taken:
             predicted = label_grid(reconstruction.surfaces, *truth.grid.axes())
         else:
+            assert reconstruction.code is not None
             predicted = predict_grid(self.model, reconstruction.code, truth)
         confusion = grid_confusion(truth, predicted, len(segment_names(self.model)[0]))
         scores = intersection_over_union(confusion, self.model.segmented)

@@ -14,7 +14,7 @@ from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
-from mereo.models.model import Answer, EncodedCloud, Model
+from mereo.models.trained import Answer, EncodedCloud, Trained
 
 ON_SURFACE = 1e-6
 """Distance, as a share of a place's coordinates, that is none: a click meets the surface up to rounding."""
@@ -49,7 +49,7 @@ class Inspection:
     Attributes:
         surfaces: all segments, in the input's frame.
         T_camera_input: from the input's frame to the camera frame.
-        model: the weights.
+        model: the weights; None of an object without.
         source: where the answer comes from, in a phrase.
         cloud: the object's points, in the input's frame; None for a state without its frame.
         code: what the weights made of the cloud, camera frame.
@@ -59,7 +59,7 @@ class Inspection:
 
     surfaces: SegmentedMesh
     T_camera_input: Float[np.ndarray, "4 4"]
-    model: Model
+    model: Trained | None
     source: str
     cloud: PointCloud | None = None
     code: EncodedCloud | None = None
@@ -84,7 +84,7 @@ class Inspection:
     def of_registration(
         cls,
         registration: Registration,
-        model: Model,
+        model: Trained | None,
         T_camera_input: Float[np.ndarray, "4 4"],
         cloud: PointCloud | None = None,
     ) -> "Inspection":
@@ -94,9 +94,9 @@ class Inspection:
             surfaces=registration.mesh.transformed(inverse_rigid(T_camera_input)),
             T_camera_input=T_camera_input,
             model=model,
-            source=explained(registration, recognize(registration, model.calibration)),
+            source=explained(registration, recognize(registration, None if model is None else model.calibration)),
             cloud=cloud,
-            code=None if seen is None else model.encode(seen),
+            code=None if seen is None or model is None else model.encode(seen),
             registration=registration,
         )
 
@@ -112,7 +112,7 @@ class Inspection:
 
     def network(self, points: Float[np.ndarray, "n 3"]) -> Answer:
         """Answers of the network at points of the input's frame, in that frame; ``ValueError`` without a frame."""
-        if self.code is None:
+        if self.code is None or self.model is None:
             raise ValueError("there is no frame that the network has seen; name its depth image or point cloud")
         found = self.model.query(self.code, transform_points(self.T_camera_input, points))
         return Answer(found.label, found.probability, found.distance, self._turned(found.direction))

@@ -21,7 +21,8 @@ def open_answer(answer: Answer, *, port: int, host: str) -> OpenPage:
     inspection = Inspection.of_answer(answer)
     entry = Entry.of(host)
     server = start_server(port, tab_title(seen.frame.source), entry)
-    facts = f"{len(seen.cloud):,} points · weights {answer.model.name or 'of this program'}"
+    made_with = "no weights" if answer.model is None else f"weights {answer.model.name or 'of this program'}"
+    facts = f"{len(seen.cloud):,} points · {made_with}"
     unit = Unit(seen.frame.unit_m)
     FramePage(server, inspection, seen.frame.source, facts, unit, DepthPicture.of(seen.frame.depth, unit))
     return OpenPage(server, entry)

@@ -16,7 +16,7 @@ from mereo.fitting.registration.register import registrar_for
 from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.config import InferenceConfig
-from mereo.models.weights import load_for, shipped_names
+from mereo.models.weights_place import load_weights, shipped_names
 from mereo.reconstruction.observation import observe
 from mereo.synthesis.recording import Recording
 from mereo.visualization.viewer import html
@@ -60,7 +60,7 @@ def view_recording(
 
 def following(recording: Recording, weights: str, inference: InferenceConfig) -> Answer | None:
     """Answers of a tracker, to be asked for in the order of the frames; None for weights without a model."""
-    model = load_for(weights, inference)
+    model = load_weights(weights, inference)
     if model.names != tuple(one.name for one in recording.index.segments):
         raise ValueError(
             f"the weights {weights} know the segments {', '.join(model.names)}, and the recording has others: name the "

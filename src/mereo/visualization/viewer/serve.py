@@ -18,8 +18,8 @@ from mereo.io.glb_scene import is_glb
 from mereo.io.progress import shown_stages
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
-from mereo.models.model import Model
-from mereo.models.weights import find_weights, load_for, shipped_names
+from mereo.models.trained import Trained
+from mereo.models.weights_place import find_weights, load_weights, shipped_names
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.registry import load_scene
@@ -32,8 +32,6 @@ from mereo.visualization.viewer.frame_page import FramePage
 from mereo.visualization.viewer.freedom import DrawnShapes, Freedom, ModeShapes
 from mereo.visualization.viewer.guard import LOOPBACK, Entry
 from mereo.visualization.viewer.kept_result import KeptResult, is_kept
-from mereo.visualization.viewer.lab_page import LabPage
-from mereo.visualization.viewer.laboratory import Laboratory
 from mereo.visualization.viewer.mesh_page import view_glb, view_kept
 from mereo.visualization.viewer.open_page import OpenPage, is_interactive
 from mereo.visualization.viewer.panels import DepthPicture
@@ -131,7 +129,7 @@ def view_frame(
         )
     else:
         frame = read_frame(input, reading or InputConfig())
-    model = load_for(weights, inference or InferenceConfig())
+    model = load_weights(weights, inference or InferenceConfig())
     isolation = isolation or IsolationConfig()
     seen = find_object(frame, isolation)
     registrar = registrar_for(model, "auto")
@@ -163,7 +161,7 @@ def view_state(
             "before"
         )
     weights = weights_of(state, weights)
-    model = load_for(weights, inference or InferenceConfig())
+    model = load_weights(weights, inference or InferenceConfig())
     plays = state.draws is not None and state.scene not in SCENES
     registration = restored(state, statistical_model_of(model), scene_of_result(path) if plays else None)
     cloud = None if seen is None else seen.cloud
@@ -199,11 +197,14 @@ def view_scene(
     Without ``weights`` it takes those of the state, or the shipped ones where there are any.
     """
     import_viser()
+    from mereo.visualization.viewer.lab_page import LabPage  # these score, for which they load torch
+    from mereo.visualization.viewer.laboratory import Laboratory
+
     scene = load_scene(name)
     chosen = None if state is None else read_state(state)
     known = weights_of(chosen, weights) if chosen is not None else weights
     known = known or (scene.name if scene.name in shipped_names() else None)
-    model = None if known is None else load_for(known, inference or InferenceConfig())
+    model = None if known is None else load_weights(known, inference or InferenceConfig())
     laboratory = Laboratory(scene, model, shapes=None if chosen is None else shapes_of(chosen, scene, model))
     facts = f"weights {known}" if known else "no weights: states and depth images only"
     entry = Entry.of(host)
@@ -213,7 +214,7 @@ def view_scene(
     return OpenPage(server, entry, page)
 
 
-def shapes_of(state: RegistrationState, scene: Scene, model: Model | None) -> Freedom[Any]:
+def shapes_of(state: RegistrationState, scene: Scene, model: Trained | None) -> Freedom[Any]:
     """What the sliders of a state move: the scene's draws, or the modes of the weights' statistical model.
 
     Raises ``ValueError`` as ``played_state`` does, and for the modes of other weights.

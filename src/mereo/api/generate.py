@@ -1,0 +1,66 @@
+"""The first step from an object to weights, as a function: labelled examples, for which no torch is needed.
+
+scene -generate-> dataset
+"""
+
+import os
+from pathlib import Path
+
+from mereo.api.words import python_words
+from mereo.io.object_storage import ObjectPath, Place, place_of
+from mereo.scenes.scene import Scene
+from mereo.synthesis import shards
+from mereo.synthesis.config import GenerateConfig
+from mereo.workers.cluster import joined_first
+from mereo.workers.config import cluster_of
+
+
+def generate(
+    scene: str | Path | Scene,
+    output: str | Path | ObjectPath,
+    settings: GenerateConfig | None = None,
+    *,
+    examples: int,
+    seed: int = 0,
+    workers: int = 1,
+    shard: tuple[int, int] = (0, 1),
+    resume: bool = False,
+    test: bool = False,
+    ray: str | None = None,
+) -> Place:
+    """Labelled examples of a scene in a folder, which is returned: `mereo generate`.
+
+    Args:
+        scene: a built-in scene's name, a scene file, or a scene.
+        output: folder to create; a text may be its URL in an object storage, s3://BUCKET/FOLDER or gs://BUCKET/FOLDER.
+        settings: how one example is made; ``SENSORS`` of ``mereo.synthesis.config`` has those of depth cameras.
+        examples: how many.
+        seed: example i comes from (seed, i) alone; seeds from 1,000,000 up are for testing.
+        workers: processes, on which the examples do not depend; 0 means one per core. More than one needs a main module
+            that can be imported (``if __name__ == "__main__":``).
+        shard: part i of n, as (i, n), to share the work between machines.
+        resume: go on with what is there.
+        test: allow a test seed.
+        ray: make them in tasks of a Ray cluster: "local", one of so many workers for this call; "auto" or "HOST:PORT",
+            the one that this machine is a node of.
+
+    Raises as ``synthesis.shards.generate`` does.
+    """
+    made = str(scene) if isinstance(scene, Path) else scene
+    place = place_of(output)
+    processes = workers or os.cpu_count() or 1
+    cluster = cluster_of(ray, processes)
+    with python_words(), joined_first(cluster):
+        shards.generate(
+            made,
+            place,
+            settings or GenerateConfig(),
+            examples=examples,
+            seed=seed,
+            workers=processes,
+            shard=shard,
+            resume=resume,
+            test=test,
+            cluster=cluster,
+        )
+    return place

@@ -1,0 +1,34 @@
+"""The extra `network`: what torch is needed for, said in one sentence where it is not installed."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+
+NEEDED = (
+    "PyTorch is not installed; networks and their training need the extra `network`: run pip install 'mereo[network]', "
+    "or leave the weights out, as an object's meshes or its scene are enough to find it"
+)
+
+
+@contextmanager
+def network_needed() -> Iterator[None]:
+    """Turn the lack of torch in the block into a sentence that names the extra."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if not is_torch(error):
+            raise
+        raise ImportError(NEEDED) from None
+
+
+def has_network() -> bool:
+    """Whether torch is installed."""
+    try:
+        return find_spec("torch") is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def is_torch(error: BaseException) -> bool:
+    """Whether an error says that torch is not installed."""
+    return isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "torch"

@@ -1,0 +1,158 @@
+"""A trained network as whoever asks it sees it: without torch, which only the asked one needs.
+
+cloud -Trained.encode-> EncodedCloud -query, logits, correspond-> what the network says at points
+
+``models.model.Model`` is the one that there is. An object without weights has none, and nothing here is loaded for it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mereo.geometry.brief import counted
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.mesh import Color
+from mereo.geometry.normalizer import Normalizer
+from mereo.models.calibration import Calibration
+from mereo.scenes.statistical_model import StatisticalModel
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedCloud:
+    """Observed cloud, encoded and ready to be queried.
+
+    Attributes:
+        code: the network's side, tensors.
+        normalizer: between the user's frame and the network's.
+        cloud: the points the network saw, in the user's frame and units.
+    """
+
+    code: Any
+    normalizer: Normalizer
+    cloud: Float[np.ndarray, "n 3"]
+
+    def __repr__(self) -> str:
+        return f"EncodedCloud({counted(len(self.cloud), 'point')})"
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Answers of a model at points, in the user's frame and units.
+
+    Attributes:
+        label: 0 for empty space, i + 1 for the model's segment i.
+        probability: of empty space and each segment; rows sum to one. Calibrated where ``Model.calibrates``: another
+            class than the label, which is decided without that, may then have a greater one.
+        distance: to the nearest segment surface, negative inside; NaN from a model that was not trained on distances.
+        direction: unit vector towards it; NaN from a model that was not trained on directions.
+    """
+
+    label: UInt8[np.ndarray, " n"]
+    probability: Float[np.ndarray, "n c"]
+    distance: Float[np.ndarray, " n"]
+    direction: Float[np.ndarray, "n 3"]
+
+    def __repr__(self) -> str:
+        return f"Answer({counted(len(self.label), 'point')}, {int((self.label > 0).sum()):,} in a segment)"
+
+
+@runtime_checkable
+class Trained(Protocol):
+    """Trained network: what may be known of it, and asked. ``Model`` says what each attribute is."""
+
+    @property
+    def name(self) -> str:
+        """How the weights were named when they were loaded."""
+        ...
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the segments."""
+        ...
+
+    @property
+    def colors(self) -> tuple[Color, ...]:
+        """Colours of the segments."""
+        ...
+
+    @property
+    def nested(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of names (inner, outer)."""
+        ...
+
+    @property
+    def segmented(self) -> bool:
+        """Whether it tells segments apart."""
+        ...
+
+    @property
+    def provenance(self) -> Mapping[str, object]:
+        """How it was trained."""
+        ...
+
+    @property
+    def statistical_model(self) -> StatisticalModel | None:
+        """Statistical model of the object's states; older weights have none."""
+        ...
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """How far its answers can be trusted; None where that was not measured."""
+        ...
+
+    @property
+    def calibrates(self) -> bool:
+        """Whether its probabilities are calibrated."""
+        ...
+
+    @property
+    def device_type(self) -> str:
+        """Kind of the device that it computes on."""
+        ...
+
+    @property
+    def working_precision(self) -> str:
+        """Name of the type of its products."""
+        ...
+
+    def encode(self, cloud: PointCloud) -> EncodedCloud:
+        """Encoded cloud of points in a camera frame; ``ValueError`` for unusable ones."""
+        ...
+
+    def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
+        """Segment, probabilities, signed distance and direction at each point."""
+        ...
+
+    def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+        """Class logits at each point."""
+        ...
+
+    def correspond(
+        self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n c"], Float[np.ndarray, "n 3"]] | None:
+        """Class probabilities and rest coordinates of points; None from a network without them."""
+        ...
+
+
+def check_enough(count: int, said: str) -> None:
+    """Raise ``ValueError``, beginning with ``said``, where a reconstruction needs more points than ``count``."""
+    if count < MIN_POINTS:
+        raise ValueError(
+            f"{said}; a reconstruction needs at least {MIN_POINTS}: move closer, or check the mask and the depth range"
+        )
+
+
+def checked_points(cloud: PointCloud) -> Float[np.ndarray, "n 3"]:
+    """Points of a cloud as float64, or ``ValueError`` with one sentence on why they cannot be used."""
+    points = np.asarray(cloud.points, dtype=np.float64)
+    check_enough(len(points), f"the cloud has {len(points)} points")
+    if (points[:, 2] <= 0).any():
+        raise ValueError(
+            f"{int((points[:, 2] <= 0).sum())} of {len(points)} points have z <= 0, behind the camera; the cloud must "
+            "be in a camera frame (x right, y down, z forward): turn it, or pass --frame scanner for y-up scans"
+        )
+    return points

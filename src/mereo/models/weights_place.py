@@ -1,0 +1,71 @@
+"""Where weights are, and loading them only then: what names them needs no torch, what loads them does."""
+
+import json
+from pathlib import Path
+
+from safetensors import safe_open
+
+from mereo.io.extras import network_needed
+from mereo.models.config import InferenceConfig
+from mereo.models.trained import Trained
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.statistical_model_file import unpack_model
+
+SHIPPED = Path(__file__).parents[1] / "weights"
+
+STATES = "states."
+"""Beginning of the names of a statistical model's tensors."""
+
+WEIGHTS = "weights.safetensors"
+"""File of weights in a folder of `mereo train` or `mereo learn`."""
+
+
+def shipped_names() -> tuple[str, ...]:
+    """Names that ``load_model`` knows without a path."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
+
+
+def find_weights(name: str | Path) -> Path:
+    """Path of weights that are given by a shipped name, as an existing file, or as the folder that holds them."""
+    path = Path(name)
+    shipped = SHIPPED / f"{name}.safetensors"
+    if path.suffix == "" and not path.is_file() and shipped.is_file():
+        return shipped
+    if (path / WEIGHTS).is_file():
+        return path / WEIGHTS
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"there are no weights {str(name)!r}; give a .safetensors file from mereo train or one of the shipped "
+            f"names: {', '.join(shipped_names()) or 'none'}"
+        )
+    return path
+
+
+def is_weights(name: str | Path) -> bool:
+    """Whether a name is that of weights: a shipped one, a .safetensors file, or a folder that holds one."""
+    try:
+        return find_weights(name).suffix == ".safetensors"
+    except FileNotFoundError:
+        return Path(name).suffix == ".safetensors"  # a file that is missing is told as such where it is loaded
+
+
+def load_weights(given: Trained | str | Path, inference: InferenceConfig) -> Trained:
+    """Weights by their name or file, on the device and in the precision that are asked for; loaded ones as they are.
+
+    Raises as ``weights.load_model`` does, and ``ImportError`` without the extra `network`.
+    """
+    if isinstance(given, Trained):
+        return given
+    with network_needed():
+        from mereo.models.weights import load_for
+    return load_for(given, inference)
+
+
+def statistical_model_in(name: str | Path) -> StatisticalModel:
+    """Statistical model that weights carry, read without their network; ``ValueError`` where they carry none."""
+    with safe_open(find_weights(name), framework="numpy") as file:
+        tensors = {key.removeprefix(STATES): file.get_tensor(key) for key in file.keys() if key.startswith(STATES)}  # noqa: SIM118 (no mapping)
+        header = json.loads((file.metadata() or {})["mereo"])
+    if not tensors:
+        raise ValueError(f"the weights {str(name)!r} carry no statistical model: take newer ones")
+    return unpack_model(tensors, header["states"])

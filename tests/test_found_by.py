@@ -1,0 +1,102 @@
+"""Who finds the object: the network at once where it can, a search where the network's fit explains too little."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from answers import answer_to
+
+from mereo.evaluation.sample_views import load_view
+from mereo.fitting.problem import correspondences
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import misfit_in, more_evident
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.search_modes import search_modes
+from mereo.geometry.camera import PointCloud
+from mereo.models.model import Model
+from mereo.models.weights import load_model
+
+HYPOTHESES = "mereo.fitting.registration.hypotheses"
+
+
+@pytest.fixture(scope="module")
+def liver() -> Model:
+    return replace(load_model("liver"), provenance={"scene": "mine"})  # whose draws nobody fits
+
+
+@pytest.fixture(scope="module")
+def cloud() -> PointCloud:
+    return load_view("liver").depth.to_points()
+
+
+@pytest.fixture
+def confused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network that takes each place of the object for another one."""
+    honest = correspondences.find_correspondences
+
+    def lying(*given: Any) -> Any:
+        found = honest(*given)
+        assert found is not None
+        return replace(found, rest=np.random.default_rng(0).permutation(found.rest))
+
+    monkeypatch.setattr("mereo.fitting.registration.fit.find_correspondences", lying)
+
+
+def answer(liver: Model, cloud: PointCloud, method: Any = "auto") -> Answer:
+    return answer_to(cloud, liver, Registrar.of(liver, method), 24)
+
+
+def test_a_network_that_understands_is_not_doubted(
+    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"{HYPOTHESES}.search_modes", None)
+    assert answer(liver, cloud).found_by == "network"
+
+
+@pytest.mark.usefixtures("confused", "without_turns")
+def test_a_search_is_asked_too_where_the_network_is_lost(liver: Model, cloud: PointCloud) -> None:
+    found = answer(liver, cloud)
+    assert found.found_by == "search" and found.taken and found.registration is not None
+    assert found.registration.accepted and found.recognition.known is True
+    assert all(0 < segment.confidence <= 1 for segment in found.reconstruction.segments)  # the network's, all the same
+
+
+@pytest.mark.usefixtures("confused", "without_turns")
+@pytest.mark.parametrize("method", ["modes", "network"])
+def test_other_methods_ask_nobody_else(
+    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch, method: Any
+) -> None:
+    monkeypatch.setattr(f"{HYPOTHESES}.search_modes", None)
+    registrar = None if method == "network" else Registrar.of(liver, method)
+    assert answer_to(cloud, liver, registrar, 24).found_by == "network"
+
+
+def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mereo.fitting.registration.fit.find_correspondences", None)
+    found = answer(liver, cloud, "search")
+    assert found.found_by == "search" and found.taken
+
+
+def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(liver: Model, cloud: PointCloud) -> None:
+    model = liver.statistical_model
+    assert model is not None
+    by_network = answer(liver, cloud).candidate
+    assert by_network is not None and by_network.modes is not None
+    right = by_network.modes
+    astray = replace(right, posed=replace(right.posed, translation=right.posed.translation + 3.0))
+    wrong = replace(by_network, modes=astray, found_by="search")
+    assert misfit_in(right, astray) > misfit_in(right, right)
+    assert more_evident(by_network, wrong) is by_network and more_evident(wrong, by_network) is by_network
+    assert more_evident(replace(by_network, modes=None), wrong) is wrong
+    halved = replace(
+        right, unit=2 * right.unit, posed=replace(right.posed, log_scale=right.posed.log_scale - np.log(2.0))
+    )
+    halved = replace(halved, posed=replace(halved.posed, translation=right.posed.translation / 2))
+    assert misfit_in(right, halved) == pytest.approx(misfit_in(right, right), rel=1e-6)
+
+
+def test_a_search_finds_an_unknown_unit(liver: Model, cloud: PointCloud) -> None:
+    assert liver.statistical_model is not None
+    found = search_modes(0.001 * cloud.points, liver.statistical_model).registration()
+    assert found.accepted and found.scene_unit == pytest.approx(0.001, rel=0.05)

@@ -1,0 +1,232 @@
+"""Objects without weights: meshes and a frame are enough, and bad input is one sentence."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from angle import write_angle, write_part
+from scene_files import write_mesh
+from shapes import box
+
+import mereo
+from mereo import __main__ as command_line
+from mereo.cli.object_option import loaded_object
+from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.metrics import intersection_over_union
+from mereo.evaluation.results import grid_confusion, labels_on
+from mereo.io.config import InputConfig
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import ClustersWarning
+from mereo.scenes.kept_model import CACHE_VARIABLE, kept_model
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.serving.answering import Answerer
+from mereo.serving.messages import JSON, FrameRequest, Served, Setup
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
+from mereo.visualization.viewer.open_page import OpenPage
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of an angle of two unequal arms, in millimetres, and what is made of it."""
+    found = tmp_path_factory.mktemp("angle")
+    write_angle(found)
+    return found
+
+
+@pytest.fixture(scope="module")
+def meshes(folder: Path) -> list[str]:
+    return [str(folder / "long.stl"), str(folder / "short.stl")]
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(folder / "cache"))
+
+
+@pytest.fixture(scope="module")
+def angle(folder: Path, meshes: list[str]) -> mereo.Object:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv(CACHE_VARIABLE, str(folder / "cache"))
+        return mereo.load_object(meshes, units="mm")
+
+
+@pytest.fixture(scope="module")
+def scene(angle: mereo.Object) -> Scene:
+    assert angle.scene is not None
+    return angle.scene
+
+
+@pytest.fixture(scope="module")
+def points(scene: Scene, folder: Path) -> np.ndarray:
+    """View of the angle in a random state, in metres; also in ``frame.npy``."""
+    assert scene.unit_m is not None
+    seen = sample_view(scene, GenerateConfig(), example_rng(1000, 2)).depth.to_points().points * scene.unit_m
+    np.save(folder / "frame.npy", seen)
+    return seen
+
+
+@pytest.fixture(scope="module")
+def found(angle: mereo.Object, points: np.ndarray) -> mereo.Result:
+    return mereo.reconstruct(points, angle, resolution=48, label_points=True, unit_m=1.0)
+
+
+def test_meshes_are_found_with_their_hidden_side(found: mereo.Result, scene: Scene) -> None:
+    view = sample_view(scene, GenerateConfig(), example_rng(1000, 2))
+    assert scene.unit_m is not None
+    truth = truth_grid(view.mesh.with_vertices([scene.unit_m * part.vertices for part in view.mesh.segments]), 40)
+    scores = intersection_over_union(grid_confusion(truth, labels_on(found.surfaces, truth.grid), 2))
+    assert scores.iou > 0.9 and scores.miou > 0.85
+    assert found.found_by == "search" and found.taken and found.known is True and found.model is None
+
+
+def test_it_has_names_and_colours_of_the_meshes_and_no_confidence(found: mereo.Result, angle: mereo.Object) -> None:
+    assert found.names == angle.names == ("long", "short")
+    assert angle.network is None and angle.model is not None and found.surfaces.colors == angle.model.rest.colors
+    assert all(np.isnan(segment.confidence) for segment in found) and not found.reconstruction.calibrated
+    assert "confidence" not in repr(found["long"]) and "confidence" not in found._repr_html_()
+
+
+def test_what_is_written_leaves_out_what_nobody_knows(found: mereo.Result, tmp_path: Path) -> None:
+    found.save(tmp_path / "out", formats=["json", "points"])
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert summary["weights"] is None and summary["registration"]["found_by"] == "search"
+    assert [one["confidence"] for one in summary["segments"]] == [None, None] and "device" not in summary
+    assert summary["recognition"]["signs"]["displaced"] is None
+    written = (tmp_path / "out/points.ply").read_bytes()
+    assert b"label" in written and b"confidence" not in written and b"occupancy" not in written
+
+
+def test_the_model_is_made_once_and_read_again(folder: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path,) = (folder / "cache/models").iterdir()
+    first = kept_model(scene)
+    monkeypatch.setattr("mereo.scenes.kept_model.scene_model", None)
+    again = kept_model(scene)
+    np.testing.assert_array_equal(first.modes, again.modes)
+    monkeypatch.undo()
+    monkeypatch.setenv(CACHE_VARIABLE, str(folder / "cache"))
+    path.write_bytes(path.read_bytes()[:100])  # damaged: made anew, with the same bits
+    np.testing.assert_array_equal(kept_model(scene).modes, first.modes)
+
+
+def test_another_mesh_has_another_model(folder: Path, meshes: list[str], tmp_path: Path) -> None:
+    other = write_part(tmp_path, "short", (0, 30, 0), (40, 96, 25))
+    before = len(list((folder / "cache/models").iterdir()))
+    mereo.load_object([meshes[0], other], units="mm")
+    assert len(list((folder / "cache/models").iterdir())) == before + 1
+
+
+def test_a_tracker_begins_with_a_search_and_follows(angle: mereo.Object, points: np.ndarray) -> None:
+    tracker = mereo.Tracker(angle)
+    first, second = (tracker.follow(points, 0.03 * step, unit_m=1.0) for step in range(2))
+    assert (first.tracked, second.tracked) == (False, True)
+    assert first.found_by == second.found_by == "search"
+
+
+def test_what_is_defined_in_the_meshes_is_carried(found: mereo.Result, scene: Scene) -> None:
+    corners = found.carry(scene.rest.merged()[0], files="scene")
+    assert np.abs(corners - found.surfaces.merged()[0]).max() < 0.02 * np.ptp(corners, axis=0).max()
+
+
+def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: np.ndarray) -> None:
+    answerer = Answerer.of(Setup((Served("angle", object=tuple(meshes)),)))
+    (facts,) = answerer.ready().facts
+    assert (facts["scene"], facts["device"], facts["calibrated"]) == ("long", None, False)
+    assert [segment["name"] for segment in facts["segments"]] == ["long", "short"]
+    asked = FrameRequest("angle", folder, "frame.npy", InputConfig(unit_m=1.0), IsolationConfig(), 24, JSON)
+    reply = answerer(asked)
+    assert reply.status == 200 and json.loads(reply.body)["registration"]["found_by"] == "search"
+
+
+def test_its_page_opens(folder: Path, meshes: list[str], points: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[OpenPage] = []
+    monkeypatch.setattr(OpenPage, "stay", lambda page, _: opened.append(page))
+    frame = [str(folder / "frame.npy"), "--unit-m", "1", "--port", "0", "--resolution", "24"]
+    assert command_line.main(["view", *frame, "--object", *meshes, "--units", "mm"]) == 0
+    opened[0].close()
+
+
+def test_a_page_needs_a_frame(meshes: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line.main(["view", "--object", *meshes]) == 2
+    assert "no frame is given; --object is looked for in one" in capsys.readouterr().err
+
+
+# --- what cannot be found ---------------------------------------------------------------------------------------------
+
+
+def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
+    flat = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    flat.export(tmp_path / "flat.stl")
+    with pytest.raises(ValueError, match="flat.stl is flat, without any volume; an object's parts are solids: let"):
+        mereo.load_object(tmp_path / "flat.stl")
+
+
+@pytest.mark.parametrize("unit_m", [1000.0, 0.001])
+def test_a_wrong_unit_is_a_sentence(angle: mereo.Object, points: np.ndarray, unit_m: float) -> None:
+    with pytest.raises(ValueError, match=r"a factor of \d+.*; a view shows from 5% to 300% of it: correct the unit"):
+        mereo.reconstruct(points, angle, unit_m=unit_m)
+
+
+def test_few_points_are_a_sentence(angle: mereo.Object, points: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="the cloud has 20 points; a reconstruction needs at least 32: move closer"):
+        mereo.reconstruct(points[:20], angle)
+
+
+def test_two_objects_in_a_cloud_are_warned_of(angle: mereo.Object, points: np.ndarray) -> None:
+    beside = points + np.array([0.5, 0.0, 0.0])
+    with pytest.warns(ClustersWarning, match="two separate clusters of like size .* if they are two, crop to one"):
+        mereo.reconstruct(np.concatenate([points, beside]), angle, resolution=24)
+
+
+@pytest.mark.parametrize(
+    "source, words",
+    [
+        ([], "no object is given; name its meshes"),
+        ("nothing", "there is no object 'nothing': name its meshes, its scene file"),
+        ("missing.stl", "missing.stl does not exist"),
+    ],
+)
+def test_no_object_is_a_sentence(source: object, words: str) -> None:
+    with pytest.raises((ValueError, FileNotFoundError), match=words):
+        mereo.load_object(source)  # type: ignore[arg-type]
+
+
+def test_an_empty_folder_is_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="holds no meshes .*: name the folder of an object, or its files"):
+        mereo.load_object(tmp_path)
+
+
+def test_a_network_cannot_answer_for_an_object_without(angle: mereo.Object, points: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="the method is network, but the object has no weights"):
+        mereo.reconstruct(points, angle, "network")
+
+
+def test_a_command_without_an_object_is_a_sentence(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line.main(["reconstruct", str(folder / "long.stl")]) == 2
+    assert "no object is named; name its meshes or its scene with --object" in capsys.readouterr().err
+
+
+def test_a_built_in_scene_is_named_like_a_file() -> None:
+    rope = loaded_object(("rope",), None)
+    assert rope.network is None and rope.scene is not None and rope.name == "rope"
+    with pytest.raises(ValueError, match="--scene is rope, but --object says what the object is"):
+        loaded_object(("rope",), None, "rope")
+
+
+def test_folders_of_meshes_and_scene_files_are_objects(folder: Path, tmp_path: Path) -> None:
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    for name in ("long", "short"):
+        (parts / f"{name}.stl").write_bytes((folder / f"{name}.stl").read_bytes())
+    known = mereo.load_object(parts, units="mm")
+    assert known.names == ("long", "short") and known.scene is not None and known.scene.file is None
+    with pytest.raises(ValueError, match="says its own: leave them out"):
+        mereo.load_object("rope.yaml", units="mm")
+
+
+def test_meshes_of_one_file_may_be_segments(tmp_path: Path) -> None:
+    write_mesh(box((0, 0, 0), (3, 2, 1), "one"), tmp_path / "one.stl")
+    assert mereo.load_object(tmp_path / "one.stl").names == ("one",)

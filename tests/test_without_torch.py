@@ -1,0 +1,115 @@
+"""An object without weights needs no torch, and what does need it says how to get it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from angle import write_angle
+
+from mereo.learning.object_files import scene_of_meshes
+from mereo.scenes.kept_model import CACHE_VARIABLE
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
+
+HIDDEN = """
+import sys
+
+class Hidden:
+    asked = []
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "torch":
+            self.asked.append(name)
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Hidden())
+"""
+"""Beginning of a program for which torch is not installed."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the angle's meshes, and of a view of it in a random state, in metres."""
+    found = tmp_path_factory.mktemp("angle")
+    scene = scene_of_meshes(write_angle(found), "mm")
+    assert scene.unit_m is not None
+    points = scene.unit_m * sample_view(scene, GenerateConfig(), example_rng(1000, 2)).depth.to_points().points
+    (found / "frames").mkdir()
+    for name in ("frame.npy", "frames/a.npy"):
+        np.save(found / name, points)
+    return found
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(folder / "cache"))
+
+
+def hidden(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a program for which torch is not installed."""
+    end = "\nassert not Hidden.asked, Hidden.asked\n"
+    return subprocess.run(
+        [sys.executable, "-c", HIDDEN + program + end], cwd=folder, capture_output=True, text=True, timeout=300
+    )
+
+
+def test_python_needs_no_torch(folder: Path) -> None:
+    program = """
+import mereo
+known = mereo.load_object(["long.stl", "short.stl"], units="mm")
+frame = mereo.load_frame("frame.npy", unit_m=1.0)
+found = mereo.reconstruct(frame, known, resolution=24)
+found.save("hidden", overwrite=True)
+found.save("hidden.html", overwrite=True)
+found.carry("long.stl").save("carried.stl", overwrite=True)
+print(mereo.Tracker(known).follow(frame, 0.0).found_by, found.found_by)
+import mereo.visualization.viewer.result_page
+import mereo.visualization.viewer.serve
+"""
+    ran = hidden(program, folder)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.split() == ["search", "search"] and (folder / "hidden/report.html").is_file()
+
+
+def test_the_command_line_needs_no_torch(folder: Path) -> None:
+    program = """
+from mereo.__main__ import main
+known = ["--object", "long.stl", "short.stl", "--units", "mm"]
+options = ["--unit-m", "1", "--resolution", "24", "--force"]
+assert main(["reconstruct", "frame.npy", *known, *options, "--output", "command"]) == 0
+assert main(["stream", "frames", *known, "--unit-m", "1"]) == 0
+assert main(["generate", "rope", "--output", "examples", "--examples", "1"]) == 0
+"""
+    ran = hidden(program, folder)
+    assert ran.returncode == 0, ran.stderr
+    assert "found by search" in ran.stdout and '"found_by": "search"' in ran.stdout
+    assert (folder / "command/summary.json").is_file()
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "mereo.load_object('bunny')",
+        "mereo.load_model('bunny')",
+        "mereo.learn('rope', 'out')",
+        "mereo.reconstruct('bun000', 'bunny')",
+    ],
+)
+def test_what_needs_torch_says_which_extra(program: str, tmp_path: Path) -> None:
+    told = f"import mereo\ntry:\n    {program}\nexcept ImportError as error:\n    print(error)\nHidden.asked.clear()\n"
+    ran = hidden(told, tmp_path)
+    assert "run pip install 'mereo[network]'" in ran.stdout, ran.stderr
+
+
+def test_a_command_that_needs_torch_says_which_extra(tmp_path: Path) -> None:
+    told = "from mereo.__main__ import main\nprint(main(['train', 'data', '--output', 'run']))\nHidden.asked.clear()"
+    ran = hidden(told, tmp_path)
+    assert ran.stdout.strip() == "2" and "run pip install 'mereo[network]'" in ran.stderr
+    assert ran.stderr.startswith("mereo: error: PyTorch is not installed") and ran.stderr.count("\n") == 1
+
+
+def test_the_doctor_speaks_without_torch(tmp_path: Path) -> None:
+    ran = hidden("from mereo.cli.doctor import diagnose\ndiagnose()\nHidden.asked.clear()", tmp_path)
+    assert ran.returncode == 0 and "objects are found by search" in ran.stdout
