@@ -29,6 +29,7 @@ from mereo.fitting.problem.scene_unit import agree, estimate_unit
 from mereo.fitting.registration.registration import Method, Registration
 from mereo.fitting.uncertainty.optimum import DrawsOptimum, ModesOptimum, Optimum
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.sight_lines import SightLines
 from mereo.io.cores import one_blas_thread
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained
@@ -67,11 +68,12 @@ class ModesFit:
         config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
         doubtful: Float[np.ndarray, "d 3"] | None = None,
         ask: Ask | None = None,
+        lines: SightLines | None = None,
     ) -> "ModesFit":
         """Fit of the modes to a cloud, seen from the origin, with correspondences in its unit.
 
-        Where it leaves much unexplained, the network is asked again with the camera turned (``turned_camera``), and
-        where what is left is noise, the frame is fitted once more as a noisy one.
+        Where much is unexplained, the network is asked again with the camera turned (``turned_camera``); where what is
+        left is noise, the frame is fitted once more as a noisy one.
 
         Args:
             points: the cloud.
@@ -79,9 +81,8 @@ class ModesFit:
             model: the statistical model.
             scene_unit: length of a scene unit in the cloud's unit, where it is known.
             config: constants.
-            doubtful: points that are none of the cloud: along their lines of sight nothing is known (``Evidence.of``).
-            ask: what the network states about points of the camera frame, in the cloud's unit; None cannot be asked
-                again.
+            doubtful, lines: as in ``Evidence.of``, in the cloud's unit.
+            ask: what the network states about points of the camera frame, in the cloud's unit; None without one.
         """
         started = time.perf_counter()
         unit = estimate_unit(found) if scene_unit is None else scene_unit
@@ -93,7 +94,8 @@ class ModesFit:
             return ask(seen * unit).scaled(1 / unit)
 
         with one_blas_thread():
-            evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit)
+            beside = None if lines is None else lines.scaled(1 / unit)
+            evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit, lines=beside)
             problem = Problem.of(model, found, evidence, scale_std, config)
             understood = problem, found, fit_modes(problem)
             again = None if ask is None else asked
@@ -226,6 +228,7 @@ def fit_frame(
     code: EncodedCloud | None = None,
     is_certain: bool = True,
     doubtful: Float[np.ndarray, "d 3"] | None = None,
+    lines: SightLines | None = None,
 ) -> ModesFit:
     """Fit of the modes to a cloud, from the network's correspondences.
 
@@ -237,7 +240,7 @@ def fit_frame(
         config: constants.
         code: of the cloud, where it is known already.
         is_certain: whether ``scene_unit`` is that for certain; else it is believed where the correspondences agree.
-        doubtful: points that were left out of the cloud as strays.
+        doubtful, lines: as in ``ModesFit.of``.
 
     Raises ``ValueError`` for a network without rest coordinates or of other segments, and where it finds too little.
     """
@@ -256,7 +259,7 @@ def fit_frame(
     def ask(points: Float[np.ndarray, "s 3"]) -> Correspondences:
         return _asked(network, model, network.encode(PointCloud(points)))
 
-    fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask)
+    fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask, lines)
     return replace(fitted, seconds=fitted.seconds + asked, calibration=network.calibration)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.search_modes import search_modes
+from mereo.geometry.sight_lines import SightLines
 from mereo.geometry.transforms import transform_points
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import Observation
@@ -60,7 +61,8 @@ def fit_hypotheses(
         dropped = encoded.reading.whole.points[~encoded.reading.keep]
         doubtful = transform_points(encoded.T_camera_input, dropped)
         try:
-            modes = patience.fit_modes(encoded.seen, encoded.code, scene_unit, is_certain, doubtful)
+            lines = seen.lines.transformed(encoded.T_camera_input)
+            modes = patience.fit_modes(encoded.seen, encoded.code, scene_unit, is_certain, doubtful, lines)
         except ValueError as error:
             return Candidate(encoded, error=error)
         return Candidate(encoded, modes)
@@ -96,24 +98,22 @@ def search_hypotheses(
     """
     unit, axes = registrar.stated_scene_unit(seen.frame.unit_m) if scene_unit is None else scene_unit, seen.frame.axes
     likelier, *others = (encode_frame(one, None, axes) for one in readings(seen.cloud, axes, keep_all))
-    best = _searched(likelier, registrar, unit)
+    best = _searched(likelier, registrar, unit, seen.lines)
     for other in others:
         if best.is_accepted:
             break
-        best = better(best, _searched(other, registrar, unit))
+        best = better(best, _searched(other, registrar, unit, seen.lines))
     return best, likelier
 
 
-def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None) -> Candidate:
-    """Candidate of one hypothesis by a search."""
+def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, beside: SightLines) -> Candidate:
+    """Candidate of one hypothesis by a search; ``beside`` are the lines of sight beside the object."""
     dropped = frame.reading.whole.points[~frame.reading.keep]
     doubtful = transform_points(frame.T_camera_input, dropped) if len(dropped) else None
     try:
         check_size(frame, registrar.model, scene_unit)
-        # lines: where the observation knows its lines of sight, they go here
-        modes = search_modes(
-            frame.seen.points, registrar.model, scene_unit, registrar.config, doubtful=doubtful, lines=None
-        )
+        lines = beside.transformed(frame.T_camera_input)
+        modes = search_modes(frame.seen.points, registrar.model, scene_unit, registrar.config, doubtful, lines)
     except ValueError as error:
         return Candidate(frame, error=error, found_by="search")
     return Candidate(frame, modes, found_by="search")

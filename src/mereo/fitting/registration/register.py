@@ -17,6 +17,7 @@ from mereo.fitting.registration.fit import ModesFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.brief import listed
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.sight_lines import SightLines
 from mereo.io.progress import stage
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.assets import AssetUnavailable
@@ -167,10 +168,11 @@ class Registrar:
         scene_unit: float | None = None,
         is_certain: bool = True,
         doubtful: Float[np.ndarray, "d 3"] | None = None,
+        lines: SightLines | None = None,
     ) -> ModesFit:
         """Fit of the modes from the network, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
         assert self.network is not None
-        return fit_frame(seen, self.network, self.model, scene_unit, self.config, code, is_certain, doubtful)
+        return fit_frame(seen, self.network, self.model, scene_unit, self.config, code, is_certain, doubtful, lines)
 
     def register(
         self,

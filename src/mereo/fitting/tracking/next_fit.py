@@ -27,6 +27,7 @@ from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.tracking.config import TrackConfig
 from mereo.geometry.downsampling import means_along_sight
+from mereo.geometry.sight_lines import SightLines
 from mereo.io.cores import one_blas_thread
 from mereo.models.calibration import Calibration
 
@@ -126,6 +127,7 @@ def next_fit(
     doubtful: Float[np.ndarray, "d 3"],
     time_s: float,
     config: TrackConfig,
+    lines: SightLines,
 ) -> tuple[ModesFit, Track]:
     """Fit of the modes to a frame, and the track that ends with it.
 
@@ -135,11 +137,15 @@ def next_fit(
         doubtful: points that are none of it (``Evidence.of``).
         time_s: of the frame.
         config: constants.
+        lines: what is known of the lines of sight beside the points, in the same frame and unit. Where they leave it
+            open, the object is seen whole or in part as it was when the track began.
     """
     started = time.perf_counter()
     with one_blas_thread():
         few = means_along_sight(points / track.unit, config.points)
-        problem = replace(track.problem, evidence=Evidence.of(few, doubtful / track.unit, config.partners))
+        beside = lines.scaled(1 / track.unit)
+        beside = replace(beside, elsewhere=beside.elsewhere or track.problem.evidence.elsewhere)
+        problem = replace(track.problem, evidence=Evidence.of(few, doubtful / track.unit, config.partners, beside))
         share_surfaces(track.problem, problem)
         start = track.expected(time_s, config)
         passed = max(time_s - track.time_s, 0.0)

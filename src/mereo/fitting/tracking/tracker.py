@@ -91,7 +91,8 @@ class Tracker:
         keep = np.ones(len(points), dtype=bool) if keep_all else gated(track, points, time_s, config)
         if keep.sum() < MIN_POINTS:
             return None
-        fitted, after = next_fit(track, points[keep], points[~keep], time_s, config)
+        lines = seen.lines.transformed(self._T_camera_input)
+        fitted, after = next_fit(track, points[keep], points[~keep], time_s, config, lines)
         return _Tracked(fitted, after, Reading(seen.cloud, keep))
 
     def _believed(self, tracked: "_Tracked") -> bool:
