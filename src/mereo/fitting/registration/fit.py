@@ -81,7 +81,8 @@ class ModesFit:
             model: the statistical model.
             scene_unit: length of a scene unit in the cloud's unit, where it is known.
             config: constants.
-            doubtful, lines: as in ``Evidence.of``, in the cloud's unit.
+            doubtful: points that are none of the cloud: along their lines of sight nothing is known.
+            lines: what is known of the lines of sight beside the cloud; where they leave it open, they went past.
             ask: what the network states about points of the camera frame, in the cloud's unit; None without one.
         """
         started = time.perf_counter()
@@ -240,7 +241,8 @@ def fit_frame(
         config: constants.
         code: of the cloud, where it is known already.
         is_certain: whether ``scene_unit`` is that for certain; else it is believed where the correspondences agree.
-        doubtful, lines: as in ``ModesFit.of``.
+        doubtful: points that were left out of the cloud as outliers.
+        lines: what is known of the lines of sight beside the cloud.
 
     Raises ``ValueError`` for a network without rest coordinates or of other segments, and where it finds too little.
     """
@@ -273,20 +275,6 @@ def _asked(network: Trained, model: StatisticalModel, code: EncodedCloud) -> Cor
     return found.evenly()
 
 
-def fit(
-    cloud: PointCloud,
-    network: Trained,
-    model: StatisticalModel,
-    scene_unit: float | None = None,
-    states: DrawnStates | None = None,
-    config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-    code: EncodedCloud | None = None,
-) -> Registration:
-    """``fit_frame``'s answer; with ``states`` of the model's scene, the better of modes and the scene's own draws."""
-    fitted = fit_frame(cloud, network, model, scene_unit, config, code)
-    return fitted.registration() if states is None else fitted.with_draws(states)
-
-
 def fit_correspondences(
     points: Float[np.ndarray, "n 3"],
     found: Correspondences,
@@ -295,6 +283,6 @@ def fit_correspondences(
     states: DrawnStates | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
 ) -> Registration:
-    """``fit`` from given correspondences; ``points`` are the observed cloud, seen from the origin."""
+    """Registration from given correspondences, with ``states`` by the scene's draws too; ``points`` are the cloud."""
     fitted = ModesFit.of(points, found, model, scene_unit, config)
     return fitted.registration() if states is None else fitted.with_draws(states)
