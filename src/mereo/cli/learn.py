@@ -13,7 +13,7 @@ from mereo.workers.config import RayAddress, TaskResources, cluster_of
 
 @dataclass(frozen=True)
 class LearnCommand:
-    """Learn an object of your own, or a folder of them: check, generate, train, evaluate, in so many minutes each.
+    """Learn an object of your own, or a folder of them, in so many minutes each: needs the extra `network`.
 
     The same command again goes on where it was stopped.
 
