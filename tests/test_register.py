@@ -186,7 +186,7 @@ def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> N
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
     stretched = view.depth.to_points().points * np.array([1.0, 2.5, 1.0])
     without_scene = replace(model, provenance={"scene": "mine"})
-    found = answer_to(stretched, model, Registrar.of(without_scene), 32)
+    found = answer_to(stretched, model, Registrar.of(without_scene).at_once, 32)  # asks no search either
     assert found.registration is not None and not found.registration.accepted and not found.taken
     forced = answer_to(stretched, model, Registrar.of(model, "modes"), 32)
     assert forced.taken and forced.registration is not None and not forced.registration.accepted
