@@ -15,6 +15,7 @@ EXPECTED = {
     "loop.py": "wrote loop.webp: 9 frames",
     "query_points.py": "to the nearest surface",
     "reconstruct_cloud.py": "report.html",
+    "search_steps.py": "wrote search_steps.png",
     "sensors.py": "wrote",
     "shipped_weights.py": "wrote objects.png",
     "simulate_liver.py": "3 states of 98 nodes",
@@ -29,7 +30,10 @@ ASSETS = {
 OPTIONS = {"loop.py": ("--fps", "1"), "shipped_weights.py": ("--weights", "rope", "--cells", "24")}
 """What keeps an example short."""
 
-LONG = ("isolate_object.py", "loop.py", "reconstruct_cloud.py", "shipped_weights.py", "simulate_liver.py")
+LONG = (
+    *("isolate_object.py", "loop.py", "reconstruct_cloud.py", "search_steps.py", "shipped_weights.py"),
+    "simulate_liver.py",
+)
 """Those that take longer; what they call has tests of its own."""
 
 EXTRAS = {"simulate_liver.py": "mujoco"}

@@ -1,0 +1,91 @@
+"""See how an object is found without a network, step by step, in a frame that shows a half of it.
+
+    python examples/search_steps.py [--scene rope] [--output search_steps.png]
+
+Pictures, from left to right: what each line of sight says (orange met the object, blue went past it, of red nothing is
+known); a start; the best pose after rigid steps; the best state after it was bent by few points; the fit; and the fit
+from behind, with the hidden half. Observed points are black.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from mereo.fitting.config import FitConfig
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
+from mereo.fitting.problem.residuals import NetworkTerm
+from mereo.fitting.search.search import ROUNDS, candidates, screened, search
+from mereo.reconstruction.observation import find_object
+from mereo.scenes.kept_model import kept_model
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
+from mereo.synthesis.occluded_views import occlude
+from mereo.visualization.contact_sheets import save_png
+from mereo.visualization.renderer import Viewpoint, shaded_canvas
+from mereo.visualization.sight_picture import sight_picture
+
+SIDE = 300
+"""Pixels along each side of a picture."""
+
+BLACK = (0.05, 0.05, 0.05)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the example.
+
+    Attributes:
+        scene: built-in scene that is looked for.
+        hidden: share of the object's pixels that are hidden.
+        index: of the view.
+        output: the picture to write.
+    """
+
+    scene: str = "rope"
+    hidden: float = 0.4
+    index: int = 0
+    output: Path = Path("search_steps.png")
+
+
+def main(options: Options) -> None:
+    """Search one occluded view, and draw the steps."""
+    scene, settings = load_scene(options.scene), GenerateConfig(image_size=192)
+    view = sample_view(scene.for_seed(1), settings, example_rng(1, options.index))
+    cut = occlude(view, "screen", options.hidden, np.random.default_rng(options.index), settings)
+    seen = find_object(cut.frame())
+    model = kept_model(scene)
+    evidence = Evidence.of(seen.cloud.points, lines=seen.lines)
+    problem = Problem(model, NetworkTerm.none(model), evidence, KNOWN_SCALE_STD, FitConfig())
+    rigid = screened(problem, ROUNDS[0])
+    bent = candidates(problem, ROUNDS[0])
+    found = search(problem)
+    states = (rigid[-1], rigid[0], bent[0][1], found.best.posed)
+    points = evidence.points
+    front = Viewpoint.along(cut.mesh.bounds, (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+    back = Viewpoint.along(cut.mesh.bounds, (0.6, 0.3, -0.75), (0.0, -1.0, 0.0))
+    tiles = [square(sight_picture(seen))]
+    for posed, viewpoint in (*((state, front) for state in states), (states[-1], back)):
+        canvas = shaded_canvas(model.mesh(posed.place(model.material(posed.z))), viewpoint, (SIDE, SIDE))
+        canvas.draw_points(points, np.broadcast_to(BLACK, points.shape), 1.0)
+        tiles.append(canvas.picture())
+    save_png(options.output, np.concatenate(tiles, axis=1))
+    print(f"{found.tried} candidates fitted, {found.alike} explain the frame; wrote {options.output}")
+
+
+def square(picture: np.ndarray) -> np.ndarray:
+    """The middle of a picture, ``SIDE`` pixels along each side."""
+    from PIL import Image
+
+    height, width = picture.shape[:2]
+    low = (width - min(height, width)) // 2, (height - min(height, width)) // 2
+    image = Image.fromarray(picture).crop((*low, low[0] + min(height, width), low[1] + min(height, width)))
+    return np.asarray(image.resize((SIDE, SIDE), Image.Resampling.NEAREST))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
