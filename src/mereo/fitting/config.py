@@ -11,6 +11,10 @@ scene as well."""
 FoundBy = Literal["search", "network"]
 """Who found the object in a frame: a search over poses and states, or a trained network."""
 
+Tracking = Literal["found", "followed", "lost"]
+"""State of a tracked object in a frame: found anew; followed from the last frame; or lost, so that its pose is not
+known."""
+
 
 @dataclass(frozen=True)
 class FitConfig:
