@@ -43,6 +43,7 @@ class FitConfig:
         samples, coarse_samples: points of the surface that stand for it in most steps, and in the choice of states.
         witnesses: how many of them are compared with what the frame rules out.
         exact_steps: last steps, which ask the faces themselves.
+        search_rounds: rounds of the search at most, while nothing explains the frame.
         scale_std: standard deviation of the scale's logarithm where the unit is not known.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface,
             in scene units.
@@ -79,6 +80,7 @@ class FitConfig:
     refined: int = 2
     rounds: int = 2
     curved: int = 300
+    search_rounds: int = 3
     scale_std: float = 0.1
     samples: int = 3000
     coarse_samples: int = 1000

@@ -7,13 +7,17 @@ search, so a thread is enough.
 """
 
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.hypotheses import search_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.reconstruction.observation import Observation
+
+ROUNDS = 2
+"""Rounds of a search at most. Where they find nothing, a newer frame is worth more than the last round, which takes as
+long as both and longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +67,8 @@ class BackgroundSearch:
     """
 
     def __init__(self, registrar: Registrar, executor: Executor | None = None) -> None:
-        self.registrar, self.executor = registrar, executor
+        self.registrar = replace(registrar, config=replace(registrar.config, search_rounds=ROUNDS))
+        self.executor = executor
         self._own: ThreadPoolExecutor | None = None
         self._running: Future[Searched] | None = None
 

@@ -103,11 +103,12 @@ class Tracker:
             alone = self._by_itself(frame, tracked, started)
             if alone.tracking != "lost":
                 return alone
-        for _ in range(2):  # a search that has ended, and one that the executor does at once
-            again = self._searched(frame)
-            if again is not None:
-                return self._gone_on(frame, again, started, "found")
+        again = self._searched(frame)
+        if again is None:
             self._search.start(frame)
+            again = self._searched(frame)  # some executors have done it now
+        if again is not None:
+            return self._gone_on(frame, again, started, "found")
         return self._lost(frame, alone, why if tracked is None else self._doubt(tracked), started)
 
     # --- fits that may be the answer ----------------------------------------------------------------------------------
@@ -123,7 +124,7 @@ class Tracker:
         points = transform_points(self._T_camera_input, seen.cloud.points)
         keep = np.ones(len(points), dtype=bool) if frame.keep_all else gated(track, points, time_s, self.config)
         if keep.sum() < MIN_POINTS:
-            return None, f"only {counted(int(keep.sum()), 'point')} lie near where it was expected"
+            return None, f"{counted(int(keep.sum()), 'point')} of at least {MIN_POINTS} lie near where it was expected"
         lines = seen.lines.transformed(self._T_camera_input)
         fitted, after = next_fit(track, points[keep], points[~keep], time_s, self.config, lines)
         return _Tracked(fitted, after, Reading(seen.cloud, keep)), ""
@@ -136,7 +137,8 @@ class Tracker:
         before = self._T_camera_input, self._axes
         self._T_camera_input, self._axes = searched.candidate.encoded.T_camera_input, searched.frame.seen.frame.axes
         own = _Tracked.of_frame(searched.candidate, searched.frame.time_s, self.config, self.registrar.config)
-        tracked, _ = self._tracked(own.track, frame, np.inf)
+        area = 0.0 if self._track is None else self._track.area
+        tracked, _ = self._tracked(replace(own.track, area=max(area, own.track.area)), frame, np.inf)
         if tracked is not None and self._takes(tracked):
             self._found_by = "search"
             return tracked
@@ -262,5 +264,5 @@ class _Tracked:
 
     @cached_property
     def area(self) -> float:
-        """Area of the object that was seen, as a share of the greatest since the track began."""
+        """Area of the object that was seen, as a share of the greatest ever."""
         return seen_area(self.fitted.problem.evidence) / self.track.area
