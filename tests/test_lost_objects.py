@@ -87,7 +87,7 @@ def rms(answer: Answer, mesh: SegmentedMesh) -> float:
 
 # --- what passes in front ---------------------------------------------------------------------------------------------
 
-FRAMES, BEFORE, AFTER = 15, 4, 11
+FRAMES, BEFORE, AFTER = 11, 3, 8
 
 
 @pytest.fixture(scope="module")
@@ -123,18 +123,21 @@ def test_what_passes_in_front_does_not_pull_the_object(
     registrar: Registrar,
     crossing: list[tuple[SegmentedMesh, SimulatedView]],
     observed: Callable[..., Observation],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shown = [int(one.image.valid.sum()) for _, one in crossing]
     assert min(shown[BEFORE:AFTER]) < 0.6 * shown[0]
     before, during, after = errors(registrar, crossing, observed)
-    print(before, during, after)
     assert max(before, during, after) < 0.6 and during < 1.2 * before
-    if observed is bare:  # which does not say that anything is in front: without the rule it counts as empty
-        monkeypatch.setattr(next_fit, "WHOLE", np.inf)
-        monkeypatch.setattr("mereo.fitting.tracking.tracker.Tracker._doubt", lambda *_: "")
-        print(errors(registrar, crossing, observed))
-        assert errors(registrar, crossing, observed)[1] > 2 * during
+
+
+@pytest.mark.slow
+def test_without_the_second_hypothesis_it_would_be_pulled(
+    registrar: Registrar, crossing: list[tuple[SegmentedMesh, SimulatedView]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(next_fit, "WHOLE", np.inf)
+    monkeypatch.setattr(Tracker, "_doubt", lambda *_: "")  # else it would be lost
+    before, during, _ = errors(registrar, crossing, bare)
+    assert before < 0.6 and during > 2 * before
 
 
 # --- lost and found ---------------------------------------------------------------------------------------------------
@@ -201,9 +204,10 @@ def searches(
 
     def search(seen: Observation, *_: object) -> tuple[Candidate, EncodedFrame]:
         asked.append(seen)
-        if id(seen) not in known:
-            known[id(seen)] = search_hypotheses(seen, registrar, False, 1.0)
-        candidate, likelier = known[id(seen)]
+        searched = frames["here"] if seen is frames["thing"] else seen
+        if id(searched) not in known:
+            known[id(searched)] = search_hypotheses(searched, registrar, False, 1.0)
+        candidate, likelier = known[id(searched)]
         if seen is frames["thing"]:
             candidate = replace(candidate, modes=None, error=ValueError("nothing is found"))
         return candidate, likelier

@@ -146,7 +146,7 @@ def test_numbers_and_sentences_are_those_of_the_answers(rows: Rows) -> None:
     assert dict(curve("milliseconds/failing")) == {0.25: pytest.approx(70.0)}
     texts = [(time, text) for time, (text,) in rows["/log TextLog:text"]]
     assert texts == [
-        (0.0, "0.png: the network was asked; the answer is by modes"),
+        (0.0, "0.png: the object was found; the answer is by modes"),
         (0.125, f"1.png: {UNSURE.told}"),
         (0.25, "2.png: 2.png is damaged: record it again"),
     ]

@@ -8,7 +8,7 @@
 | ``cloud``, ``strays`` | points that are taken for the object's, and the others; the input's frame and unit |
 | ``object/NAME`` | mesh of each segment that was found, in its colour |
 | ``answer/...``, ``points/...``, ``milliseconds/...`` | numbers of each frame (``series``) |
-| ``log`` | doubt, errors, and when the network was asked (``messages``) |
+| ``log`` | doubt, errors, and when the object was found (``messages``) |
 """
 
 import socket
