@@ -1,4 +1,4 @@
-"""A tracked object without weights: what passes in front does not pull it, and one that is lost is searched beside."""
+"""A tracked object without weights that is lost: its frames say so, and it is searched beside them."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -9,138 +9,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tracked_views import CAMERA, bare, lump_model, mesh_of, rms, view
 
 from mereo.api.result import Result
 from mereo.cli.stream import SurfaceFolder, line
 from mereo.cli.stream_answers import Answering, Seen
-from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.registration.answer import Answer, Candidate
+from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.hypotheses import search_hypotheses
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.search.search import rotations
-from mereo.fitting.tracking import background_search, next_fit
+from mereo.fitting.tracking import background_search
 from mereo.fitting.tracking.background_search import BackgroundSearch, SynchronousExecutor, TrackedFrame
 from mereo.fitting.tracking.tracker import Tracker
-from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.solids import Solids
-from mereo.io.sensor_frame import SensorFrame
-from mereo.models.weights import load_model
-from mereo.reconstruction.observation import Observation, find_object, observe
+from mereo.reconstruction.observation import Observation, observe
 from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.reconstruction.stream import Outcome
-from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis import depth_sensor
-from mereo.synthesis.clutter import Backdrop, Capsule, Surroundings, farthest
-from mereo.synthesis.config import SENSORS
-from mereo.synthesis.depth_sensor import SimulatedView
-
-CAMERA = Camera.from_fov(96, 96, 0.5)
-PLACE = np.array([1.0, -2.0, 130.0])
-AWAY = np.array([0.0, 0.0, 1.0])
+from mereo.synthesis.clutter import Capsule
 
 
 @pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    """Model of a lobe with a core inside and a tip that lies on it, which bends."""
-    found = load_model("tests/golden/lump.safetensors").statistical_model
-    assert found is not None
-    return found
-
-
-@pytest.fixture(scope="module")
-def registrar(model: StatisticalModel) -> Registrar:
-    return Registrar(None, model)
-
-
-def mesh_of(model: StatisticalModel, turn: int, share: float = 0.0) -> SegmentedMesh:
-    """Segments before the camera, on the way from one state of the library to another."""
-    z = ((1 - share) * model.library[3] + share * model.library[4]).astype(np.float64)
-    R = rotations(97)[turn]
-    posed = Posed(R, PLACE - R @ model.mean.mean(axis=0), z)
-    return model.mesh(posed.place(model.material(z)))
-
-
-def view(mesh: SegmentedMesh, seed: int = 0, occluders: tuple[Capsule, ...] = ()) -> SimulatedView:
-    """View before a far wall."""
-    solids, rng = Solids(mesh), np.random.default_rng(seed)
-    wall = Backdrop(AWAY, farthest(solids, AWAY) + 60.0)
-    return depth_sensor.observe(solids, CAMERA, 0.02, SENSORS["paper"], rng, around=Surroundings(occluders, wall))
-
-
-def bare(seen: SimulatedView) -> Observation:
-    return observe(seen.image.to_points())
-
-
-def whole(seen: SimulatedView) -> Observation:
-    image = seen.image
-    return find_object(SensorFrame(Path("simulated"), image.to_points(), None, "camera", image, whole=seen.whole))
-
-
-def vertices(mesh: SegmentedMesh) -> np.ndarray:
-    return np.concatenate([segment.vertices for segment in mesh.segments])
-
-
-def rms(answer: Answer, mesh: SegmentedMesh) -> float:
-    return float(np.sqrt(((vertices(answer.surfaces) - vertices(mesh)) ** 2).sum(axis=1).mean()))
-
-
-# --- what passes in front ---------------------------------------------------------------------------------------------
-
-FRAMES, BEFORE, AFTER = 11, 3, 8
-
-
-@pytest.fixture(scope="module")
-def crossing(model: StatisticalModel) -> list[tuple[SegmentedMesh, SimulatedView]]:
-    """A tool comes from the side, hides half of an object that bends slowly, and leaves."""
-    frames = []
-    for number in range(FRAMES):
-        mesh = mesh_of(model, 20, 0.3 * number / FRAMES)
-        low, high = vertices(mesh).min(axis=0), vertices(mesh).max(axis=0)
-        tool: tuple[Capsule, ...] = ()
-        if BEFORE <= number < AFTER:
-            share = np.sin(np.pi * (number - BEFORE + 0.5) / (AFTER - BEFORE))
-            width, z = high[0] - low[0], 0.9 * low[2]
-            x = 0.9 * (low[0] - width + (0.25 + 0.35 * share) * width)
-            tool = (Capsule(np.array([x, -200.0, z]), np.array([x, 200.0, z]), 0.9 * width),)
-        frames.append((mesh, view(mesh, number, tool)))
-    return frames
-
-
-def errors(
-    registrar: Registrar, crossing: list[tuple[SegmentedMesh, SimulatedView]], observed: Callable[..., Observation]
-) -> list[float]:
-    """Greatest error before, while and after something is in front."""
-    with Tracker(registrar, executor=SynchronousExecutor()) as tracker:
-        answers = [tracker.follow(observed(one), i / 30, scene_unit=1.0) for i, (_, one) in enumerate(crossing)]
-    assert [one.tracking for one in answers] == ["found", *["followed"] * (FRAMES - 1)]
-    off = [rms(answer, mesh) for answer, (mesh, _) in zip(answers, crossing, strict=True)]
-    return [max(part) for part in (off[:BEFORE], off[BEFORE:AFTER], off[AFTER:])]
-
-
-@pytest.mark.parametrize("observed", [bare, whole])
-def test_what_passes_in_front_does_not_pull_the_object(
-    registrar: Registrar,
-    crossing: list[tuple[SegmentedMesh, SimulatedView]],
-    observed: Callable[..., Observation],
-) -> None:
-    shown = [int(one.image.valid.sum()) for _, one in crossing]
-    assert min(shown[BEFORE:AFTER]) < 0.6 * shown[0]
-    before, during, after = errors(registrar, crossing, observed)
-    assert max(before, during, after) < 0.6 and during < 1.2 * before
-
-
-@pytest.mark.slow
-def test_without_the_second_hypothesis_it_would_be_pulled(
-    registrar: Registrar, crossing: list[tuple[SegmentedMesh, SimulatedView]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(next_fit, "WHOLE", np.inf)
-    monkeypatch.setattr(Tracker, "_doubt", lambda *_: "")  # else it would be lost
-    before, during, _ = errors(registrar, crossing, bare)
-    assert before < 0.6 and during > 2 * before
-
-
-# --- lost and found ---------------------------------------------------------------------------------------------------
+def registrar() -> Registrar:
+    return Registrar(None, lump_model())
 
 
 class HeldExecutor(Executor):
@@ -160,14 +50,14 @@ class HeldExecutor(Executor):
 
 
 @pytest.fixture(scope="module")
-def here(model: StatisticalModel) -> SegmentedMesh:
-    return mesh_of(model, 20)
+def here(registrar: Registrar) -> SegmentedMesh:
+    return mesh_of(registrar.model, 20)
 
 
 @pytest.fixture(scope="module")
-def there(model: StatisticalModel) -> SegmentedMesh:
+def there(registrar: Registrar) -> SegmentedMesh:
     """The same state, moved by its own length and turned."""
-    found = mesh_of(model, 50)
+    found = mesh_of(registrar.model, 50)
     shift = np.array([22.0, 10.0, 60.0])
     return found.with_vertices([segment.vertices + shift for segment in found.segments])
 
