@@ -1,6 +1,6 @@
 """Constants of following an object from frame to frame; light, so that the command line may import them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 StreamMethod = Literal["auto", "network", "search", "modes"]
@@ -59,3 +59,8 @@ class TrackConfig:
     most_ruled_out: float = 0.3
     scale_std: float = 0.002
     longest_s: float = 1.0
+
+    @property
+    def patient(self) -> "TrackConfig":
+        """The same with more steps, the first of them wider: for what has moved far since the last frame."""
+        return replace(self, steps=4 * self.steps, first_sigma=2 * self.first_sigma, cooling=0.75)

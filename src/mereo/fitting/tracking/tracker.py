@@ -126,8 +126,15 @@ class Tracker:
         if keep.sum() < MIN_POINTS:
             return None, f"{counted(int(keep.sum()), 'point')} of at least {MIN_POINTS} lie near where it was expected"
         lines = seen.lines.transformed(self._T_camera_input)
-        fitted, after = next_fit(track, points[keep], points[~keep], time_s, self.config, lines)
-        return _Tracked(fitted, after, Reading(seen.cloud, keep)), ""
+
+        def fit(config: TrackConfig) -> _Tracked:
+            fitted, after = next_fit(track, points[keep], points[~keep], time_s, config, lines)
+            return _Tracked(fitted, after, Reading(seen.cloud, keep))
+
+        tracked = fit(self.config)
+        if not tracked.registration.accepted and not self.registrar.asks_network:  # it may have moved far
+            tracked = max(tracked, fit(self.config.patient), key=lambda one: one.score)
+        return tracked, ""
 
     def _searched(self, frame: TrackedFrame) -> "_Tracked | None":
         """The frame fitted from the state that a search has found in an earlier one; None where that explains none."""
