@@ -7,11 +7,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from mereo import __main__ as command_line
 from mereo.cli import commands
 from mereo.io import cores
-from mereo.io.cores import THREAD_VARIABLES, FreeCores, threads_for, use_free_cores, workers_for
+from mereo.io.cores import THREAD_VARIABLES, FreeCores, one_blas_thread, threads_for, use_free_cores, workers_for
 
 
 @pytest.mark.parametrize(
@@ -125,3 +126,19 @@ def test_threads_hold_for_torch_blas_and_what_is_started(monkeypatch: pytest.Mon
 
 def test_workers_are_as_many_as_threads_unless_said() -> None:
     assert (workers_for(3, 2), workers_for(0, 2)) == (3, 2) and workers_for(0, 0) >= 1
+
+
+def test_one_blas_thread_lasts_until_the_last_thread_lets_go() -> None:
+    def counts() -> set[int]:
+        return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+    with threadpool_limits(2, "blas"):
+        before = counts()
+        first, second = one_blas_thread(), one_blas_thread()
+        first.__enter__()
+        second.__enter__()
+        assert counts() == {1}
+        first.__exit__(None, None, None)  # in the order in which threads may end, not the one of nested blocks
+        assert counts() == {1}
+        second.__exit__(None, None, None)
+        assert counts() == before

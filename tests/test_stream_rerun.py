@@ -50,7 +50,9 @@ def answer(*segments: Segment, tracked: bool = True, recognition: Recognition = 
     reading = Reading(cloud, np.array([True, True, False, True]))
     mesh, seen = SegmentedMesh(segments), Observation(frame, cloud)
     radii = {"median": 0.5, "max": 2.5, "calibrated": True}
-    return FrameAnswer(mesh, {}, reading, "modes", tracked, 0.75, recognition, radii, seen, 0.05)
+    return FrameAnswer(
+        mesh, {}, reading, "modes", "followed" if tracked else "found", 0.75, recognition, radii, seen, 0.05
+    )
 
 
 def outcome(number: int, result: FrameAnswer | None, error: str = "") -> Outcome[FrameAnswer]:
@@ -144,7 +146,7 @@ def test_numbers_and_sentences_are_those_of_the_answers(rows: Rows) -> None:
     assert dict(curve("milliseconds/failing")) == {0.25: pytest.approx(70.0)}
     texts = [(time, text) for time, (text,) in rows["/log TextLog:text"]]
     assert texts == [
-        (0.0, "0.png: the network was asked; the answer is by modes"),
+        (0.0, "0.png: the object was found; the answer is by modes"),
         (0.125, f"1.png: {UNSURE.told}"),
         (0.25, "2.png: 2.png is damaged: record it again"),
     ]
@@ -152,7 +154,7 @@ def test_numbers_and_sentences_are_those_of_the_answers(rows: Rows) -> None:
 
 
 def test_without_a_model_nothing_is_said_of_the_network() -> None:
-    alone = FrameAnswer(SegmentedMesh((empty("a"),)), {}, Reading.of_all(PointCloud(CORNERS)), "network", False, None)
+    alone = FrameAnswer(SegmentedMesh((empty("a"),)), {}, Reading.of_all(PointCloud(CORNERS)), "network", "found", None)
     assert list(messages(outcome(0, alone))) == []
     assert not {"answer/explained", "answer/known"} & series(outcome(0, alone)).keys()
 

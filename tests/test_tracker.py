@@ -1,6 +1,8 @@
 """An object that is followed: what is still stays, what jumps is found again, and slow ones are as if fitted alone."""
 
+from concurrent.futures import Executor, Future
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -189,6 +191,26 @@ def test_a_frame_that_nothing_explains_is_the_networks(
     assert not found.taken and not found.tracked and found.candidate is not None and "network alone" in repr(found)
     alone = reconstruct(cloud, network, 24)
     np.testing.assert_array_equal(replace(found, resolution=24).reconstruction.labels.labels, alone.labels.labels)
+
+
+class Waiting(Executor):
+    """Executor that never comes to its work."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        return Future()
+
+
+def test_a_lost_object_with_weights_is_searched_and_has_the_networks_surfaces(
+    network: Model, registrar: Registrar, scene: Scene, here: SegmentedMesh
+) -> None:
+    tracker = Tracker(Unbelieving(network, registrar.model, "auto"), executor=Waiting())
+    found = tracker.follow(observe(seen(scene, here)), 0.0, scene_unit=1.0)
+    assert found.tracking == "lost" and found.registered is None and not found.is_missing
+    assert found.recognition.known is False and str(found.recognition.reason).startswith("the object is lost: nothing")
+    running = tracker._search._running
+    assert running is not None and len(replace(found, resolution=24).surfaces.segments) == len(network.names)
+    tracker.forget()
+    assert running.cancelled()
 
 
 def some_state(count: int, seed: int) -> Posed:

@@ -8,6 +8,7 @@ Result[name] -> SegmentResult
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from html import escape
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -206,11 +207,15 @@ class Result(Answer):
         return [path for path in paths if path.is_file() or is_recording(path)]
 
     def __repr__(self) -> str:
+        if self.is_missing:
+            return f"Result({self.seen.frame.source!r}: {self.recognition.reason})"
         found = f"{sum(len(one.faces) > 0 for one in self.surfaces.segments)} of {len(self)} segments"
         return f"Result({self.seen.frame.source!r}: {found}; {self.source}; {self.seconds:.1f} s)"
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the points seen on what was found, from two sides, and the segments in figures."""
+        if self.is_missing:
+            return f"<p>{escape(repr(self))}</p>"
         to_camera = camera_axes(self.seen.frame.axes)
         points = transform_points(to_camera, self.seen.cloud.points)
         surfaces = self.reconstruction.surfaces.transformed(to_camera)

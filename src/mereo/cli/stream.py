@@ -4,7 +4,7 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,12 +65,13 @@ def stream_reconstructions(
     frames: Iterable[StreamFrame[Observation] | None] = (
         watched_frames(source, reading, isolation) if watch else frames_of(source, reading, isolation, rate_hz)
     )
-    answer = Answering(known.network, known.registrar(method), resolution, isolation.keep_all, uncertainty)
+    answer = Answering(known.network, known.registrar(method), resolution, isolation.keep_all, uncertainty, every_frame)
     # what is written to standard input or into a watched folder arrives when it does
     pace = not every_frame and not watch and source != STANDARD_INPUT
     timed = (None if frame is None else with_time(frame) for frame in frames)
     outcomes: Iterator[Outcome[FrameAnswer]] = stream(timed, answer, recorded_pace=pace, every_frame=every_frame)
-    with nullcontext() if target is None else target.opened(Path(source).name, reading.frame) as log:
+    opened = nullcontext() if target is None else target.opened(Path(source).name, reading.frame)
+    with closing(answer), opened as log:
         broken_off, last_error, summary = answer_all(outcomes, folder, log, reading.frame)
         if not summary.answered and broken_off is None and last_error:
             broken_off = ValueError(
@@ -147,6 +148,10 @@ class SurfaceFolder:
         name = re.sub(r"[^\w.-]+", "_", outcome.name)
         try:
             owner = self._frames.get(name)
+            if outcome.result.surfaces is None:
+                if owner == outcome.name:  # no surfaces of an earlier state
+                    (self.path / f"{name}.glb").unlink(missing_ok=True)
+                return outcome
             if owner not in (None, outcome.name):
                 raise FileExistsError(f"{self.path / name}.glb holds the surfaces of {owner}: rename {outcome.name}")
             with atomic_file(self.path / f"{name}.glb", force=self.force or owner is not None) as partial:
@@ -169,7 +174,12 @@ def line(outcome: Outcome[FrameAnswer]) -> dict[str, Any]:
     if outcome.result is None:
         return {**facts, "error": outcome.error}
     found = outcome.result
-    where: dict[str, Any] = {"method": found.method, "tracked": found.tracked, "explained": found.explained}
+    where: dict[str, Any] = {
+        "method": found.method,
+        "tracked": found.tracked,
+        "tracking": found.tracking,
+        "explained": found.explained,
+    }
     where |= {"known": found.recognition.known, "reason": found.recognition.reason}
     if found.found_by is not None:
         where["found_by"] = found.found_by

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.config import FoundBy
+from mereo.fitting.config import FoundBy, Tracking
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
 from mereo.fitting.registration.register import Registrar
+from mereo.fitting.tracking.background_search import SynchronousExecutor
 from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.moments import owned_centroids
@@ -36,12 +37,12 @@ class FrameAnswer:
     """Answer to a frame of a stream, in the input's frame and units.
 
     Attributes:
-        surfaces: of all segments.
+        surfaces: of all segments; None where the object is lost and no network answers.
         segments: facts of each that was found, by its name: ``centroid``, ``volume``, and the network's ``confidence``
             where the answer is the network's.
         reading: the frame's points, and which of them are taken for the object's.
-        method: "modes" of the registered model, or "network".
-        tracked: whether the last frame's state led to it, so that the network was not asked.
+        method: "modes" of the registered model, or "network"; None without surfaces.
+        tracking: whether the object was found anew, followed from the last frame, or is lost.
         explained: share of the observed points that the registered model explains; None without one.
         recognition: whether the frame shows the object, in a state that was learned.
         radius95: median and greatest radius of 95 % of the surface, input unit, and whether they are calibrated; None
@@ -51,11 +52,11 @@ class FrameAnswer:
         found_by: who found the object when it began to be followed; None where the answer is the network's own.
     """
 
-    surfaces: SegmentedMesh
+    surfaces: SegmentedMesh | None
     segments: dict[str, Any]
     reading: Reading
-    method: str
-    tracked: bool
+    method: str | None
+    tracking: Tracking
     explained: float | None
     recognition: Recognition = NOT_ASKED
     radius95: dict[str, float | bool] | None = None
@@ -64,13 +65,22 @@ class FrameAnswer:
     found_by: FoundBy | None = None
 
     @property
+    def tracked(self) -> bool:
+        """Whether the last frame's state led to it, so that neither network nor search was asked."""
+        return self.tracking == "followed"
+
+    @property
     def strays(self) -> int:
         """Number of points that were dropped."""
         return self.reading.dropped
 
     @classmethod
     def of_network(
-        cls, found: Reconstruction, explained: float | None = None, recognition: Recognition = NOT_ASKED
+        cls,
+        found: Reconstruction,
+        explained: float | None = None,
+        recognition: Recognition = NOT_ASKED,
+        tracking: Tracking = "found",
     ) -> "FrameAnswer":
         """Answer that is the network's; ``explained`` is of a registration that was not taken."""
         segments = {
@@ -81,7 +91,7 @@ class FrameAnswer:
             for segment in found.segments
             if segment.voxels
         }
-        return cls(found.surfaces, segments, found.reading, "network", False, explained, recognition)
+        return cls(found.surfaces, segments, found.reading, "network", tracking, explained, recognition)
 
     @classmethod
     def of_registration(cls, found: Answer, uncertainty: bool = False) -> "FrameAnswer":
@@ -98,7 +108,7 @@ class FrameAnswer:
             segments[one.name] |= {"centroid_radius95": round(one.centroid_radius95, DIGITS), "volume95": one.volume95}
         radius95 = None if sure is None else sure.summary(sure.outline)
         method, known = registration.method, found.recognition
-        followed = cls(mesh, segments, found.hypothesis, method, found.tracked, explained, known, radius95)
+        followed = cls(mesh, segments, found.hypothesis, method, found.tracking, explained, known, radius95)
         return replace(followed, found_by=found.found_by)
 
 
@@ -116,10 +126,15 @@ class Answering:
         resolution: int,
         keep_all: bool = False,
         uncertainty: bool = False,
+        waits: bool = False,
     ) -> None:
-        """Answering with a network, a registrar or both; without a registrar the network alone answers each frame."""
+        """Answering with a network, a registrar or both; without a registrar the network alone answers each frame.
+
+        ``waits`` lets each frame of a lost object wait for its search, so that answers do not depend on their speed.
+        """
         self.model, self.resolution, self.keep_all, self.uncertainty = model, resolution, keep_all, uncertainty
-        self.tracker = None if registrar is None else Tracker(registrar)
+        executor = SynchronousExecutor() if waits else None
+        self.tracker = None if registrar is None else Tracker(registrar, executor=executor)
 
     def __call__(self, seen: Seen) -> FrameAnswer:
         """Answer to a frame; raises ``ValueError`` for unusable clouds, and where nothing is found."""
@@ -135,5 +150,12 @@ class Answering:
         if found.taken:
             return FrameAnswer.of_registration(found, self.uncertainty)
         explained = None if found.registration is None else round(found.registration.explained, 4)
+        if found.is_missing:
+            return FrameAnswer(None, {}, found.hypothesis, None, found.tracking, None, found.recognition)
         surfaces = replace(found, resolution=self.resolution).reconstruction
-        return FrameAnswer.of_network(surfaces, explained, found.recognition)
+        return FrameAnswer.of_network(surfaces, explained, found.recognition, found.tracking)
+
+    def close(self) -> None:
+        """End the search for a lost object, where one goes on."""
+        if self.tracker is not None:
+            self.tracker.close()

@@ -8,7 +8,7 @@
 | ``cloud``, ``strays`` | points that are taken for the object's, and the others; the input's frame and unit |
 | ``object/NAME`` | mesh of each segment that was found, in its colour |
 | ``answer/...``, ``points/...``, ``milliseconds/...`` | numbers of each frame (``series``) |
-| ``log`` | doubt, errors, and when the network was asked (``messages``) |
+| ``log`` | doubt, errors, and when the object was found (``messages``) |
 """
 
 import socket
@@ -209,11 +209,12 @@ class RerunLog:
 
     def _add_object(self, answer: FrameAnswer) -> None:
         """Meshes of the segments; faces and colours only where they have changed, which those of a model never do."""
-        present = {segment.name: segment for segment in answer.surfaces.segments if len(segment.faces)}
+        segments = () if answer.surfaces is None else answer.surfaces.segments
+        present = {segment.name: segment for segment in segments if len(segment.faces)}
         for name in self._found.keys() - present.keys():
             self._log(("object", name), self._rerun.Clear(recursive=True))
         self._found = {name: one for name, one in self._found.items() if name in present}
-        for index, segment in enumerate(answer.surfaces.segments):
+        for index, segment in enumerate(segments):
             if segment.name not in present:
                 continue
             before = self._found.get(segment.name)
@@ -238,6 +239,7 @@ def faces_of(segment: Segment) -> dict[str, Any]:
 
 def shading(answer: FrameAnswer, index: int) -> dict[str, Any]:
     """Fields of a segment's mesh that colour it; those by values at its vertices (``vertex_colors``) belong here."""
+    assert answer.surfaces is not None
     opacity = 255 if answer.surfaces.opaque[index] else round(255 * OUTER_OPACITY)
     return {"albedo_factor": (*answer.surfaces.segments[index].color, opacity)}
 
@@ -273,5 +275,5 @@ def messages(outcome: Outcome[FrameAnswer]) -> Iterator[tuple[str, str]]:
         return
     if found.recognition.told is not None and found.recognition is not NOT_ASKED:
         yield "WARN", f"{outcome.name}: {found.recognition.told}"
-    if not found.tracked and found.explained is not None:  # else it is asked for every frame
-        yield "INFO", f"{outcome.name}: the network was asked; the answer is by {found.method}"
+    if found.tracking == "found" and found.explained is not None:  # else a network alone is asked for every frame
+        yield "INFO", f"{outcome.name}: the object was found; the answer is by {found.method}"

@@ -11,6 +11,10 @@ scene as well."""
 FoundBy = Literal["search", "network"]
 """Who found the object in a frame: a search over poses and states, or a trained network."""
 
+Tracking = Literal["found", "followed", "lost"]
+"""State of a tracked object in a frame: found anew; followed from the last frame; or lost, so that its pose is not
+known."""
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -39,6 +43,7 @@ class FitConfig:
         samples, coarse_samples: points of the surface that stand for it in most steps, and in the choice of states.
         witnesses: how many of them are compared with what the frame rules out.
         exact_steps: last steps, which ask the faces themselves.
+        search_rounds: rounds of the search at most, while nothing explains the frame.
         scale_std: standard deviation of the scale's logarithm where the unit is not known.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface,
             in scene units.
@@ -75,6 +80,7 @@ class FitConfig:
     refined: int = 2
     rounds: int = 2
     curved: int = 300
+    search_rounds: int = 3
     scale_std: float = 0.1
     samples: int = 3000
     coarse_samples: int = 1000

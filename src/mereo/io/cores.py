@@ -3,6 +3,7 @@
 import math
 import os
 import sys
+import threading
 import time
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -113,14 +114,38 @@ def use_threads(count: int) -> None:
         threadpool_limits(count)
 
 
+class _OneBlasThread:
+    """Limit of BLAS to one thread that several threads of a program may hold at once; the last to leave lifts it."""
+
+    def __init__(self) -> None:
+        self._changing, self._holders = threading.Lock(), 0
+        self._limit: AbstractContextManager[object] | None = None
+
+    def __enter__(self) -> None:
+        from threadpoolctl import threadpool_limits
+
+        with self._changing:
+            if self._holders == 0:
+                self._limit = threadpool_limits(1, "blas")
+            self._holders += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._changing:
+            self._holders -= 1
+            if self._holders == 0 and self._limit is not None:
+                self._limit.__exit__(None, None, None)
+
+
+_ONE_BLAS_THREAD = _OneBlasThread()
+
+
 def one_blas_thread() -> AbstractContextManager[object]:
     """Hold BLAS to one thread: its sums come out the same on any number of cores.
 
-    And where products are small it is faster than two, on busy cores 20 times.
+    And where products are small it is faster than two, on busy cores 20 times. The limit is the whole process's, and
+    lasts until the last thread that holds it lets go.
     """
-    from threadpoolctl import threadpool_limits
-
-    return threadpool_limits(1, "blas")
+    return _ONE_BLAS_THREAD
 
 
 def workers_for(workers: int, threads: int) -> int:

@@ -236,11 +236,19 @@ class Problem:
 
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""
-        sigma, surface = self.config.cloud_sigma, surface or Surface.of(self.model, posed)
-        cloud = self.cloud_misfit(surface)
+        surface = surface or Surface.of(self.model, posed)
+        cloud, network = self.cloud_misfit(surface), self.network.energy(posed, self.network_sigma)
+        return self.total(cloud, network, self._witness_square(surface), posed.z)
+
+    def witness_misfit(self, surface: Surface) -> float:
+        """Misfit of all vertices that the frame rules out."""
+        return self._witness_square(surface) * WITNESS_WEIGHT * WITNESSES
+
+    def _witness_square(self, surface: Surface) -> float:
+        """Mean square of how far a vertex is ruled out, in standard deviations."""
+        sigma = self.config.cloud_sigma
         amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * sigma)[1]
-        outside = float(robust_square(amount, sigma, 4 * ROBUST).mean())
-        return self.total(cloud, self.network.energy(posed, self.network_sigma), outside, posed.z)
+        return float(robust_square(amount, sigma, 4 * ROBUST).mean())
 
     def ruled_out(self, surface: Surface) -> float:
         """Share of a surface's vertices that the frame rules out by more than ``FAR``."""

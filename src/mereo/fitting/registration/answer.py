@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.config import FoundBy
+from mereo.fitting.config import FoundBy, Tracking
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
 from mereo.fitting.registration.register import Registrar
@@ -86,6 +86,7 @@ class Answer:
         label_points: whether ``reconstruction`` also says on which segment each observed point lies.
         seconds: that it took, without ``reconstruction``.
         found_by: who found the object; of a tracked answer, when it began to be followed.
+        tracking: of a tracked object; what is lost has no pose, and ``recognition`` says why.
     """
 
     seen: Observation
@@ -102,6 +103,7 @@ class Answer:
     label_points: bool = False
     seconds: float = 0.0
     found_by: FoundBy = "network"
+    tracking: Tracking = "found"
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.seen.frame.source!r}: {self.source})"
@@ -119,11 +121,18 @@ class Answer:
     @property
     def tracked(self) -> bool:
         """Whether the last frame's state led to the answer, so that the network was not asked."""
-        return self.candidate is None
+        return self.tracking == "followed"
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether there are no surfaces: the object is lost, and no network answers."""
+        return self.tracking == "lost" and self.model is None
 
     @property
     def source(self) -> str:
         """Where the answer comes from, in a phrase."""
+        if self.is_missing:
+            return "lost"
         if self.registration is None:
             return "network alone" if self.refusal is None else f"network alone: {self.refusal}"
         told = self.registration.told
@@ -140,8 +149,10 @@ class Answer:
     def reconstruction(self) -> Reconstruction:
         """Surfaces, label grid and figures of all segments, in the frame's axes and unit.
 
-        Raises ``ValueError`` where the network answers and finds no segment.
+        Raises ``ValueError`` where the network answers and finds no segment, and where a lost object has no network.
         """
+        if self.is_missing:
+            raise ValueError(self.recognition.reason)
         with stage("extract surfaces and labels"):
             if self.taken and self.registration is not None:
                 return registered_reconstruction(

@@ -159,7 +159,7 @@ def search(whole: Problem, partial: Problem | None = None) -> Found:
             taken where it explains the frame better by more than ``WHOLE``.
     """
     trails = [_Trail(whole)] if partial is None else [_Trail(whole), _Trail(partial, WHOLE)]
-    for number, stage in enumerate(ROUNDS):
+    for number, stage in enumerate(ROUNDS[: whole.config.search_rounds]):
         for trail in trails:
             trail.go_on(stage)
         for trail, other in permutations(trails, 2):  # either may have found what the other has missed

@@ -1,6 +1,6 @@
 """Constants of following an object from frame to frame; light, so that the command line may import them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 StreamMethod = Literal["auto", "network", "search", "modes"]
@@ -32,6 +32,8 @@ class TrackConfig:
         gate: distance from the expected surface beyond which a point is left out, as a share of the same half.
         drop: share of the points by which a frame may be explained less than the best since the network was asked.
         margin: share of the points that a frame's own fit must explain more than a lost track to take its place.
+        least_area: share of the greatest area that was ever seen of the object, below which it is lost.
+        most_ruled_out: share of the surface that the frame may rule out before the object is lost.
         scale_std: standard deviation of the scale's logarithm from frame to frame, where the unit is not known.
         longest_s: a longer time without a frame ends the track.
     """
@@ -53,5 +55,12 @@ class TrackConfig:
     gate: float = 0.25
     drop: float = 0.05
     margin: float = 0.02
+    least_area: float = 0.15
+    most_ruled_out: float = 0.3
     scale_std: float = 0.002
     longest_s: float = 1.0
+
+    @property
+    def patient(self) -> "TrackConfig":
+        """The same with more steps, the first of them wider: for what has moved far since the last frame."""
+        return replace(self, steps=4 * self.steps, first_sigma=2 * self.first_sigma, cooling=0.75)

@@ -25,9 +25,10 @@ from mereo.fitting.problem.priors import Prior
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.search.search import WHOLE
 from mereo.fitting.tracking.config import TrackConfig
 from mereo.geometry.downsampling import means_along_sight
-from mereo.geometry.sight_lines import SightLines
+from mereo.geometry.sight_lines import SightKind, SightLines
 from mereo.io.cores import one_blas_thread
 from mereo.models.calibration import Calibration
 
@@ -45,6 +46,8 @@ class Track:
         unsure: how far the velocity may be off because little is known yet, scene units per second.
         noise: of the frames, smoothed, scene units.
         clean: constants of frames without noise; ``problem`` has those for ``noise``.
+        elsewhere: kind of the lines of sight of which a frame says nothing, as it was when the track began.
+        area: greatest area of the object that was seen (``seen_area``).
         calibration: as ``ModesFit`` has it.
     """
 
@@ -56,6 +59,8 @@ class Track:
     unsure: float
     noise: float
     clean: FitConfig
+    elsewhere: SightKind
+    area: float
     calibration: Calibration | None = None
 
     @classmethod
@@ -73,8 +78,9 @@ class Track:
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
         share_surfaces(base, problem)
         still, noise = np.zeros(POSE + model.count), fitted.problem.noise_beside(fitted.surface)
-        unit, unsure = fitted.unit * scale, config.first_speed
-        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, fitted.calibration)
+        unit, unsure, seen = fitted.unit * scale, config.first_speed, base.evidence
+        area, kind = seen_area(seen), seen.elsewhere
+        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, kind, area, fitted.calibration)
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
@@ -138,21 +144,38 @@ def next_fit(
         time_s: of the frame.
         config: constants.
         lines: what is known of the lines of sight beside the points, in the same frame and unit. Where they leave it
-            open, the object is seen whole or in part as it was when the track began.
+            open, the object is seen whole or in part as it was when the track began; where it was seen whole and the
+            frame rules that out by more than ``WHOLE``, it is fitted as seen in part too, and the better fit is taken.
     """
     started = time.perf_counter()
     with one_blas_thread():
         few = means_along_sight(points / track.unit, config.points)
-        beside = lines.scaled(1 / track.unit)
-        beside = replace(beside, elsewhere=beside.elsewhere or track.problem.evidence.elsewhere)
-        problem = replace(track.problem, evidence=Evidence.of(few, doubtful / track.unit, config.partners, beside))
-        share_surfaces(track.problem, problem)
         start = track.expected(time_s, config)
-        passed = max(time_s - track.time_s, 0.0)
-        posed = descend(problem, start, Expectation.of(track, start, passed, config), config)
-    seconds = time.perf_counter() - started
-    fitted = ModesFit(problem, nothing(), track.unit, posed, seconds, calibration=track.calibration)
+        expectation = Expectation.of(track, start, max(time_s - track.time_s, 0.0), config)
+
+        def fit(elsewhere: SightKind) -> ModesFit:
+            beside = replace(lines.scaled(1 / track.unit), elsewhere=elsewhere)
+            problem = replace(track.problem, evidence=Evidence.of(few, doubtful / track.unit, config.partners, beside))
+            share_surfaces(track.problem, problem)
+            posed = descend(problem, start, expectation, config)
+            return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
+
+        fitted = fit(lines.elsewhere or track.elsewhere)
+        if lines.elsewhere is None and is_ruled_out(fitted):
+            fitted = less_ruled_out(fitted, fit("unknown"))
+    fitted = replace(fitted, seconds=time.perf_counter() - started)
     return fitted, followed(track, fitted, time_s, config)
+
+
+def is_ruled_out(fitted: ModesFit) -> bool:
+    """Whether a frame rules out so much of a state that something may hide the object in part."""
+    return fitted.problem.witness_misfit(fitted.surface) > WHOLE
+
+
+def less_ruled_out(whole: ModesFit, partial: ModesFit) -> ModesFit:
+    """The second fit, to an object of which a part is hidden, where it is better by as much as a search demands."""
+    misfits = [fitted.problem.misfit(fitted.posed, fitted.surface).total for fitted in (whole, partial)]
+    return partial if misfits[1] + WHOLE < misfits[0] else whole
 
 
 def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig) -> Track:
@@ -164,7 +187,22 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     noise = track.noise + config.smoothing * (fitted.problem.noise_beside(fitted.surface) - track.noise)
     problem = replace(fitted.problem, config=constants_for(noise, track.clean))
     share_surfaces(fitted.problem, problem)
-    return Track(problem, track.unit * scale, posed, time_s, velocity, unsure, noise, track.clean, track.calibration)
+    return replace(
+        track,
+        problem=problem,
+        unit=track.unit * scale,
+        posed=posed,
+        time_s=time_s,
+        velocity=velocity,
+        unsure=unsure,
+        noise=noise,
+        area=max(track.area, seen_area(problem.evidence)),
+    )
+
+
+def seen_area(evidence: Evidence) -> float:
+    """Area of the surface that was seen, across the lines of sight: that of a pixel for each point, scene units."""
+    return float(((evidence.pitch * evidence.ranges) ** 2).sum())
 
 
 def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:

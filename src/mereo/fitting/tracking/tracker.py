@@ -1,30 +1,34 @@
-"""An object followed from frame to frame: each fit starts where the last ended, and asks network or search when lost.
+"""An object followed from frame to frame: each fit starts where the last ended, and network or search find it if lost.
 
-    Observation, time -Tracker.follow-> Answer (tracked from the last state, or of the frame by itself)
+    Observation, time -Tracker.follow-> Answer (found, followed or lost)
 
-What can be seen of a lost object is that the model explains fewer of the frame's points than it did. Then, and at
-first, the frame is fitted by itself, as `mereo reconstruct` does, and the better of both is gone on with.
+What can be seen of a lost object: few points lie near where it was expected, the model explains fewer of them than it
+must, or the frame rules out much of it. Then, and at first, a network fits the frame by itself, as `mereo reconstruct`
+does, and the better of both is gone on with. Where that explains nothing, or there is no network, the answer says that
+the object is lost, and a search goes on in the background; its state, fitted to the newest frame, begins a new track.
 """
 
 import time
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from mereo.fitting.config import FitConfig, FoundBy
+from mereo.fitting.config import FitConfig, FoundBy, Tracking
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_of, find, in_found_unit
 from mereo.fitting.registration.fit import ModesFit
-from mereo.fitting.registration.recognition import recognize
+from mereo.fitting.registration.recognition import MOST, Recognition, recognize
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
+from mereo.fitting.tracking.background_search import BackgroundSearch, TrackedFrame
 from mereo.fitting.tracking.config import TrackConfig
-from mereo.fitting.tracking.next_fit import Track, gated, next_fit
+from mereo.fitting.tracking.next_fit import Track, gated, next_fit, seen_area
+from mereo.geometry.brief import counted
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.transforms import transform_points
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.reconstruction.strays import Reading
 
 
@@ -37,18 +41,43 @@ class Tracker:
         config: constants.
     """
 
-    def __init__(self, registrar: Registrar, config: TrackConfig = TrackConfig()) -> None:  # noqa: B008 (frozen)
+    def __init__(
+        self,
+        registrar: Registrar,
+        config: TrackConfig = TrackConfig(),  # noqa: B008 (frozen)
+        executor: Executor | None = None,
+    ) -> None:
+        """Follow an object.
+
+        Args:
+            registrar: of the object.
+            config: constants.
+            executor: what searches for a lost object (``BackgroundSearch``); None for a thread of its own.
+        """
         # a frame that nobody understands comes 30 times a second while the object is away
         self.registrar = registrar.at_once
         self.config = config
+        self._search = BackgroundSearch(registrar, executor)
         self.forget()
 
+    def __enter__(self) -> "Tracker":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def forget(self) -> None:
-        """Start anew: the next frame is fitted by itself."""
+        """Start anew: the next frame is fitted by itself; a search that goes on is given up."""
+        self._search.close(wait=False)
         self._track: Track | None = None
         self._T_camera_input, self._axes = np.eye(4), "camera"
         self._best = 0.0
         self._found_by: FoundBy = "network"
+        self._has_begun = False
+
+    def close(self) -> None:
+        """Give up the search that goes on, if one does, and wait until its thread has ended."""
+        self._search.close(wait=True)
 
     def follow(
         self, seen: Observation, time_s: float, *, scene_unit: float | None = None, keep_all: bool = False
@@ -61,58 +90,137 @@ class Tracker:
             scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
             keep_all: take every point for the object's.
 
-        Raises ``ValueError`` for unusable clouds and, unless the registrar's method is "auto", where a frame that is
-        fitted by itself finds too little. The track is kept: the object may come again.
+        The first frame is waited for, however long a search takes. Raises ``ValueError`` for unusable clouds and,
+        unless a network or a track can answer, where a frame that is fitted by itself finds too little. The track is
+        kept: the object may come again.
         """
-        started = time.perf_counter()
-        tracked = self._tracked(seen, time_s, keep_all)
-        if tracked is not None and self._believed(tracked):
-            return self._gone_on(seen, tracked, started)
-        found, likelier = find(seen, self.registrar.network, self.registrar, keep_all, scene_unit)
-        must_register = self.registrar.method != "auto" or self.registrar.network is None
+        started, frame = time.perf_counter(), TrackedFrame(seen, time_s, scene_unit, keep_all)
+        tracked, why = self._tracked(self._track, frame, self.config.longest_s)
+        if tracked is not None and self._is_believed(tracked):
+            return self._gone_on(frame, tracked, started)
+        alone = None
+        if self.registrar.asks_network or not self._has_begun:
+            alone = self._by_itself(frame, tracked, started)
+            if alone.tracking != "lost":
+                return alone
+        again = self._searched(frame)
+        if again is None:
+            self._search.start(frame)
+            again = self._searched(frame)  # some executors have done it now
+        if again is not None:
+            return self._gone_on(frame, again, started, "found")
+        return self._lost(frame, alone, why if tracked is None else self._doubt(tracked), started)
+
+    # --- fits that may be the answer ----------------------------------------------------------------------------------
+
+    def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> "tuple[_Tracked | None, str]":
+        """The frame fitted from an earlier state; None, and why, without one that leads here."""
+        seen, time_s = frame.seen, frame.time_s
+        if track is None or seen.frame.axes != self._axes:
+            return None, "nothing explains what is seen"
+        passed_s = time_s - track.time_s
+        if not 0 <= passed_s <= longest_s:
+            return None, f"it was last followed {passed_s:.1f} s before"
+        points = transform_points(self._T_camera_input, seen.cloud.points)
+        keep = np.ones(len(points), dtype=bool) if frame.keep_all else gated(track, points, time_s, self.config)
+        if keep.sum() < MIN_POINTS:
+            return None, f"{counted(int(keep.sum()), 'point')} of at least {MIN_POINTS} lie near where it was expected"
+        lines = seen.lines.transformed(self._T_camera_input)
+
+        def fit(config: TrackConfig) -> _Tracked:
+            fitted, after = next_fit(track, points[keep], points[~keep], time_s, config, lines)
+            return _Tracked(fitted, after, Reading(seen.cloud, keep))
+
+        tracked = fit(self.config)
+        if not tracked.registration.accepted and not self.registrar.asks_network:  # it may have moved far
+            tracked = max(tracked, fit(self.config.patient), key=lambda one: one.score)
+        return tracked, ""
+
+    def _searched(self, frame: TrackedFrame) -> "_Tracked | None":
+        """The frame fitted from the state that a search has found in an earlier one; None where that explains none."""
+        searched = self._search.take()
+        if searched is None or searched.candidate.modes is None:
+            return None
+        before = self._T_camera_input, self._axes
+        self._T_camera_input, self._axes = searched.candidate.encoded.T_camera_input, searched.frame.seen.frame.axes
+        own = _Tracked.of_frame(searched.candidate, searched.frame.time_s, self.config, self.registrar.config)
+        area = 0.0 if self._track is None else self._track.area
+        tracked, _ = self._tracked(replace(own.track, area=max(area, own.track.area)), frame, np.inf)
+        if tracked is not None and self._takes(tracked):
+            self._found_by = "search"
+            return tracked
+        self._T_camera_input, self._axes = before
+        return None
+
+    def _by_itself(self, frame: TrackedFrame, tracked: "_Tracked | None", started: float) -> Answer:
+        """Answer of a frame by itself, with which a track begins; or of the track that went on, where that is better.
+
+        It is lost where neither explains the frame, and then the track is kept.
+        """
+        seen, registrar, config = frame.seen, self.registrar, self.config
+        found, likelier = find(seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
+        must_register = registrar.method != "auto" or registrar.network is None
         if found.modes is None and tracked is None and must_register:
             assert found.error is not None
             raise found.error
-        own = None if found.modes is None else _Tracked.of_frame(found, time_s, self.config, self.registrar.config)
-        if (
-            tracked is not None
-            and self._takes(tracked)
-            and (own is None or own.score <= tracked.score + self.config.margin)
-        ):
-            return self._gone_on(seen, tracked, started, restart=True)
-        return self._begun(seen, found, own, likelier, started)
+        self._has_begun = True
+        own = None if found.modes is None else _Tracked.of_frame(found, frame.time_s, config, registrar.config)
+        if tracked is not None and self._takes(tracked) and (own is None or own.score <= tracked.score + config.margin):
+            return self._gone_on(frame, tracked, started, restart=True)
+        if own is None or not self._takes(own):
+            registration = None if own is None else own.registration
+            answer = answer_of(seen, registrar.network, None, found, likelier, registration)
+            return replace(answer, registrar=registrar, tracking="lost")
+        self._search.drop()
+        self._track, self._best, self._found_by = own.track, own.score, found.found_by
+        self._T_camera_input, self._axes = found.encoded.T_camera_input, seen.frame.axes
+        answer = answer_of(seen, registrar.network, registrar, found, likelier, own.registration)
+        return replace(answer, seconds=time.perf_counter() - started)
 
-    def _tracked(self, seen: Observation, time_s: float, keep_all: bool) -> "_Tracked | None":
-        """The frame fitted from the last state; None without one that leads here."""
-        track, config = self._track, self.config
-        if track is None or seen.frame.axes != self._axes or not 0 <= time_s - track.time_s <= config.longest_s:
-            return None
-        points = transform_points(self._T_camera_input, seen.cloud.points)
-        keep = np.ones(len(points), dtype=bool) if keep_all else gated(track, points, time_s, config)
-        if keep.sum() < MIN_POINTS:
-            return None
-        lines = seen.lines.transformed(self._T_camera_input)
-        fitted, after = next_fit(track, points[keep], points[~keep], time_s, config, lines)
-        return _Tracked(fitted, after, Reading(seen.cloud, keep))
+    # --- what is believed ---------------------------------------------------------------------------------------------
 
-    def _believed(self, tracked: "_Tracked") -> bool:
+    def _is_believed(self, tracked: "_Tracked") -> bool:
         """Whether the frame need not be fitted by itself."""
-        if not (tracked.registration.accepted or self.registrar.asks_network or self.registrar.method == "modes"):
-            return False  # a search's answer is taken in any case, as nobody else has one
-        return self._takes(tracked) and tracked.score >= self._best - self.config.drop
+        if not self._takes(tracked):
+            return False
+        return not self.registrar.asks_network or tracked.score >= self._best - self.config.drop
 
     def _takes(self, candidate: "_Tracked") -> bool:
-        return self.registrar.takes(candidate.registration)
+        """Whether a fit is the answer to a frame; with "modes" any is."""
+        if not self.registrar.takes(candidate.registration):
+            return False
+        return self.registrar.method == "modes" or not self._doubt(candidate)
 
-    def _gone_on(self, seen: Observation, tracked: "_Tracked", started: float, restart: bool = False) -> Answer:
-        """Answer that the last frame's state led to."""
+    def _doubt(self, tracked: "_Tracked") -> str:
+        """What speaks against a fit, by the frame alone, in a clause; "" where nothing does."""
+        registration, config = tracked.registration, self.config
+        if tracked.area < config.least_area:
+            return f"only {tracked.area:.0%} as much of it as before can be seen"
+        if not registration.accepted:
+            return f"only {registration.explained:.0%} of the points near where it was expected can be its own"
+        if registration.ruled_out is not None and registration.ruled_out > config.most_ruled_out:
+            return f"{registration.ruled_out:.0%} of it would lie where the frame shows none of it"
+        return ""
+
+    # --- answers ------------------------------------------------------------------------------------------------------
+
+    def _gone_on(
+        self,
+        frame: TrackedFrame,
+        tracked: "_Tracked",
+        started: float,
+        tracking: Tracking = "followed",
+        restart: bool = False,
+    ) -> Answer:
+        """Answer that an earlier frame's state led to."""
         self._track = tracked.track
-        self._best = tracked.score if restart else max(self._best, tracked.score)
+        self._best = tracked.score if restart or tracking == "found" else max(self._best, tracked.score)
+        self._search.drop()
         model = self.registrar.network
-        stated = self.registrar.stated_scene_unit(seen.frame.unit_m)
+        stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)
         calibration = None if model is None else model.calibration
         recognition = recognize(tracked.registration, calibration, stated_scene_unit=stated)
-        seen = in_found_unit(seen, self.registrar, tracked.registration, recognition)
+        seen = in_found_unit(frame.seen, self.registrar, tracked.registration, recognition)
         return Answer(
             seen=seen.read_as(tracked.hypothesis),
             model=model,
@@ -123,19 +231,18 @@ class Tracker:
             taken=True,
             recognition=recognition,
             found_by=self._found_by,
+            tracking=tracking,
             seconds=time.perf_counter() - started,
         )
 
-    def _begun(
-        self, seen: Observation, found: Candidate, own: "_Tracked | None", likelier: EncodedFrame, started: float
-    ) -> Answer:
-        """Answer of a frame by itself; the track begins with it, or ends where it is not believed."""
-        registration = None if own is None else own.registration
-        answer = answer_of(seen, self.registrar.network, self.registrar, found, likelier, registration)
-        self._track = own.track if own is not None and answer.taken else None
-        self._T_camera_input, self._axes = found.encoded.T_camera_input, seen.frame.axes
-        self._best, self._found_by = 0.0 if own is None else own.score, found.found_by
-        return replace(answer, seconds=time.perf_counter() - started)
+    def _lost(self, frame: TrackedFrame, alone: Answer | None, why: str, started: float) -> Answer:
+        """Answer of a frame in which the object cannot be found: what a network alone says of it, or nothing."""
+        reason = f"the object is lost: {why}; it is being searched for, so keep it in view, or start again with it"
+        if alone is None or alone.model is None:
+            hypothesis = Reading.of_all(frame.seen.cloud)
+            alone = Answer(frame.seen, None, self.registrar, hypothesis, self._T_camera_input, found_by="search")
+        recognition = Recognition(False, reason, MOST)
+        return replace(alone, recognition=recognition, tracking="lost", seconds=time.perf_counter() - started)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,3 +268,8 @@ class _Tracked:
     def score(self) -> float:
         """Share of all points of the frame that are explained."""
         return self.registration.explained * float(self.hypothesis.keep.mean())
+
+    @cached_property
+    def area(self) -> float:
+        """Area of the object that was seen, as a share of the greatest ever."""
+        return seen_area(self.fitted.problem.evidence) / self.track.area

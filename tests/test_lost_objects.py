@@ -1,0 +1,271 @@
+"""A tracked object without weights that is lost: its frames say so, and it is searched beside them."""
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tracked_views import CAMERA, bare, lump_model, mesh_of, rms, view
+
+from mereo.api.result import Result
+from mereo.cli.stream import SurfaceFolder, line
+from mereo.cli.stream_answers import Answering, Seen
+from mereo.fitting.registration.answer import Candidate
+from mereo.fitting.registration.hypotheses import search_hypotheses
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.tracking import background_search
+from mereo.fitting.tracking.background_search import BackgroundSearch, SynchronousExecutor, TrackedFrame
+from mereo.fitting.tracking.tracker import Tracker
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.reconstruction.observation import Observation, observe
+from mereo.reconstruction.pipeline import EncodedFrame
+from mereo.reconstruction.stream import Outcome
+from mereo.synthesis.clutter import Capsule
+
+
+@pytest.fixture(scope="module")
+def registrar() -> Registrar:
+    return Registrar(None, lump_model())
+
+
+class HeldExecutor(Executor):
+    """Executor that does its work when it is told to."""
+
+    def __init__(self) -> None:
+        self.held: list[tuple[Future[Any], Callable[[], Any]]] = []
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.held.append((Future(), lambda: fn(*args, **kwargs)))
+        return self.held[-1][0]
+
+    def work(self) -> None:
+        """Do what was submitted last."""
+        future, work = self.held[-1]
+        future.set_result(work())
+
+
+@pytest.fixture(scope="module")
+def here(registrar: Registrar) -> SegmentedMesh:
+    return mesh_of(registrar.model, 20)
+
+
+@pytest.fixture(scope="module")
+def there(registrar: Registrar) -> SegmentedMesh:
+    """The same state, moved by its own length and turned."""
+    found = mesh_of(registrar.model, 50)
+    shift = np.array([22.0, 10.0, 60.0])
+    return found.with_vertices([segment.vertices + shift for segment in found.segments])
+
+
+@pytest.fixture(scope="module")
+def frames(here: SegmentedMesh, there: SegmentedMesh) -> dict[str, Observation]:
+    """The object here and there, nine tenths of it hidden, and another thing where it was."""
+    shown = bare(view(here))
+    points = shown.cloud.points
+    hidden = points[points[:, 0] > np.quantile(points[:, 0], 0.9)]
+    middle = points.mean(axis=0)
+    along = np.array([25.0, 20.0, 0.0])
+    rod = Capsule(middle - along, middle + along, 2.0)
+    rays = CAMERA.directions().reshape(-1, 3)
+    rows, hits = rod.first_hit(rays)
+    thing = rays[rows] * hits.distance[:, None]
+    return {
+        "here": shown,
+        "there": bare(view(there, 1)),
+        "hidden": observe(PointCloud(hidden)),
+        "thing": observe(PointCloud(thing)),
+    }
+
+
+Searches = list[Observation]
+
+
+@pytest.fixture
+def searches(
+    registrar: Registrar, frames: dict[str, Observation], monkeypatch: pytest.MonkeyPatch, known: dict[int, Any]
+) -> Searches:
+    """Frames that were searched, each in truth only once; another thing is found nowhere."""
+    asked: Searches = []
+
+    def search(seen: Observation, *_: object) -> tuple[Candidate, EncodedFrame]:
+        asked.append(seen)
+        searched = frames["here"] if seen is frames["thing"] else seen
+        if id(searched) not in known:
+            known[id(searched)] = search_hypotheses(searched, registrar, False, 1.0)
+        candidate, likelier = known[id(searched)]
+        if seen is frames["thing"]:
+            candidate = replace(candidate, modes=None, error=ValueError("nothing is found"))
+        return candidate, likelier
+
+    monkeypatch.setattr("mereo.fitting.registration.answer_frame.search_hypotheses", search)
+    monkeypatch.setattr(background_search, "search_hypotheses", search)
+    return asked
+
+
+@pytest.fixture(scope="module")
+def known() -> dict[int, Any]:
+    return {}
+
+
+@pytest.fixture
+def held() -> HeldExecutor:
+    return HeldExecutor()
+
+
+@pytest.fixture
+def begun(
+    registrar: Registrar, frames: dict[str, Observation], searches: Searches, held: HeldExecutor
+) -> Iterator[Tracker]:
+    """Tracker that has seen the object here in two frames."""
+    with Tracker(registrar, executor=held) as tracker:
+        answers = [tracker.follow(frames["here"], 0.03 * number, scene_unit=1.0) for number in range(2)]
+        assert [one.tracking for one in answers] == ["found", "followed"] and searches == [frames["here"]]
+        searches.clear()
+        yield tracker
+
+
+@pytest.mark.parametrize(
+    "name, reason",
+    [
+        ("there", r"\d+ points of at least \d+ lie near where it was expected"),
+        ("hidden", r"only \d+% as much of it as before can be seen"),
+        ("thing", r"only \d+% of the points near where it was expected can be its own"),
+    ],
+)
+def test_a_lost_object_is_told_in_the_same_frame_and_has_no_pose(
+    begun: Tracker, held: HeldExecutor, frames: dict[str, Observation], name: str, reason: str
+) -> None:
+    answer = begun.follow(frames[name], 0.06, scene_unit=1.0)
+    assert answer.tracking == "lost" and not answer.tracked and not answer.taken
+    assert answer.registration is None and answer.registered is None and answer.recognition.known is False
+    sentence = rf"^the object is lost: {reason}; it is being searched for, so keep it in view, or start again with it$"
+    with pytest.raises(ValueError, match=sentence):
+        _ = answer.surfaces
+    assert answer.hypothesis.keep.all() and answer.seen.cloud is frames[name].cloud
+    result = Result.of(answer)
+    assert "the object is lost" in repr(result) and "the object is lost" in result._repr_html_()
+    assert repr(answer).endswith(": lost)") and len(held.held) == 1
+    # in its old place it is followed at once, and nobody waits for the search any more
+    assert begun.follow(frames["here"], 0.09, scene_unit=1.0).tracking == "followed"
+    assert held.held[0][0].cancelled()
+
+
+def test_it_is_searched_in_the_latest_lost_frame_one_at_a_time(
+    begun: Tracker, held: HeldExecutor, frames: dict[str, Observation], searches: Searches, there: SegmentedMesh
+) -> None:
+    for number in range(3):
+        assert begun.follow(frames["thing"], 0.1 + 0.03 * number, scene_unit=1.0).tracking == "lost"
+    assert len(held.held) == 1 and not searches
+    held.work()  # nothing is found, and the newest frame is searched
+    assert begun.follow(frames["there"], 0.3, scene_unit=1.0).tracking == "lost"
+    assert len(held.held) == 2
+    held.work()
+    assert searches == [frames["thing"], frames["there"]]
+    found = begun.follow(frames["there"], 5.0, scene_unit=1.0)
+    assert found.tracking == "found" and found.found_by == "search" and found.taken and not found.tracked
+    assert rms(found, there) < 0.7 and len(held.held) == 2
+    assert begun.follow(frames["there"], 5.03, scene_unit=1.0).tracking == "followed"
+
+
+def test_what_was_found_must_explain_the_newest_frame(
+    begun: Tracker, held: HeldExecutor, frames: dict[str, Observation], here: SegmentedMesh
+) -> None:
+    assert begun.follow(frames["there"], 0.1, scene_unit=1.0).tracking == "lost"
+    held.work()
+    # it has gone back meanwhile: the old track explains it, and what was found there is forgotten
+    back = begun.follow(frames["here"], 0.2, scene_unit=1.0)
+    assert back.tracking == "followed" and rms(back, here) < 0.7
+    assert begun.follow(frames["there"], 0.3, scene_unit=1.0).tracking == "lost"
+    held.work()
+    assert begun.follow(frames["thing"], 0.4, scene_unit=1.0).tracking == "lost" and len(held.held) == 3
+    # later than any expectation lasts
+    late = begun.follow(frames["here"], 9.0, scene_unit=1.0)
+    assert late.tracking == "lost" and "it was last followed 8.8 s before" in str(late.recognition.reason)
+
+
+def test_an_executor_that_works_at_once_finds_it_in_the_same_frame(
+    registrar: Registrar, frames: dict[str, Observation], searches: Searches, there: SegmentedMesh
+) -> None:
+    tracker = Tracker(registrar, executor=SynchronousExecutor())
+    shown = [frames[name] for name in ("here", "there", "thing", "thing")]
+    answers = [tracker.follow(one, 0.03 * number, scene_unit=1.0) for number, one in enumerate(shown)]
+    assert [one.tracking for one in answers] == ["found", "found", "lost", "lost"]
+    assert searches == shown and rms(answers[1], there) < 0.7
+
+
+def test_the_own_thread_blocks_no_frame_and_ends(
+    registrar: Registrar,
+    frames: dict[str, Observation],
+    searches: Searches,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    waiting, goes_on, search = threading.Event(), threading.Event(), background_search.search_hypotheses
+
+    def slow(seen: Observation, *rest: Any) -> tuple[Candidate, EncodedFrame]:
+        waiting.set()
+        assert goes_on.wait(60) and threading.current_thread().name.startswith("mereo-search")
+        return search(seen, *rest)
+
+    monkeypatch.setattr(background_search, "search_hypotheses", slow)
+
+    def threads() -> list[str]:
+        return [one.name for one in threading.enumerate() if one.name.startswith("mereo-search")]
+
+    with Tracker(registrar) as tracker:
+        tracker.follow(frames["here"], 0.0, scene_unit=1.0)
+        assert not threads()
+        assert tracker.follow(frames["there"], 0.03, scene_unit=1.0).tracking == "lost" and waiting.wait(60)
+        assert tracker.follow(frames["there"], 0.06, scene_unit=1.0).tracking == "lost" and len(threads()) == 1
+        goes_on.set()
+        running = tracker._search._running
+        assert running is not None and running.result(60).frame.time_s == 0.03
+        assert tracker.follow(frames["there"], 0.09, scene_unit=1.0).tracking == "found"
+        # given up while it goes on: its thread ends with it, and the next frame is a first one
+        assert tracker.follow(frames["thing"], 0.12, scene_unit=1.0).tracking == "lost"
+        tracker.forget()
+        assert tracker.follow(frames["here"], 0.15, scene_unit=1.0).tracking == "found"
+        assert tracker.follow(frames["thing"], 0.18, scene_unit=1.0).tracking == "lost"
+    tracker.close()
+    for one in threading.enumerate():
+        if one.name.startswith("mereo-search"):
+            one.join(60)
+    assert not threads()
+
+
+def test_faults_of_a_search_are_raised_and_unusable_frames_are_none(registrar: Registrar, held: HeldExecutor) -> None:
+    search, frame = BackgroundSearch(registrar, held), TrackedFrame(observe(PointCloud(np.eye(3))), 0.0)
+    assert search.take() is None
+    for problem in (ValueError("3 points"), OSError("broken")):
+        search.start(frame)
+        search.start(frame)
+        assert search.take() is None
+        held.held[-1][0].set_exception(problem)
+        if isinstance(problem, ValueError):
+            assert search.take() is None
+        else:
+            with pytest.raises(OSError, match="broken"):
+                search.take()
+    assert len(held.held) == 2 and search.registrar.config.search_rounds == background_search.ROUNDS < 3
+
+
+def test_a_stream_says_it(
+    registrar: Registrar, frames: dict[str, Observation], searches: Searches, tmp_path: Path
+) -> None:
+    answering, folder = Answering(None, registrar, 24, waits=True), SurfaceFolder(tmp_path / "out", False)
+    lines = []
+    for number, name in enumerate(("here", "thing", "there")):
+        answer = answering(Seen(frames[name], 0.03 * number))
+        outcome = folder.written(Outcome("frame" if number < 2 else "last", 0.0, answer, "", 0.0, 0.0, 0), "camera")
+        lines.append(line(outcome))
+    answering.close()
+    assert [one["tracking"] for one in lines] == ["found", "lost", "found"]
+    assert "error" not in lines[1] and lines[1]["segments"] == {} and lines[1]["known"] is False
+    assert lines[1]["method"] is None and lines[1]["explained"] is None
+    assert lines[1]["reason"].startswith("the object is lost: only")
+    # surfaces of the frame that was there by this name before it was lost are gone
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["last.glb"]
