@@ -54,34 +54,30 @@ def training_reason(choice: TrainChoice, reasons: list[str], is_begun: bool) -> 
 def best_method(table: Mapping[str, Mapping[str, Any]]) -> tuple[Method, str]:
     """Choose who is to answer, with the reason in a sentence.
 
-    Of the answers whose mIoU is within ``CLEARLY`` of the best, and that explain as many views, the fastest is taken;
-    the network alone, which registers nothing, only where neither of the others is among them.
+    Of the search alone and both, that with the clearly higher mIoU is taken (by ``CLEARLY``), else that which explains
+    more views, else the faster one; the network alone, which registers nothing, only where it is clearly better still.
 
     Args:
         table: IoU, mIoU, explained share and seconds of "search", "network" and "both", on the same views.
     """
     scores = {name: float(row["miou"] if row["miou"] is not None else row["iou"]) for name, row in table.items()}
-    explained = max(table[name]["explained"] for name in ("search", "both"))
-    best = max(scores.values())
-    good = [name for name in ("search", "both") if scores[name] >= best - CLEARLY]
-    good = [name for name in good if table[name]["explained"] == explained] or good
-    if not good:
-        return "network", f"use the network alone: {_against(scores, 'network', 'both')}"
-    if good == ["search", "both"]:
-        fastest = min(good, key=lambda name: table[name]["seconds"])
-        slower = "both" if fastest == "search" else "search"
-        seconds = f"{table[fastest]['seconds']:.2f} s a frame, not {table[slower]['seconds']:.2f} s"
-        if fastest == "search":
-            return "search", f"use the search alone: as good as both, and faster ({seconds})"
-        return "auto", f"use both: as good as the search alone, and faster ({seconds})"
-    if good == ["search"]:
-        return "search", f"use the search alone: {_against(scores, 'search', 'both')}"
-    if scores["both"] < scores["search"] + CLEARLY:
-        shares = f"{table['both']['explained']:.0%} of the views, the search alone {table['search']['explained']:.0%}"
-        return "auto", f"use both: they explain {shares}"
-    return "auto", f"use both: {_against(scores, 'both', 'search')}"
+    search, both = table["search"], table["both"]
+    if scores["network"] > max(scores["search"], scores["both"]) + CLEARLY:
+        return "network", f"use the network alone: mIoU {_than(scores, 'network', 'both')}"
+    if abs(scores["both"] - scores["search"]) > CLEARLY:
+        is_both = scores["both"] > scores["search"]
+        reason = f"mIoU {_than(scores, 'both', 'search') if is_both else _than(scores, 'search', 'both')}"
+    elif both["explained"] != search["explained"]:
+        is_both = both["explained"] > search["explained"]
+        shares = f"{both['explained']:.0%} of the views by both, {search['explained']:.0%} by the search alone"
+        reason = f"it explains more, {shares}"
+    else:
+        is_both = both["seconds"] < search["seconds"]
+        times = f"{both['seconds']:.2f} s a frame with both, {search['seconds']:.2f} s with the search alone"
+        reason = f"as good as {'the search alone' if is_both else 'both'}, and faster, {times}"
+    return ("auto", f"use both: {reason}") if is_both else ("search", f"use the search alone: {reason}")
 
 
-def _against(scores: Mapping[str, float], name: str, other: str) -> str:
-    titles = {"search": "of the search alone", "both": "of both", "network": "of the network alone"}
-    return f"mIoU {format_score(scores[name])}, not {format_score(scores[other])} {titles[other]}"
+def _than(scores: Mapping[str, float], name: str, other: str) -> str:
+    titles = {"search": "of the search alone", "both": "of both"}
+    return f"{format_score(scores[name])}, not {format_score(scores[other])} {titles[other]}"
