@@ -1,6 +1,8 @@
 """``mereo learn`` trains an object only where the search alone is not good enough, and says which answers to use."""
 
 import json
+import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from mereo.learning import outcome, search_stage
 from mereo.learning.learn import learn
 from mereo.learning.object_files import scene_of_folder
 from mereo.learning.training_choice import best_method, is_to_train, shortcomings
+from mereo.scenes.files import check_states
 from mereo.scenes.kept_model import CACHE_VARIABLE
 
 GOOD = {"examples": 16, "iou": 0.96, "miou": 0.92, "lowest_miou": 0.8, "explained": 1.0, "seconds": 1.5}
@@ -188,20 +191,27 @@ def test_a_folder_knows_its_scene(scored: list[SearchScores], tmp_path: Path) ->
     assert "--object mine.py" in outcome.command(out, "mine.py", is_trained=False)
 
 
-def test_an_object_that_the_search_answers_needs_no_weights(
+def test_a_folder_without_weights_is_an_object(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setattr(search_stage, "LEAST_VIEWS", 2)
-    monkeypatch.setattr(search_stage, "VIEWS", 2)
+    for module, name, value in (
+        (search_stage, "LEAST_VIEWS", 1),
+        (search_stage, "VIEWS", 1),
+        (learning, "search_scores", partial(search_stage.search_scores, cells=24)),
+        (check_states, "STATES", 3),
+    ):
+        monkeypatch.setattr(module, name, value)
     out, meshes = tmp_path / "out", [str(path) for path in write_angle(tmp_path)]
-    command = ["learn", *meshes, "--units", "mm", "--output", str(out)]
+    command = ["learn", *meshes, "--units", "mm", "--train", "never", "--output", str(out)]
     assert command_line.main(command) == 0
     said, scores = capsys.readouterr().out, (out / "search.json").read_bytes()
-    assert "2 test views, 2 of them explained" in said and "nothing is trained: the search alone is good enough" in said
+    assert re.findall(r"\[(\d)/6\]", said) == ["1", "2"]
+    assert "1 test views, which training has not seen" in said and "nothing is trained" in said
     assert f"--object {out} --output" in said
     assert command_line.main(command) == 0
     assert (out / "search.json").read_bytes() == scores
+    assert 0.5 < json.loads((out / "metrics.json").read_text())["iou"] <= 1
     angle = mereo.load_object(out)
     assert angle.network is None and angle.names == ("long", "short")
     options = ["--object", str(out), "--resolution", "24", "--formats", "json", "--output", str(tmp_path / "result")]

@@ -161,8 +161,7 @@ class Screen:
         tables, state = self.tables, poses.state[:, None]
         size, inverse = np.exp(poses.log_scale)[:, None, None], poses.rotation.transpose(0, 2, 1)
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
-        index = ((seen - tables.low[state]) / tables.cell[state][..., None]).astype(np.int32)
-        index = np.clip(index, 0, CELLS - 1)
+        index = np.clip((seen - tables.low[state]) / tables.cell[state][..., None], 0, CELLS - 1).astype(np.int32)
         sample = tables.nearest[state, (index[..., 0] * CELLS + index[..., 1]) * CELLS + index[..., 2]]
         place, normal = tables.place[state, sample], tables.normal[state, sample]
         offset, narrow = seen - place, sigma / size[..., 0]

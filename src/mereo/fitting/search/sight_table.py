@@ -68,7 +68,8 @@ class SightTable:
         cells = round(np.sqrt(len(self.front)))
         turned = place @ self.T.T
         slope = turned[..., :2] / np.maximum(turned[..., 2:], 1e-6)
-        index = np.clip(((slope - self.low) / self.cell).astype(np.int32), 0, cells - 1)
+        # clipped before it is whole: what lies behind the camera has a slope that no integer holds
+        index = np.clip((slope - self.low) / self.cell, 0, cells - 1).astype(np.int32)
         row = index[..., 0] * cells + index[..., 1]
         distance = np.sqrt(np.einsum("nwi,nwi->nw", place, place))
         toward, free = self.toward[row], self.free[row]
