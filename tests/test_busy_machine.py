@@ -100,7 +100,7 @@ def test_doctor_shows_policy_and_load(monkeypatch: pytest.MonkeyPatch, capsys: p
     monkeypatch.setenv(VARIABLE, "passive")
     monkeypatch.setattr(os, "getloadavg", lambda: (3.25, 0.0, 0.0), raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
-    monkeypatch.setattr(doctor.torch, "get_num_threads", lambda: 4)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 4)
     doctor.diagnose()
     report = capsys.readouterr().out.splitlines()
     assert "wait policy    passive" in report

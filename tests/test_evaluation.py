@@ -275,14 +275,14 @@ def test_the_demo_reconstructs_and_scores(
         truth: TruthGrid = truth_grid(mesh, 20)
         return demo.Case("cuboids", "two cuboids", Object(oracle(mesh)), load_frame(cloud()), truth)
 
-    monkeypatch.setattr(demo, "_inputs", lambda: iter([case]))
+    monkeypatch.setattr(demo, "_inputs", lambda _: iter([case]))
     monkeypatch.setattr(demo, "RESOLUTION", 64)
     demo.main(tmp_path)
     out = capsys.readouterr().out
     rows = [line.split("│") for line in out.splitlines() if line.count("│") > 2]
     scores = [float(row[2]) for row in rows if "seconds" not in row[1]]
     assert len(scores) == 4 and min(scores) > 0.97, "each segment, IoU and mIoU, but for the steps of the surfaces"
-    assert "mereo reconstruct cloud.ply --weights bunny --output result" in out
+    assert "mereo reconstruct cloud.ply --object PART.stl PART.stl --output result" in out
     assert (tmp_path / "cuboids/report.html").is_file()
 
 

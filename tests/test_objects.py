@@ -143,10 +143,23 @@ def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: n
 
 def test_its_page_opens(folder: Path, meshes: list[str], points: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[OpenPage] = []
-    monkeypatch.setattr(OpenPage, "stay", lambda page, _: opened.append(page))
+    monkeypatch.setattr(OpenPage, "stay", lambda page, _: opened.append(page) or page)  # type: ignore[func-returns-value]
     frame = [str(folder / "frame.npy"), "--unit-m", "1", "--port", "0", "--resolution", "24"]
     assert command_line.main(["view", *frame, "--object", *meshes, "--units", "mm"]) == 0
     opened[0].close()
+
+
+def test_its_result_shows_itself(
+    found: mereo.Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: list[OpenPage] = []
+    monkeypatch.setattr(OpenPage, "stay", lambda page, _: opened.append(page) or page)  # type: ignore[func-returns-value]
+    found.save(tmp_path / "out")
+    assert (tmp_path / "out/state.json").is_file()
+    assert command_line.main(["view", str(tmp_path / "out"), "--port", "0"]) == 0
+    opened[0].close()
+    assert command_line.main(["view", str(tmp_path / "out"), "--object", "rope"]) == 2
+    assert "is a result, which shows itself: leave out --object" in capsys.readouterr().err
 
 
 def test_a_page_needs_a_frame(meshes: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,13 +14,14 @@ from analytic import untrained
 import mereo
 from mereo.api import steps
 from mereo.scenes.registry import load_scene
+from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.training.config import PRESETS, TrainConfig
 
 
 def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(steps.shards, "generate", lambda *given, **named: calls.append((*given, named)))
+    monkeypatch.setattr(shards, "generate", lambda *given, **named: calls.append((*given, named)))
     assert mereo.generate(tmp_path / "mine.yaml", str(tmp_path / "data"), examples=3, workers=2) == tmp_path / "data"
     ((scene, output, settings, named),) = calls
     assert (scene, output, settings) == (str(tmp_path / "mine.yaml"), tmp_path / "data", GenerateConfig())

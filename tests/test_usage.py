@@ -33,8 +33,7 @@ def said(text: str, capsys: pytest.CaptureFixture[str]) -> str:
         ("--weights b reconstruct", "'--weights' comes before the command; options follow it: give the command first; "
          "see `mereo --help`"),
         # options
-        ("reconstruct", "mereo reconstruct lacks --weights: add it; "
-         "see `mereo reconstruct --help`"),
+        ("learn lamp.stl", "mereo learn lacks --output: add it; see `mereo learn --help`"),
         ("train data", "mereo train lacks --output: add it; see `mereo train --help`"),
         (f"{RECONSTRUCT} --resoluton 64", "mereo reconstruct has no option '--resoluton' (did you mean --resolution?); "
          "see `mereo reconstruct --help`"),
@@ -53,7 +52,7 @@ def said(text: str, capsys: pytest.CaptureFixture[str]) -> str:
         (f"{RECONSTRUCT} --depth-range 1 x", "--depth-range is '1 x'; it must be 2 values: a number, a number; "
          "see `mereo reconstruct --help`"),
         (f"{RECONSTRUCT} --method mods", "--method is 'mods' (did you mean modes?); it must be one of auto, "
-         "network, modes, full; see `mereo reconstruct --help`"),
+         "network, search, modes, full; see `mereo reconstruct --help`"),
         ("train data --output run --preset huge", "--preset is 'huge'; it must be one of paper, paper-autodecoder, "
          "base, large, tiny, tiny-autodecoder; see `mereo train --help`"),
         ("export bunny --output", "--output has no value; it must be a path; see `mereo export --help`"),
@@ -69,7 +68,7 @@ def test_what_is_wrong_is_said_in_one_sentence(text: str, sentence: str, capsys:
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ("reconstruct scan.ply --output out", ("Missing from mereo reconstruct", "--weights")),
+        ("learn lamp.stl", ("Missing from mereo learn", "--output")),
         ("train data --output run --batch x", ("--batch", "'x'")),
         (f"{RECONSTRUCT} --method mods", ("'mods'", "--method", "'modes'")),
     ],

@@ -153,7 +153,7 @@ def test_the_command_shows_a_folder_a_file_and_a_frame_in_a_state(
     pages: list[tuple[Any, ...]] = []
     monkeypatch.setattr(serve, "start_server", lambda *_: None)
     monkeypatch.setattr(serve, "FramePage", lambda *given: pages.append(given))
-    monkeypatch.setattr(serve, "LabPage", lambda *given: pages.append(given))
+    monkeypatch.setattr("mereo.visualization.viewer.lab_page.LabPage", lambda *given: pages.append(given))
     monkeypatch.setattr(serve.OpenPage, "__init__", lambda *_: None)
     monkeypatch.setattr(serve.OpenPage, "stay", lambda page, _: page)
     weights, folder, cloud = tmp_path / "rope.safetensors", tmp_path / "result", tmp_path / "cloud.npy"

@@ -18,7 +18,6 @@ from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import (
     ClustersWarning,
-    FrameWarning,
     Observation,
     SizeWarning,
     clusters_warning,
@@ -109,6 +108,8 @@ def reconstruct_observation(
 
     Takes its arguments, raises and warns as it does. Of ``isolation`` it matters whether every point is kept.
     """
+    if object.network is None and (warning := clusters_warning(seen)) is not None:
+        warnings.warn(_said(warning), ClustersWarning, stacklevel=3)
     answer = answer_frame(
         seen,
         object.network,
@@ -121,15 +122,16 @@ def reconstruct_observation(
         raise answer.error
     result = Result.of(answer)
     _ = result.reconstruction  # raises where nothing is found
-    used = seen.read_as(answer.hypothesis)
-    kind: type[FrameWarning] = SizeWarning
-    if object.network is None:
-        warning, kind = clusters_warning(used), ClustersWarning
-    else:
-        warning = size_warning(used, object.network.provenance)
-    if warning is not None:
-        warnings.warn(warning if SPEAKS_OPTIONS.get() else in_python(warning), kind, stacklevel=3)
+    if object.network is not None:
+        warning = size_warning(seen.read_as(answer.hypothesis), object.network.provenance)
+        if warning is not None:
+            warnings.warn(_said(warning), SizeWarning, stacklevel=3)
     return result
+
+
+def _said(text: str) -> str:
+    """A warning in the words of whoever called."""
+    return text if SPEAKS_OPTIONS.get() else in_python(text)
 
 
 def _are_many(frame: Any) -> bool:

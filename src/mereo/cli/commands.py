@@ -26,7 +26,7 @@ from mereo.workers.config import ONE_CPU, RayAddress, TaskResources, cluster_of
 
 @dataclass(frozen=True)
 class Demo:
-    """Reconstruct a real scan and shipped depth frames, and compare them with the truth.
+    """Find an object in a real scan by its meshes; with the extra `network` also shipped frames, by network and fit.
 
     Attributes:
         output: folder for meshes, pictures and reports.
@@ -143,7 +143,7 @@ class Generate:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a network on generated examples; the same command again continues a stopped run.
+    """Train a network on generated examples; the same command again continues a stopped run: needs the extra `network`.
 
     Attributes:
         dataset: folder written by `mereo generate`, or its URL in an object storage.
@@ -173,7 +173,7 @@ class Train:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Score weights on test examples of their scene: IoU, mIoU, per segment, with pictures of the errors.
+    """Score weights on test examples of their scene: IoU, mIoU, pictures of the errors: needs the extra `network`.
 
     Attributes:
         weights: a shipped name or a file.

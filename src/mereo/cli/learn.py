@@ -13,7 +13,7 @@ from mereo.workers.config import RayAddress, TaskResources, cluster_of
 
 @dataclass(frozen=True)
 class LearnCommand:
-    """Find out whether an object of your own, or each of a folder of them, needs training, and train it if so.
+    """Find out whether an object of yours, or each of a folder, needs training, and train it if so: extra `network`.
 
     First the search alone, which needs no training, is scored on test views. Where it is good enough (every view is
     explained, and mIoU is 0.85 or more, 0.5 or more in each view), that is all; else: generate, train, evaluate.

@@ -74,8 +74,12 @@ class ViewCommand:
         """Find an object in a frame, and keep the page of the answer open."""
         if self.input is None:
             raise ValueError("no frame is given; --object is looked for in one: mereo view FRAME --object PART.stl")
+        from mereo.fitting.registration.state_file import is_state
+
         if self.state is not None:
             raise ValueError(f"--state is {self.state}, which has its own object: leave out --object")
+        if is_state(self.input):
+            raise ValueError(f"{self.input} is a result, which shows itself: leave out --object")
         from mereo.api.reconstruct import reconstruct
         from mereo.cli.object_option import loaded_object
         from mereo.evaluation.sample_views import shipped_frame, shipped_frames

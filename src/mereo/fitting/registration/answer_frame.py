@@ -14,10 +14,17 @@ from mereo.fitting.registration.hypotheses import fit_hypotheses, search_hypothe
 from mereo.fitting.registration.recognition import Recognition, recognize
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
+from mereo.fitting.search.search import WHOLE
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame
+
+FORCED = 350.0
+"""Misfit of prior and ruled-out surface together from which a search is asked too.
+
+Fits to whole clean training views have at most 150; fits that take a view whose half is hidden for a whole one have 400
+and more, although they explain its points."""
 
 
 def answer_frame(
@@ -107,25 +114,42 @@ def find(
 ) -> tuple[Candidate, EncodedFrame]:
     """Best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
 
-    A network starts the fit where there is one, in tenths of a second; where that does not explain the frame, a search
-    is asked too, and the fit with the greater evidence is taken. Takes the arguments of ``answer_frame``, and raises as
-    it does for unusable clouds.
+    A network starts the fit where there is one, in tenths of a second; where that does not explain the frame, or only
+    with an unlikely state, a search is asked too, and the fit with the greater evidence is taken. Takes the arguments
+    of ``answer_frame``, and raises as it does for unusable clouds.
     """
     if registrar is not None and not registrar.asks_network:
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
     assert model is not None
     found, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
-    if registrar is None or not registrar.asks_search or found.is_accepted:
+    if registrar is None or not registrar.asks_search or (found.is_accepted and not is_forced(found)):
         return found, likelier
     searched, _ = search_hypotheses(seen, registrar, keep_all, scene_unit)
     return more_evident(found, searched), likelier
 
 
+def is_forced(candidate: Candidate) -> bool:
+    """Whether a fit explains the points only by a state that is far from usual, or lies where nothing was seen."""
+    assert candidate.modes is not None
+    misfit = candidate.modes.problem.misfit(candidate.modes.posed)
+    return misfit.witnesses + misfit.prior > FORCED
+
+
 def more_evident(first: Candidate, second: Candidate) -> Candidate:
-    """The candidate whose state has the lower misfit in the problem of the first; the first where both do."""
+    """The candidate whose state has the lower misfit in the problem of the first; the first where both do.
+
+    Where they differ in whether the object is seen whole, each in its own, as two hypotheses of a search.
+    """
     if first.modes is None or second.modes is None:
         return first if second.modes is None else second
-    return second if misfit_in(first.modes, second.modes) < misfit_in(first.modes, first.modes) else first
+    one, other = first.modes.problem.evidence.elsewhere, second.modes.problem.evidence.elsewhere
+    if one == other:
+        return second if misfit_in(first.modes, second.modes) < misfit_in(first.modes, first.modes) else first
+    cost = [
+        misfit_in(each, each) + (WHOLE if each.problem.evidence.elsewhere == "unknown" else 0.0)
+        for each in (first.modes, second.modes)
+    ]
+    return second if cost[1] < cost[0] else first
 
 
 def misfit_in(frame: ModesFit, fitted: ModesFit) -> float:

@@ -48,6 +48,7 @@ class ModesFit:
         seconds: that it took.
         rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
         calibration: the network's, by which radii are scaled.
+        alike: number of states that a search found to explain the frame alike, this included; 1 without a search.
     """
 
     problem: Problem
@@ -57,6 +58,7 @@ class ModesFit:
     seconds: float
     rest: Judged | None = None
     calibration: Calibration | None = None
+    alike: int = 1
 
     @classmethod
     def of(
@@ -178,6 +180,7 @@ class ModesFit:
             optimum=optimum,
             radius_scale=scale,
             radius_beside=beside,
+            alike=self.alike,
         )
 
     def _radius_factors(self, method: Method, surface: Surface) -> tuple[float | None, float]:

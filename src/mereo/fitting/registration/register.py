@@ -269,6 +269,7 @@ def describe(registration: Registration) -> dict[str, object]:
         "residual": registration.residual,
         "ruled_out": registration.ruled_out,
         "beyond_states": registration.beyond_states,
+        "alike": registration.alike,
         "scene_unit": registration.scene_unit,
         "unit": "known" if registration.unit_known else "found",
         "coefficients": registration.z.tolist(),

@@ -86,6 +86,7 @@ class Registration:
             where the registration was read from a file.
         radius_scale: factor of the radii by the weights' calibration of such fits to such frames; None without one.
         radius_beside: radius that every place has beside that, as ``Uncertainty.beside``; scene units.
+        alike: number of states, each elsewhere, that a search found to explain the frame alike, this one included.
     """
 
     model: StatisticalModel
@@ -104,6 +105,7 @@ class Registration:
     optimum: Optimum | None = None
     radius_scale: float | None = None
     radius_beside: float = 0.0
+    alike: int = 1
 
     def __repr__(self) -> str:
         trust = "" if self.accepted else "not believed, "
@@ -113,7 +115,8 @@ class Registration:
     @property
     def told(self) -> str:
         """Phrase on how well the frame is explained."""
-        return f"registered model ({self.method}) explains {self.explained:.1%} of the observed points"
+        others = f"; {counted(self.alike - 1, 'other state')} would do so too" if self.alike > 1 else ""
+        return f"registered model ({self.method}) explains {self.explained:.1%} of the observed points{others}"
 
     @cached_property
     def modes_z(self) -> Float[np.ndarray, " k"]:

@@ -61,7 +61,8 @@ def search_modes(
         problem, modes = found.problem, found.best
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)
-    return ModesFit(problem, nothing(), unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
+    seconds = time.perf_counter() - started
+    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, alike=found.alike)
 
 
 def size_of(points: Float[np.ndarray, "n 3"], model: StatisticalModel) -> float:

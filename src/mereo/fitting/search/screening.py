@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.residuals import ROBUST, WITNESS_WEIGHT
 from mereo.fitting.search.shape_tables import CELLS, ShapeTables
-from mereo.fitting.search.sight_table import SightTable
+from mereo.fitting.search.sight_table import SightTable, clipped
 from mereo.geometry.transforms import rotation_along
 from mereo.io.cores import cores
 from mereo.scenes.statistical_model import WITNESSES
@@ -161,7 +161,7 @@ class Screen:
         tables, state = self.tables, poses.state[:, None]
         size, inverse = np.exp(poses.log_scale)[:, None, None], poses.rotation.transpose(0, 2, 1)
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
-        index = np.clip((seen - tables.low[state]) / tables.cell[state][..., None], 0, CELLS - 1).astype(np.int32)
+        index = clipped((seen - tables.low[state]) / tables.cell[state][..., None], CELLS)
         sample = tables.nearest[state, (index[..., 0] * CELLS + index[..., 1]) * CELLS + index[..., 2]]
         place, normal = tables.place[state, sample], tables.normal[state, sample]
         offset, narrow = seen - place, sigma / size[..., 0]

@@ -42,7 +42,7 @@ class SearchRound:
     fitted: int
 
 
-ROUNDS = (SearchRound(0, 600, 12, 4), SearchRound(12, 300, 24, 6), SearchRound(40, 300, 40, 8))
+ROUNDS = (SearchRound(0, 400, 12, 4), SearchRound(12, 200, 24, 6), SearchRound(40, 150, 40, 8))
 """Rounds of the search, one after the other while the frame is not explained."""
 
 SIGMAS = (

@@ -6,13 +6,19 @@ Notation: n poses, w places of each, c cells.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32
 
 from mereo.fitting.problem.evidence import Evidence
 from mereo.geometry.transforms import rotation_along
 
 SIDE = 96
 """Cells along each side of the table of what a frame rules out; about as many as a depth image has pixels there."""
+
+
+def clipped(place: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndarray, "n w d"]:
+    """Index of a cell along each axis, of ``count``: that at the border for what lies beyond, or nowhere."""
+    index: Int32[np.ndarray, "n w d"] = np.fmax(np.fmin(place, np.float32(count - 1)), np.float32(0)).astype(np.int32)
+    return index
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +74,7 @@ class SightTable:
         cells = round(np.sqrt(len(self.front)))
         turned = place @ self.T.T
         slope = turned[..., :2] / np.maximum(turned[..., 2:], 1e-6)
-        # clipped before it is whole: what lies behind the camera has a slope that no integer holds
-        index = np.clip((slope - self.low) / self.cell, 0, cells - 1).astype(np.int32)
+        index = clipped((slope - self.low) / self.cell, cells)
         row = index[..., 0] * cells + index[..., 1]
         distance = np.sqrt(np.einsum("nwi,nwi->nw", place, place))
         toward, free = self.toward[row], self.free[row]

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mereo.fitting.registration.state_file import STATE
+from mereo.fitting.registration.state_file import STATE, read_state
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.io.glb_scene import GlbScene, read_glb
 from mereo.io.writers.formats import WRITERS
+from mereo.models.weights_place import is_weights
 from mereo.visualization.trust import Level
 from mereo.visualization.units import UNKNOWN, Unit
 from mereo.visualization.viewer.panels import DepthPicture
@@ -22,8 +23,16 @@ NEAR = 1e-4
 
 
 def is_kept(path: Path) -> bool:
-    """Whether a path is a folder of results that has surfaces, but no state of a registered model."""
-    return path.is_dir() and (path / WRITERS["glb"].file).is_file() and not (path / STATE).is_file()
+    """Whether a path is a folder of results that has surfaces, but no state of a model that weights carry."""
+    if not (path.is_dir() and (path / WRITERS["glb"].file).is_file()):
+        return False
+    return not (path / STATE).is_file() or _is_without_weights(path)
+
+
+def _is_without_weights(path: Path) -> bool:
+    """Whether a result was made without weights; those of a program that have no name are the scene's."""
+    state = read_state(path)
+    return state.weights == "" and not is_weights(state.scene)
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,9 +83,9 @@ def view(
     if isinstance(input, Answer):
         return open_answer(input, port=place, host=host).stay(block)
     path, known = (None if value is None else Path(value) for value in (input, state))
-    if known is None and is_state(path):
-        path, known = None, path
     named = None if weights is None else str(weights)
+    if known is None and is_state(path) and not (named is None and path is not None and is_kept(path)):
+        path, known = None, path
     if path is not None and scene is None and is_recording_folder(path):
         return view_recording(read_recording(path), named, place, host, inference).stay(block)
     if path is not None and scene is None and known is None and (is_glb(path) or is_kept(path)):
