@@ -173,8 +173,14 @@ def test_a_page_needs_a_frame(meshes: list[str], capsys: pytest.CaptureFixture[s
 def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
     flat = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     flat.export(tmp_path / "flat.stl")
-    with pytest.raises(ValueError, match="flat.stl is flat, without any volume; an object's parts are solids: let"):
+    with pytest.raises(ValueError, match="flat.stl is flat, without any volume; an object's parts are solids: name a"):
         mereo.load_object(tmp_path / "flat.stl")
+    tilted = trimesh.Trimesh([[0, 0, 0], [90, 0, 10], [0, 60, 20]], [[0, 1, 2]], process=False)
+    tilted.export(tmp_path / "tilted.stl")
+    with pytest.raises(
+        ValueError, match=r"tilted.stl is an open surface \(3 open edges\) that encloses no volume; .*or let"
+    ):
+        mereo.load_object(tmp_path / "tilted.stl")
 
 
 @pytest.mark.parametrize("unit_m", [1000.0, 0.001])

@@ -93,8 +93,11 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
     cure = f"let `mereo scene new {new} --output object.yaml` and `mereo scene check object.yaml --repair` mend it"
     for file in () if is_volume(files[0]) else files:
         for part in read_segmented_mesh(file).segments:
-            if faults := examine(part).hopeless:
-                raise ValueError(f"segment {part.name!r} of {file} {faults[0]}; an object's parts are solids: {cure}")
+            health = examine(part)
+            if health.hopeless:
+                solid = "name a file of its whole, closed surface" + (f", or {cure}" if health.mendable else "")
+                fault = f"segment {part.name!r} of {file} {health.hopeless[0]}"
+                raise ValueError(f"{fault}; an object's parts are solids: {solid}")
     with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", MeshWarning)
         path = write_scene_file(files, Path(folder) / SCENE, units, name=files[0].name.split(".")[0])
