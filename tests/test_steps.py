@@ -41,6 +41,7 @@ def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
     alone = mereo.evaluate(model, examples=1, cells=8, method="network", progress=False)
     written = mereo.evaluate(model, load_scene("rope"), output=tmp_path / "out", examples=1, cells=8, method="network")
     np.testing.assert_array_equal(alone.confusion, written.confusion)
+    assert len(alone.seconds) == 1
     assert json.loads((tmp_path / "out/metrics.json").read_text())["scene"] == "rope"
     with pytest.raises(ValueError, match="scans are real and take no simulated camera"):
         mereo.evaluate(model, scans=(), settings=GenerateConfig())
