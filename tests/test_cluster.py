@@ -252,12 +252,12 @@ def test_a_failed_object_stops_no_other_and_the_same_call_continues(
 ) -> None:
     learnt: list[str] = []
 
-    def learn(files: tuple[Path, ...], output: Path, **settings: object) -> dict[str, float | None]:
+    def learn(files: tuple[Path, ...], output: Path, **settings: object) -> dict[str, object]:
         learnt.append(output.name)
-        assert settings == {"minutes": 2.0, "init": "", "units": None, "workers": 1}
+        assert settings == {"minutes": 2.0, "init": "", "units": None, "workers": 1, "train": "auto"}
         if output.name == "bar" and len(learnt) < 3:
             raise ValueError("the bar is bent: straighten it")
-        return {"iou": 0.9, "miou": None}
+        return {"iou": 0.9, "miou": None, "trained": True, "method": "auto"}
 
     monkeypatch.setattr(object_folders, "learn", learn)
     folder, out = folder_of_objects(tmp_path), tmp_path / "out"

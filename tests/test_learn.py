@@ -18,7 +18,7 @@ from mereo.fitting.draws.playback import DrawnStates
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.learning import learn as learning
-from mereo.learning import outcome, probe, schedule
+from mereo.learning import outcome, probe, schedule, search_stage
 from mereo.learning.example_frame import write_example_frame
 from mereo.learning.learn import learn
 from mereo.learning.object_files import check, deformation, scene_for
@@ -27,6 +27,7 @@ from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object, size_warning
 from mereo.scenes.files import check_states
+from mereo.scenes.kept_model import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
 from mereo.synthesis import shards
 from mereo.training import trial
@@ -163,25 +164,31 @@ def test_the_example_frame_is_as_long_as_the_object(tmp_path: Path) -> None:
 
 
 def test_bad_scores_come_with_advice_and_good_ones_without() -> None:
-    bad = {"iou": 0.5, "miou": 0.1, "per_segment": {"left": 0.1, "right": None}}
-    lines = "\n".join(outcome.advice(bad, 10.0))
+    bad, each = {"iou": 0.5, "miou": 0.1}, {"left": 0.1, "right": None}
+    lines = "\n".join(outcome.advice_after_training(bad, each, 10.0))
     assert "0.10 is too low to rely on" in lines and "right is the weakest" in lines and "--minutes 30" in lines
-    assert not outcome.advice({**bad, "miou": 0.8}, 10.0)
-    assert outcome.advice({**bad, "miou": None, "iou": 0.9}, 10.0) == []
+    assert not outcome.advice_after_training({**bad, "miou": 0.8}, each, 10.0)
+    assert outcome.advice_after_training({**bad, "miou": None, "iou": 0.9}, each, 10.0) == []
 
 
 def test_the_command_names_the_scene_where_it_is_not_built_in() -> None:
     built_in = "mereo reconstruct out/frame.ply --weights out/weights.safetensors --output out/result"
     assert outcome.command(Path("out"), "rope") == built_in
-    assert "--scene 'my lamp.yaml'" in outcome.command(Path("out"), "my lamp.yaml")
+    assert "--scene 'my lamp.yaml' --method search" in outcome.command(Path("out"), "my lamp.yaml", method="search")
 
 
 # --- the whole --------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, without_turns: None) -> None:
+def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, cache: Path) -> None:
     """So little of everything that a run takes seconds."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(cache))
     for module, name, value in (
         (check_states, "STATES", 3),
         (probe, "EXAMPLES", 12),
@@ -201,6 +208,10 @@ def small(monkeypatch: pytest.MonkeyPatch, without_turns: None) -> None:
         (learning, "recipe_for", lambda minutes: LIGHT),
         (learning, "evaluate", partial(learning.evaluate, cells=16)),
         (learning, "evaluate_weights", partial(learning.evaluate_weights, cells=16)),
+        (learning, "search_scores", partial(learning.search_scores, cells=16)),
+        (learning, "scores_of_views", partial(learning.scores_of_views, cells=16)),
+        (search_stage, "VIEWS", 1),
+        (search_stage, "LEAST_VIEWS", 1),
     ):
         monkeypatch.setattr(module, name, value)
 
@@ -213,15 +224,16 @@ def test_one_command_and_the_same_again(
     small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, out = write_bar(tmp_path), tmp_path / "out"
-    scores = learn([scene], out, minutes=0.05, init="rope")
+    scores = learn([scene], out, minutes=0.05, init="rope", train="always")
     printed = capsys.readouterr()
     said = printed.out
-    assert re.findall(r"\[(\d)/5\]", said) == list("12345")
+    assert re.findall(r"\[(\d)/6\]", said) == list("123456")
     assert f"measure: {trial.trial_steps(compared=False)} steps in" in printed.err
     assert "the least that can be learnt from takes" in said
     assert f"mereo reconstruct {out}/frame.ply --weights {out}/weights.safetensors --scene {scene}" in said
     assert {place.name for place in out.iterdir()} == {
-        "config.json", "plan.json", "data", "run", "test", "weights.safetensors", "frame.ply"
+        *("config.json", "search.json", "plan.json", "data", "run", "test", "weights.safetensors"),
+        *("metrics.json", "frame.ply"),
     }  # fmt: skip
     plan = Plan(**json.loads((out / "plan.json").read_text())["plan"])
     assert plan.examples == 30 and plan.init == "rope"
@@ -230,7 +242,7 @@ def test_one_command_and_the_same_again(
     found = load_model(out / "weights.safetensors").calibration
     assert found is not None and found.temperature is not None and found.views == 4
     monkeypatch.setattr(learning, "evaluate_weights", None)  # all is there
-    assert learn([scene], out, minutes=0.05, init="rope") == scores
+    assert learn([scene], out, minutes=0.05, init="rope", train="always") == scores
     assert (out / "weights.safetensors").read_bytes() == calibrated
     assert before == {path: path.stat().st_mtime_ns for path in (out / "data").glob("shard-*")}
     for arguments, message in (
@@ -267,19 +279,21 @@ def test_the_nearest_weights_are_those_that_adapt_fastest(
 @pytest.mark.slow
 def test_killed_at_any_stage_it_ends_with_the_same_weights(small: None, tmp_path: Path) -> None:
     scene, whole, parts = write_bar(tmp_path), tmp_path / "whole", tmp_path / "parts"
-    learn([scene], whole, minutes=0.05, init="rope")
+    learn([scene], whole, minutes=0.05, init="rope", train="always")
     stops: list[tuple[object, str, Callable[..., None]]] = [
+        (learning, "search_scores", _stop),
         (learning, "measure", _stop),
         (learning, "generate", _stop),
         (Trainer, "save", _stop),
         (learning, "evaluate_weights", _stop),
+        (learning, "scores_of_views", _stop),
         (learning, "write_example_frame", _stop),
     ]
     for owner, name, stop in stops:
         with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(owner, name, stop)
-            learn([scene], parts, minutes=0.05, init="rope")
+            learn([scene], parts, minutes=0.05, init="rope", train="always")
         assert not [place for place in parts.rglob(".*") if place.name.endswith(".partial")]
-    learn([scene], parts, minutes=0.05, init="rope")
+    learn([scene], parts, minutes=0.05, init="rope", train="always")
     ours, theirs = learnt(whole), learnt(parts)
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)

@@ -173,8 +173,14 @@ def test_a_page_needs_a_frame(meshes: list[str], capsys: pytest.CaptureFixture[s
 def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
     flat = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     flat.export(tmp_path / "flat.stl")
-    with pytest.raises(ValueError, match="flat.stl is flat, without any volume; an object's parts are solids: let"):
+    with pytest.raises(ValueError, match="flat.stl is flat, without any volume; an object's parts are solids: name a"):
         mereo.load_object(tmp_path / "flat.stl")
+    tilted = trimesh.Trimesh([[0, 0, 0], [90, 0, 10], [0, 60, 20]], [[0, 1, 2]], process=False)
+    tilted.export(tmp_path / "tilted.stl")
+    with pytest.raises(
+        ValueError, match=r"tilted.stl is an open surface \(3 open edges\) that encloses no volume; .*or let"
+    ):
+        mereo.load_object(tmp_path / "tilted.stl")
 
 
 @pytest.mark.parametrize("unit_m", [1000.0, 0.001])
@@ -192,6 +198,40 @@ def test_two_objects_in_a_cloud_are_warned_of(angle: mereo.Object, points: np.nd
     beside = points + np.array([0.5, 0.0, 0.0])
     with pytest.warns(ClustersWarning, match="two separate clusters of like size .* if they are two, crop to one"):
         mereo.reconstruct(np.concatenate([points, beside]), angle, resolution=24)
+
+
+@pytest.mark.parametrize(
+    "frame, object, unit_m, words",
+    [
+        ("few.npy", ("long.stl", "short.stl"), "1", "the cloud has 20 points; a reconstruction needs at least 32"),
+        ("mm.npy", ("long.stl", "short.stl"), "1", "correct the unit of the frame (--unit-m 0.001 for millimetres"),
+        ("frame.npy", ("long.stl", "none.stl"), "1", "none.stl does not exist; a mesh is needed: check the path"),
+        ("frame.npy", ("long.stl", "short.stl"), "0.001", "the object 120, a factor of 9"),
+        ("frame.npy", ("one.stl",), "1", "is flat, without any volume; an object's parts are solids: name a file"),
+    ],
+)
+def test_bad_input_ends_a_command_with_a_sentence_and_nothing_written(
+    frame: str,
+    object: tuple[str, ...],
+    unit_m: str,
+    words: str,
+    folder: Path,
+    points: np.ndarray,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, cloud in (("frame", points), ("few", points[:20]), ("mm", 1000 * points)):
+        np.save(f"{name}.npy", cloud)
+    for name in ("long.stl", "short.stl"):
+        Path(name).write_bytes((folder / name).read_bytes())
+    trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0]], [[0, 1, 2]], process=False).export("one.stl")
+    before = set(Path().iterdir())
+    given = ["reconstruct", frame, "--object", *object, "--units", "mm", "--unit-m", unit_m, "--output", "out"]
+    assert command_line.main(given) == 2
+    text = capsys.readouterr().err
+    assert text.count("mereo: error: ") == 1 and words in text and set(Path().iterdir()) == before
 
 
 @pytest.mark.parametrize(

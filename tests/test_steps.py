@@ -41,6 +41,7 @@ def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
     alone = mereo.evaluate(model, examples=1, cells=8, method="network", progress=False)
     written = mereo.evaluate(model, load_scene("rope"), output=tmp_path / "out", examples=1, cells=8, method="network")
     np.testing.assert_array_equal(alone.confusion, written.confusion)
+    assert len(alone.seconds) == 1
     assert json.loads((tmp_path / "out/metrics.json").read_text())["scene"] == "rope"
     with pytest.raises(ValueError, match="scans are real and take no simulated camera"):
         mereo.evaluate(model, scans=(), settings=GenerateConfig())
@@ -48,12 +49,19 @@ def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
 
 def test_learn_and_export_return_what_they_leave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[Any] = []
-    scores = {"iou": 0.9, "miou": 0.8}
+    scores = {"iou": 0.9, "miou": 0.8, "trained": True, "method": "auto"}
     monkeypatch.setattr(steps.learning, "learn", lambda files, output, **named: calls.append((files, named)) or scores)
     learned = mereo.learn("rope", tmp_path, minutes=3)
-    assert calls == [([Path("rope")], {"minutes": 3, "init": "", "units": None, "workers": 1})]
+    assert calls == [([Path("rope")], {"minutes": 3, "init": "", "units": None, "workers": 1, "train": "auto"})]
     assert learned.weights == tmp_path / "weights.safetensors" and learned.scene == "rope" and learned.miou == 0.8
-    assert repr(learned).endswith("weights.safetensors': IoU 0.900, mIoU 0.800)")
+    assert repr(learned) == f"Learned({str(tmp_path)!r}: trained, method auto, IoU 0.900, mIoU 0.800)"
+    scores |= {"trained": False, "method": "search"}
+    learned = mereo.learn("rope", tmp_path, train="never")
+    assert learned.weights is learned.report is None and learned.method == "search" and learned.folder == tmp_path
+    with pytest.raises(
+        ValueError, match="train is 'once'; it must be one of auto, always, never: correct the spelling"
+    ):
+        inspect.unwrap(mereo.learn)("rope", tmp_path, train="once")
     monkeypatch.setattr(steps, "export_weights", lambda *given: calls.append(given))
     assert mereo.export("rope", tmp_path / "graphs", "torch") == tmp_path / "graphs"
     assert calls[-1] == ("rope", tmp_path / "graphs", "torch", False)

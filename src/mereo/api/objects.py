@@ -17,12 +17,12 @@ from mereo.fitting.registration.register import Registrar, other_mesh, registrar
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.volume_files import is_volume
-from mereo.learning.object_files import SCENE, scene_of_meshes
+from mereo.learning.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes
 from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.models.trained import Trained
 from mereo.models.weights_place import is_weights, load_weights, shipped_names
 from mereo.scenes.kept_model import kept_model
-from mereo.scenes.registry import is_yaml, load_scene
+from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -173,10 +173,10 @@ def _own_weights(source: Source) -> Trained | str | Path | None:
     return source if isinstance(source, str | Path) and is_weights(source) else None
 
 
-def _learned_scene(source: Trained | str | Path) -> Path | None:
-    """Scene file in the folder that ``mereo learn`` has written."""
-    path = Path(source) / SCENE if isinstance(source, str | Path) else None
-    return path if path is not None and path.is_file() else None
+def _learned_scene(source: Trained | str | Path) -> str | None:
+    """Scene of the folder of weights that ``mereo learn`` has written, as far as its file is still there."""
+    scene = scene_of_folder(Path(source)) if isinstance(source, str | Path) else None
+    return scene if scene is not None and (scene in SCENES or Path(scene).is_file()) else None
 
 
 def _scene_of(scene: Scene | str | Path | None) -> Scene | None:
@@ -190,11 +190,11 @@ def _scene(source: Source, units: str | None) -> Scene:
     assert not isinstance(source, Trained)
     files = [Path(one) for one in ([source] if isinstance(source, str | Path) else source)]
     if len(files) == 1 and files[0].is_dir():
-        learned = files[0] / SCENE
-        files = [learned] if learned.is_file() else _shapes_in(files[0])
+        learned = scene_of_folder(files[0])
+        files = [Path(learned)] if learned is not None else _shapes_in(files[0])
     if not files:
         raise ValueError("no object is given; name its meshes, one file for each segment, or its scene file")
-    if len(files) == 1 and (str(files[0]) in SCENES or is_yaml(files[0]) or files[0].suffix == ".py"):
+    if names_scene(files):
         if units is not None:
             raise ValueError(f"the units are {units}, but {files[0]} says its own: leave them out")
         return load_scene(files[0] if files[0].suffix else str(files[0]))

@@ -2,7 +2,7 @@
 
     dataset -train-> weights -evaluate-> Evaluation
                         '-----export---> graphs for other runtimes
-    scene or meshes -learn-> all of it, in so many minutes
+    scene or meshes -learn-> all of it where the object needs it, in so many minutes
 
 They print their progress as the commands do, and raise the sentences that those print.
 """
@@ -11,7 +11,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from mereo.api.words import python_words
 from mereo.evaluation import scoring
@@ -23,6 +23,7 @@ from mereo.io.object_storage import ObjectPath, place_of
 from mereo.learning import learn as learning
 from mereo.learning.example_frame import FRAME
 from mereo.learning.object_files import scene_for
+from mereo.learning.training_choice import TrainChoice
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.models.elsewhere import for_tasks
 from mereo.models.export.onnx_export import export_weights
@@ -167,25 +168,29 @@ def export(
 
 @dataclass(frozen=True)
 class Learned:
-    """What ``learn`` leaves.
+    """Outcome of ``learn``: a folder that ``load_object`` takes, with weights where the object was trained.
 
     Attributes:
-        weights: file of the weights, for ``load_model``.
+        folder: the folder.
+        weights: file of the weights, for ``load_model``; None where nothing was trained.
         scene: name or file of the object's scene.
-        frame: point cloud to try the weights on.
-        report: page of the scores.
-        metrics: scores as test/metrics.json has them.
+        frame: point cloud to try it on.
+        report: page of the scores; None where nothing was trained.
+        method: whose answers are best, as ``reconstruct`` takes it: "auto", "search" or "network".
+        metrics: scores of each of these on the same test views, as metrics.json in the folder has them.
     """
 
-    weights: Path
+    folder: Path
+    weights: Path | None
     scene: str
     frame: Path
-    report: Path
+    report: Path | None
+    method: AnswerMethod
     metrics: dict[str, Any]
 
     @property
     def iou(self) -> float:
-        """IoU of the answers that a user gets, on views that training has not seen."""
+        """IoU of the answers by ``method``, on views that training has not seen."""
         return float(self.metrics["iou"])
 
     @property
@@ -196,7 +201,8 @@ class Learned:
 
     def __repr__(self) -> str:
         miou = "" if self.miou is None else f", mIoU {format_score(self.miou)}"
-        return f"Learned({str(self.weights)!r}: IoU {format_score(self.iou)}{miou})"
+        trained = "trained" if self.weights is not None else "not trained"
+        return f"Learned({str(self.folder)!r}: {trained}, method {self.method}, IoU {format_score(self.iou)}{miou})"
 
 
 def learn(
@@ -207,8 +213,9 @@ def learn(
     init: str = "",
     units: Literal["mm", "cm", "m", "in"] | None = None,
     workers: int = 1,
+    train: TrainChoice = "auto",
 ) -> Learned:
-    """Weights of an object of your own, in one call and so many minutes: `mereo learn`.
+    """Score the search alone on an object, and train a network of it where that is not good enough: `mereo learn`.
 
     Args:
         object: a scene's name or file, or the object's meshes: one for each segment, one file of named parts, or a
@@ -218,18 +225,24 @@ def learn(
         init: weights to start from, a shipped name or a file; by default the shipped ones that adapt fastest.
         units: of the meshes; guessed where not given.
         workers: processes that make examples, as in ``generate``; 0 means one per core.
+        train: "auto" where the search alone is not good enough, "always", or "never".
 
     Raises ``ValueError`` for other arguments than the folder was begun with, and as the stages do.
     """
     given = [object] if isinstance(object, str | Path) else object
     files, folder = [Path(file) for file in given], Path(output)
+    if train not in get_args(TrainChoice):
+        known = ", ".join(get_args(TrainChoice))
+        raise ValueError(f"train is {train!r}; it must be one of {known}: correct the spelling")
     processes = workers or os.cpu_count() or 1
     with python_words():
-        metrics = learning.learn(files, folder, minutes=minutes, init=init, units=units, workers=processes)
+        metrics = learning.learn(files, folder, minutes=minutes, init=init, units=units, workers=processes, train=train)
     return Learned(
-        weights=folder / WEIGHTS,
+        folder=folder,
+        weights=folder / WEIGHTS if metrics["trained"] else None,
         scene=scene_for(files, folder, units),
         frame=folder / FRAME,
-        report=folder / learning.TEST / "report.html",
+        report=folder / learning.TEST / "report.html" if metrics["trained"] else None,
+        method=metrics["method"],
         metrics=metrics,
     )

@@ -43,7 +43,7 @@ OWN_OBJECT = """[bold]On your own object[/bold], from its meshes: nothing is tra
   mereo reconstruct cloud.ply --object PART.stl PART.stl --output result
   mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --object PART.stl PART.stl --output result
 
-[bold]At once, and telling look-alike parts apart[/bold]: with a network, ten minutes once for an object
+[bold]At once, and telling look-alike parts apart[/bold]: with a network, where that helps, ten minutes for an object
   mereo learn PART.stl PART.stl --output learned --minutes 10
   mereo reconstruct frame.ply --object learned --output result
 

@@ -13,11 +13,15 @@ from mereo.workers.config import RayAddress, TaskResources, cluster_of
 
 @dataclass(frozen=True)
 class LearnCommand:
-    """Learn an object of your own, or a folder of them, in so many minutes each: needs the extra `network`.
+    """Find out whether an object of yours, or each of a folder, needs training, and train it if so: extra `network`.
+
+    First the search alone, which needs no training, is scored on test views. Where it is good enough (every view is
+    explained, and mIoU is 0.85 or more, 0.5 or more in each view), that is all; else: generate, train, evaluate.
 
     The same command again goes on where it was stopped.
 
-    The result is weights.safetensors in the folder, with scores and a report in test, and a frame to try them on.
+    The result is a folder for --object: scores in metrics.json and a frame to try, and where it was trained
+    weights.safetensors, and a report in test.
 
     Attributes:
         object: a scene file (.yaml, .py), or the object's meshes as for `mereo scene new`: one for each segment, one
@@ -25,6 +29,7 @@ class LearnCommand:
             meshes is one, is learnt into --output/NAME, and one that fails stops no other.
         output: folder to create; the same command continues one that was stopped.
         minutes: what all stages of an object may take together; more is better.
+        train: auto trains where the search alone is not good enough; always; or never.
         init: weights to start from, a shipped name or a file; by default the shipped ones that adapt fastest.
         units: of the meshes; guessed where not given.
         workers: processes that make examples; 0 means as many as --threads.
@@ -39,6 +44,7 @@ class LearnCommand:
     object: ObjectFiles
     output: Path
     minutes: Positive = 10.0
+    train: Literal["auto", "always", "never"] = "auto"
     init: str = ""
     units: Literal["mm", "cm", "m", "in"] | None = None
     workers: Workers = 0
@@ -49,7 +55,7 @@ class LearnCommand:
     options_from: ConfigFile = None
 
     def run(self) -> None:
-        """Learn, and print the scores and how to use the weights."""
+        """Learn, and print the scores and how to use the object."""
         from mereo.api.steps import learn
         from mereo.learning.object_folders import is_folder_of_objects, learn_objects
         from mereo.workers.cluster import joined_first
@@ -58,7 +64,15 @@ class LearnCommand:
         if not is_folder_of_objects(self.object):
             if self.ray is not None:
                 raise ValueError("--ray is for a folder of objects, each of which is a task: name one, or leave it out")
-            learn(self.object, self.output, minutes=self.minutes, init=self.init, units=self.units, workers=workers)
+            learn(
+                self.object,
+                self.output,
+                minutes=self.minutes,
+                init=self.init,
+                units=self.units,
+                workers=workers,
+                train=self.train,
+            )
             return
         task = TaskResources(self.cpus_per_object, self.gpus_per_object)
         cluster = None if self.ray is None else cluster_of(self.ray, self.threads, task)
@@ -70,5 +84,6 @@ class LearnCommand:
                 init=self.init,
                 units=self.units,
                 workers=workers,
+                train=self.train,
                 cluster=cluster,
             )

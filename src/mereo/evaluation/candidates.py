@@ -52,12 +52,14 @@ class Candidates:
         each: answers by who gives them.
         default: whose answer a user gets.
         known: whether the frame is said to show the object; None where no registration was asked for.
+        seconds: from the cloud to the answer that a user gets, all that led to it included.
     """
 
     code: EncodedCloud
     each: dict[AnswerName, Candidate]
     default: AnswerName
     known: Known | None = None
+    seconds: float = 0.0
 
     @property
     def answer(self) -> Candidate:
@@ -92,14 +94,14 @@ def find_candidates(
     labels = network_labels(model, code, grid)
     each: dict[AnswerName, Candidate] = {"network": Candidate(labels, encoding + time.perf_counter() - started)}
     if registrar is None:
-        return Candidates(code, each, "network")
+        return Candidates(code, each, "network", seconds=each["network"].seconds)
     known, names = answer.recognition.known, names_for(registrar)
     if answer.candidate.modes is None or answer.registration is None:  # too little is found, whoever is scored
-        return Candidates(code, dict.fromkeys(names, each["network"]), "network", known)
+        return Candidates(code, dict.fromkeys(names, each["network"]), "network", known, answer.seconds)
     each["modes"] = _registered(answer.candidate.modes.registration(), grid, encoding)
     if "full" in names:
         each["full"] = _registered(answer.registration, grid, encoding)
-    return Candidates(code, each, names[-1] if answer.taken else "network", known)
+    return Candidates(code, each, names[-1] if answer.taken else "network", known, answer.seconds)
 
 
 def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:

@@ -88,6 +88,7 @@ class ScoredCase:
         places: of the registration behind the answer; None without one, or without known places.
         view: labels for a picture; None where none is wanted.
         known: as ``Candidates`` has it.
+        seconds: as ``Candidates`` has them.
     """
 
     name: str
@@ -98,6 +99,7 @@ class ScoredCase:
     places: RegisteredPlaces | None
     view: EvaluatedView | None
     known: Known | None = None
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +145,7 @@ class Scoring:
             places=_places(one, found.answer),
             view=_evaluated_view(one, model, found, colors) if index < self.kept else None,
             known=found.known,
+            seconds=found.seconds,
         )
 
 
@@ -208,4 +211,5 @@ class EvaluationTally:
             radii_calibrated=bool(places) and all(one.calibrated for one in places),
             reliability=self.reliability,
             calibrated=self.model.calibrates,
+            seconds=tuple(one.seconds for one in self.cases),
         )

@@ -76,6 +76,7 @@ class Evaluation:
         radii_calibrated: whether all of these are.
         reliability: of the network's probabilities.
         calibrated: whether these are.
+        seconds: of each example, from the cloud to the answer that a user gets.
     """
 
     names: tuple[str, ...]
@@ -92,6 +93,7 @@ class Evaluation:
     radii_calibrated: bool = False
     reliability: Reliability = field(default_factory=Reliability)
     calibrated: bool = False
+    seconds: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         scores, count = self.scores, counted(len(self.examples), "example")

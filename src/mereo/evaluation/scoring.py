@@ -119,7 +119,7 @@ def evaluate(
             raise ValueError(
                 f"{fault}, so places cannot be compared: {CURE}, or score the network with --method network"
             )
-    case = partial(_scene_case, scene, settings or GenerateConfig(), seed, cells)
+    case = partial(scene_case, scene, settings or GenerateConfig(), seed, cells)
     unit_mm = None if scene.unit_m is None else 1000 * scene.unit_m
     registrar = registrar_for(model, method, scene)
     return replace(score_cases(model, case, examples, progress, registrar, cluster=cluster), unit_mm=unit_mm)
@@ -138,7 +138,8 @@ def trained_scene(model: Model) -> str:
     return scene
 
 
-def _scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, index: int) -> TestCase:
+def scene_case(scene: Scene, settings: GenerateConfig, seed: int, cells: int, index: int) -> TestCase:
+    """Make a test case of a scene: view ``index`` of a seed, as a cloud in scene units, with its truth."""
     view = sample_view(scene.for_seed(seed), settings, example_rng(seed, index))
     name = f"{scene.name} {index}"
     return TestCase(name, view.depth.to_points(), truth_grid(view.mesh, cells), 1.0, partial(true_material, view))

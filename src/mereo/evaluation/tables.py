@@ -29,6 +29,7 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "confusion matrix over the set; miou is the mean over the segments without empty space",
         "iou": scores.iou,
         "miou": scores.miou,
+        "seconds": float(np.median(evaluation.seconds)) if evaluation.seconds else None,
         "per_segment": dict(zip(evaluation.names, scores.per_segment.tolist(), strict=True)),
         "example_mean": {"iou": iou, "miou": miou},
         "per_example": per_example(evaluation),

@@ -20,6 +20,9 @@ MOST_BURIED = 5e-3
 MOST_BACKWARDS = 0.05
 """Share of the surface that may face inwards before the winding number has no meaning."""
 
+MOST_UNDECIDED = 0.5
+"""Share of the surface that may have as much of an inside before it as behind it: of open surfaces it is all."""
+
 
 @dataclass(frozen=True)
 class Health:
@@ -28,10 +31,12 @@ class Health:
     Attributes:
         dirty: faults that the winding number copes with.
         hopeless: faults that leave no inside.
+        mendable: whether a repair may help.
     """
 
     dirty: tuple[str, ...] = ()
     hopeless: tuple[str, ...] = ()
+    mendable: bool = True
 
     @property
     def sound(self) -> bool:
@@ -43,22 +48,25 @@ def examine(segment: Segment) -> Health:
     """Faults of a mesh: missing or broken data, open edges, faces that disagree, face inwards or are buried.
 
     Across a face the winding number rises by one from its front to its back. In front of it, it is 0 on a solid's
-    surface, 1 where the face lies within the mesh itself (a self-intersection), and -1 where it faces inwards.
+    surface, 1 where the face lies within the mesh itself (a self-intersection), and -1 where it faces inwards. On both
+    sides of an open surface that encloses nothing it is about a half.
     """
     vertices, faces = segment.vertices, segment.faces
     if len(faces) == 0:
-        return Health(hopeless=("has no faces",))
+        return Health(hopeless=("has no faces",), mendable=False)
     if not np.isfinite(vertices).all():
         return Health(hopeless=("has NaN or infinite vertices",))
     if faces.min() < 0 or faces.max() >= len(vertices):
         return Health(hopeless=(f"has a face that refers to vertex {int(faces.max())} of {len(vertices)}",))
     if not (segment.bounds[1] > segment.bounds[0]).all():
-        return Health(hopeless=("is flat, without any volume",))
+        return Health(hopeless=("is flat, without any volume",), mendable=False)
     dirty = []
     open_edges, misoriented = segment.edge_imbalance()
     if open_edges:
         dirty.append(f"has {open_edges} open edges (holes)")
-    buried, backwards = _wrong_shares(segment)
+    buried, backwards, undecided = _wrong_shares(segment)
+    if open_edges and undecided > MOST_UNDECIDED:
+        return Health(hopeless=(f"is an open surface ({open_edges} open edges) that encloses no volume",))
     if backwards > MOST_BACKWARDS:
         return Health(tuple(dirty), (f"has {backwards:.0%} of its surface facing inwards",))
     if misoriented:
@@ -74,8 +82,8 @@ def faces_astray(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
     return segment.edge_imbalance()[1] > 0 or _wrong_shares(segment)[1] > NEGLIGIBLE
 
 
-def _wrong_shares(segment: Segment) -> tuple[float, float]:
-    """Shares of the surface that lie within the mesh itself, and that face inwards."""
+def _wrong_shares(segment: Segment) -> tuple[float, float, float]:
+    """Shares of the surface that lie within the mesh itself, that face inwards, and that have an inside nowhere."""
     low, high = segment.bounds
     vertices = (segment.vertices - (low + high) / 2) / float(np.linalg.norm(high - low))
     a, b, c = (vertices[segment.faces[:, k]] for k in range(3))
@@ -85,7 +93,8 @@ def _wrong_shares(segment: Segment) -> tuple[float, float]:
     front = ((a + b + c) / 3)[proper] + BESIDE * normal[proper] / area[proper, None]
     winding = igl.fast_winding_number(vertices, segment.faces.astype(np.int64), front)
     share = area[proper] / area.sum()
-    return float(share[winding > 0.5].sum()), float(share[winding < -0.5].sum())
+    undecided = (winding > -0.75) & (winding < -0.25)
+    return float(share[winding > 0.5].sum()), float(share[winding < -0.5].sum()), float(share[undecided].sum())
 
 
 # --- units ------------------------------------------------------------------------------------------------------------

@@ -1,1 +1,1 @@
-"""From an object to weights that answer, in one command and so many minutes."""
+"""Whether an object needs weights, and from the object to them, in one command and so many minutes."""

@@ -1,8 +1,10 @@
-"""``mereo learn``: from an object to weights that answer, in stages that each leave something whole.
+"""``mereo learn``: whether an object needs training, and its weights if so, in stages that each leave something whole.
 
-    object -check-> measure -plan-> generate -> train -> evaluate -> scores, a report, and a frame to try
+    object -check-> search alone -good enough-> scores, and a frame to try
+                         '--else--> measure -plan-> generate -> train -> evaluate -> these, a report, and weights
 
-The plan is written down once it is made, so the same command continues where it was stopped, with the same numbers.
+Scores and plan are written down once they are made, so the same command continues where it was stopped, with the same
+numbers.
 """
 
 import json
@@ -20,23 +22,34 @@ from mereo.io.config import CONFIG
 from mereo.io.output_folders import MARKER, claim_directory
 from mereo.io.scratch_folders import scratch_folder
 from mereo.learning.example_frame import FRAME, write_example_frame
-from mereo.learning.object_files import SCENE, check, names_scene, scene_for
-from mereo.learning.outcome import show_outcome
+from mereo.learning.object_files import SCENE, SEARCH, check, place_of_scene, scene_for
+from mereo.learning.outcome import (
+    advice_after_training,
+    advice_without_training,
+    comparison,
+    repeated_command,
+    show_outcome,
+)
 from mereo.learning.probe import MADE_AS, measure
 from mereo.learning.schedule import OFFSET_EXAMPLES, Plan, Rates, epochs_for, holdout, plan_for, views_for
+from mereo.learning.search_stage import SEARCH_SHARE, scores_of_views, search_line, search_scores
+from mereo.learning.training_choice import TrainChoice, is_to_train, shortcomings, training_reason
 from mereo.models.weights import load_model, with_calibration
 from mereo.models.weights_place import WEIGHTS, find_weights
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.shards import generate
 from mereo.training.config import PRESETS, TrainConfig
-from mereo.training.trainer import train
+from mereo.training.trainer import train as train_network
 from mereo.visualization.evaluation_files import evaluate_weights
 
 SETTINGS, PLAN = CONFIG, "plan.json"
 """What was asked for, and what was decided, with the measurements behind it."""
 
 DATA, RUN, TEST = "data", "run", "test"
+
+METRICS = "metrics.json"
+"""Scores of the search alone and, where there are weights, of the network alone and of both, and which to use."""
 
 SEED = 1
 """Of examples and training. What is learnt from another one differs by chance alone."""
@@ -74,7 +87,7 @@ class Clock:
     def stage(self, number: int, what: str) -> None:
         """Print which stage begins, and the time left."""
         left = f"{self.left_s / 60:.1f} of {self.budget_s / 60:g} min left" if self.left_s > 0 else "out of time"
-        print(f"[{number}/5] {what} ({left})", flush=True)
+        print(f"[{number}/6] {what} ({left})", flush=True)
 
 
 def learn(
@@ -85,8 +98,9 @@ def learn(
     init: str = "",
     units: str | None = None,
     workers: int = 1,
+    train: TrainChoice = "auto",
 ) -> dict[str, Any]:
-    """Learn an object in about so many minutes; returns the scores, as ``test/metrics.json`` has them.
+    """Learn an object in about so many minutes, where it needs that; returns the scores as ``metrics.json`` has them.
 
     Args:
         files: a scene's name or file, or the object's meshes, as ``mereo scene new`` takes them.
@@ -95,42 +109,72 @@ def learn(
         init: weights to start from; empty compares the shipped ones.
         units: of the meshes; guessed where not given.
         workers: processes that make examples.
+        train: "auto" trains where the search alone is not good enough (``training_choice.shortcomings``), or where that
+            was begun in the folder; "always" in any case; "never" not at all.
 
     Raises ``ValueError`` for other arguments than the folder was begun with, and as the stages do.
     """
     clock = Clock.of(minutes)
     if init:
         find_weights(init)  # a name that is none is better said before the work
-    if not (output / PLAN).is_file():
+    if not (output / PLAN).is_file() and not (output / SEARCH).is_file():
         clock.stage(1, "check the object")
         check(files, units)
-    _claim(output, {"object": [_place(file) for file in files], "minutes": minutes, "init": init, "units": units})
+    _claim(
+        output, {"object": [place_of_scene(file) for file in files], "minutes": minutes, "init": init, "units": units}
+    )
+    is_begun = (output / PLAN).is_file()
+    if is_begun and train == "never":
+        raise ValueError(
+            f"{output} was trained, or begun to be, but --train is never: leave it out to go on, or choose another "
+            "--output"
+        )
     scene = scene_for(files, output, units)
-    loaded, recipe = load_scene(scene), recipe_for(minutes)
+    loaded, named = load_scene(scene), place_of_scene(Path(scene))
+    clock.stage(2, "score the search alone, without training")
+    searched = search_scores(output, loaded, named, SEARCH_SHARE * clock.budget_s)
+    reasons = shortcomings(searched.summary())
+    print(search_line(searched), flush=True)
+    if is_begun or is_to_train(train, reasons):
+        print(f"it is trained: {training_reason(train, reasons, is_begun)}", flush=True)
+        _train(scene, output, clock, init, workers, searched.median_s)
+        test = read_metrics(output / TEST / "metrics.json")
+        metrics = comparison(scores_of_views(output, loaded, named, test["examples"]).summary(), test)
+        advice = advice_after_training(metrics, test["per_segment"], minutes)
+    else:
+        metrics = {"trained": False, "method": "search", **searched.summary(), "search": searched.summary()}
+        advice = advice_without_training(reasons, repeated_command(files, output, minutes, init, units))
+    write_json(output / METRICS, metrics)
+    frame = write_example_frame(loaded, output / FRAME)
+    show_outcome(metrics, advice, output, scene, frame, (time.monotonic() - clock.started) / 60)
+    return metrics
+
+
+def _train(scene: str, output: Path, clock: Clock, init: str, workers: int, search_s: float) -> None:
+    """Measure, generate, train, calibrate and evaluate; the search will take ``search_s`` seconds of each test view."""
+    recipe = recipe_for(clock.budget_s / 60)
     plan = _decided(output)
     fresh = plan is None
     if plan is None:
-        clock.stage(2, "measure this machine, and choose weights to start from")
+        clock.stage(3, "measure this machine, and choose weights to start from")
         plan = _measured(scene, output, recipe, clock, init, workers)
-    clock.stage(3, f"generate {plan.examples} examples, about {_duration(plan.generation_s)}")
+    clock.stage(4, f"generate {plan.examples} examples, about {_duration(plan.generation_s)}")
     generate(scene, output / DATA, MADE_AS, examples=plan.examples, seed=SEED, workers=workers, resume=True)
     if fresh:
         plan = _revised(output, plan, clock, recipe.batch)
     clock.stage(
-        4, f"train from the weights of {plan.init}, {plan.epochs:.1f} passes, about {_duration(plan.training_s)}"
+        5, f"train from the weights of {plan.init}, {plan.epochs:.1f} passes, about {_duration(plan.training_s)}"
     )
-    weights = train(output / DATA, output / RUN, trained(recipe, plan), checkpoint_every_s=CHECKPOINT_S)
-    clock.stage(5, "calibrate, and evaluate on views that training has not seen")
+    weights = train_network(output / DATA, output / RUN, trained(recipe, plan), checkpoint_every_s=CHECKPOINT_S)
+    clock.stage(6, "calibrate, and evaluate on views that training has not seen")
     evaluated = (output / TEST / MARKER).is_file()
     if not evaluated or not (output / WEIGHTS).is_file():
         left_s = max(clock.left_s, plan.evaluation_s)
         each_s = _calibrated(weights, output, scene, left_s)
         if not evaluated:
-            _evaluate(output, scene, max(clock.left_s, (1 - CALIBRATION_SHARE) * plan.evaluation_s), each_s)
-    text = write_example_frame(loaded, output / FRAME)
-    metrics = read_metrics(output / TEST / "metrics.json")
-    show_outcome(metrics, output, scene, text, minutes, (time.monotonic() - clock.started) / 60)
-    return metrics
+            left_s = max(clock.left_s, (1 - CALIBRATION_SHARE) * plan.evaluation_s)
+            examples = views_for(left_s, each_s + search_s)
+            evaluate_weights(output / WEIGHTS, output / TEST, examples=examples, scene=scene)
 
 
 def recipe_for(minutes: float) -> TrainConfig:
@@ -146,11 +190,6 @@ def trained(recipe: TrainConfig, plan: Plan) -> TrainConfig:
 
 
 # --- what is kept between runs of the command -------------------------------------------------------------------------
-
-
-def _place(file: Path) -> str:
-    """Name of a built-in scene, or the absolute path of a file."""
-    return str(file) if names_scene([file]) and not file.suffix else str(file.absolute())
 
 
 def _claim(output: Path, settings: dict[str, Any]) -> None:
@@ -212,11 +251,6 @@ def _calibrated(weights: Path, output: Path, scene: str, left_s: float) -> float
     with atomic_file(output / WEIGHTS) as partial:
         partial.write_bytes(with_calibration(weights, found))
     return each_s
-
-
-def _evaluate(output: Path, scene: str, left_s: float, each_s: float) -> None:
-    """Score the weights on as many views as there is time for."""
-    evaluate_weights(output / WEIGHTS, output / TEST, examples=views_for(left_s, each_s), scene=scene)
 
 
 def _duration(seconds: float) -> str:

@@ -1,8 +1,10 @@
 """What is learnt: a scene, or meshes for which a scene file is written; and what is wrong with it before any work."""
 
+import json
 import shlex
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +26,9 @@ from mereo.scenes.seeds import example_rng
 SCENE = "scene.yaml"
 """Scene file that is written for meshes."""
 
+SEARCH = "search.json"
+"""File of a folder of ``mereo learn`` with the scores of the search alone, and the scene's name or file."""
+
 STATES = 24
 """Random states from which it is seen how far an object deforms."""
 
@@ -34,6 +39,28 @@ HARDLY = 0.005
 def names_scene(files: Sequence[Path]) -> bool:
     """Whether a scene is named: one that is built in, or a scene file; other files are meshes."""
     return len(files) == 1 and (str(files[0]) in SCENES or is_yaml(files[0]) or files[0].suffix == ".py")
+
+
+def place_of_scene(file: Path) -> str:
+    """Name of a built-in scene, or the absolute path of a file."""
+    return str(file) if names_scene([file]) and not file.suffix else str(file.absolute())
+
+
+def scene_of_folder(folder: Path) -> str | None:
+    """Scene of a folder that ``mereo learn`` has written: its own file, or else the name or file it was learnt from.
+
+    None where the folder is none of these. A scene in Python is not run by a folder's word: also None.
+    """
+    if (folder / SCENE).is_file():
+        return str(folder / SCENE)
+    path = folder / SEARCH
+    if not path.is_file():
+        return None
+    with suppress(ValueError, AttributeError):
+        scene = json.loads(path.read_text("utf-8")).get("scene")
+        if isinstance(scene, str) and (scene in SCENES or is_yaml(Path(scene))):
+            return scene
+    return None
 
 
 def scene_for(files: Sequence[Path], folder: Path, units: str | None, quiet: bool = False) -> str:
@@ -66,8 +93,11 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
     cure = f"let `mereo scene new {new} --output object.yaml` and `mereo scene check object.yaml --repair` mend it"
     for file in () if is_volume(files[0]) else files:
         for part in read_segmented_mesh(file).segments:
-            if faults := examine(part).hopeless:
-                raise ValueError(f"segment {part.name!r} of {file} {faults[0]}; an object's parts are solids: {cure}")
+            health = examine(part)
+            if health.hopeless:
+                solid = "name a file of its whole, closed surface" + (f", or {cure}" if health.mendable else "")
+                fault = f"segment {part.name!r} of {file} {health.hopeless[0]}"
+                raise ValueError(f"{fault}; an object's parts are solids: {solid}")
     with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", MeshWarning)
         path = write_scene_file(files, Path(folder) / SCENE, units, name=files[0].name.split(".")[0])

@@ -25,6 +25,7 @@ from mereo.io.progress import duration
 from mereo.io.scratch_folders import check_place
 from mereo.io.volume_files import is_volume
 from mereo.learning.learn import learn
+from mereo.learning.training_choice import TrainChoice
 from mereo.scenes.registry import is_yaml
 from mereo.workers.config import Cluster
 from mereo.workers.spread import spread
@@ -42,7 +43,7 @@ class Trial:
 
     Attributes:
         name: its own.
-        metrics: scores as its test/metrics.json has them; None where it could not be learnt.
+        metrics: scores as its metrics.json has them; None where it could not be learnt.
         reason: why not, in a sentence.
         seconds: that its trial took.
     """
@@ -122,6 +123,7 @@ def learn_objects(
     init: str = "",
     units: str | None = None,
     workers: int = 1,
+    train: TrainChoice = "auto",
     cluster: Cluster | None = None,
 ) -> list[Trial]:
     """Learn each object of a folder into ``output``/NAME, and print a table; one that fails is said and passed over.
@@ -135,6 +137,7 @@ def learn_objects(
         init: weights to start from; empty compares the shipped ones.
         units: of the meshes; guessed where not given.
         workers: processes that make examples of an object.
+        train: when to train an object, as ``learn`` takes it.
         cluster: where each object is a task, whose CPUs are its workers. All nodes must see the files and ``output``
             under the same paths.
 
@@ -146,15 +149,14 @@ def learn_objects(
     _claim(output, settings)
     absolute = [(name, tuple(file.absolute() for file in files)) for name, files in found]
     trial = _Learning(
-        output.absolute(), minutes, init, units, cluster.cpus if cluster else workers, cluster is not None
+        output.absolute(), minutes, init, units, cluster.cpus if cluster else workers, train, cluster is not None
     )
     trials: dict[str, Trial] = {}
     started = time.monotonic()
     with closing(spread(trial, absolute, cluster=cluster, lost=_lost)) as done:
         for (name, _), one in done:
             trials[name] = one
-            told = "failed" if one.metrics is None else f"learnt in {duration(one.seconds)}"
-            print(f"\n[{len(trials)} of {len(found)}] {name} {told}", flush=True)
+            print(f"\n[{len(trials)} of {len(found)}] {name} {_outcome(one)}", flush=True)
             if one.metrics is None:
                 print(f"mereo: error: {name}: {one.reason}", file=sys.stderr, flush=True)
     ordered = [trials[name] for name, _ in found]
@@ -188,6 +190,7 @@ class _Learning:
     init: str
     units: str | None
     workers: int
+    train: TrainChoice
     remote: bool
 
     def __call__(self, item: Learnable, cancelled: Callable[[], bool]) -> Trial:
@@ -210,6 +213,7 @@ class _Learning:
                     init=self.init,
                     units=self.units,
                     workers=self.workers,
+                    train=self.train,
                 )
         except Exception as error:
             if os.environ.get("MEREO_TRACEBACK") == "1":
@@ -227,6 +231,13 @@ class _Learning:
                 )
 
 
+def _outcome(trial: Trial) -> str:
+    """Phrase on what became of an object."""
+    if trial.metrics is None:
+        return "failed"
+    return f"{'trained' if trial.metrics['trained'] else 'scored without training'} in {duration(trial.seconds)}"
+
+
 def _lost(item: Learnable, error: ChildProcessError) -> Trial:
     """Trial of an object whose task was killed again and again."""
     return Trial(item[0], None, str(error))
@@ -237,17 +248,19 @@ def _show(trials: Sequence[Trial], output: Path, seconds: float) -> None:
     print()
     table = Table(title=f"{len(trials)} objects in {duration(seconds)}, results in {output}/NAME", title_justify="left")
     table.add_column("object", overflow="fold")
+    table.add_column("use")
     for column in ("IoU", "mIoU", "took"):
         table.add_column(column, justify="right")
     for one in trials:
         scores = (
-            ("", "", "failed")
+            ("", "", "", "failed")
             if one.metrics is None
-            else (_score(one.metrics["iou"]), _score(one.metrics["miou"]), duration(one.seconds))
+            else (
+                "both" if one.metrics["method"] == "auto" else one.metrics["method"],
+                format_score(one.metrics["iou"]),
+                format_score(one.metrics["miou"]),
+                duration(one.seconds),
+            )
         )
         table.add_row(one.name, *scores)
     Console(markup=False, emoji=False).print(table)
-
-
-def _score(value: float | None) -> str:
-    return format_score(float("nan") if value is None else value)
