@@ -35,7 +35,7 @@ def stream(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: tuple[str, .
     outcomes = [Outcome(name, 0.0, answered, "", 0.1, 0.1, 0) for name in frames]
     nothing = SimpleNamespace(network=None, registrar=lambda _: None)
     monkeypatch.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
-    monkeypatch.setattr("mereo.cli.stream.Answering", lambda *_: None)
+    monkeypatch.setattr("mereo.cli.stream.Answering", lambda *_: SimpleNamespace(close=lambda: None))
     monkeypatch.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(outcomes))
     monkeypatch.setattr("mereo.cli.stream.line", lambda outcome: {"error": outcome.error})
     return command_line.main(["stream", "-", "--weights", "rope", "--surfaces", str(surfaces), *more])

@@ -93,7 +93,7 @@ def test_a_stream_ends_with_its_summary(
     with monkeypatch.context() as patched:
         nothing = SimpleNamespace(network=None, registrar=lambda _: None)
         patched.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
-        patched.setattr("mereo.cli.stream.Answering", lambda *_: None)
+        patched.setattr("mereo.cli.stream.Answering", lambda *_: SimpleNamespace(close=lambda: None))
         patched.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(lambda: os.kill(os.getpid(), STOPPING[0]), 1))
         assert run(lambda: stream_reconstructions(str(tmp_path), "rope") and None, patched) == 0
     assert capsys.readouterr().err.startswith("stopped\n0 frames answered")

@@ -99,6 +99,7 @@ def _device() -> Iterator[str]:
         return
     from mereo.models.device import cpu_features
 
+    yield _row("torch", torch.__version__)
     if torch.cuda.is_available():
         free, total = torch.cuda.mem_get_info()
         memory = f"{free / 2**30:.1f} of {total / 2**30:.1f} GiB free"

@@ -63,7 +63,7 @@ BENDING = ((0.12, 5, 0.05), (0.05, 8, 0.02))
 RIVAL = 1.5
 """Misfit by few points, in misfits of the best, up to which a candidate may still be as good.
 
-Of 176 candidates of training views that had more, none was better than the best by more than a hundredth."""
+Of 65 candidates with more, of 25 training views that others explain, none ended lower by a cloud's misfit of .01."""
 
 NOISY_FITS = 4
 """Candidates that are fitted again where a frame is noisy."""
@@ -71,12 +71,11 @@ NOISY_FITS = 4
 ALIKE = 0.05
 """Difference of the cloud's misfit up to which two states explain a frame alike."""
 
-
 WHOLE = 150.0
 """Misfit by which an object that is seen whole may be explained worse than one that something hides in part.
 
-The silhouette only adds to the misfit, so the hypothesis without it always has a lower one: on whole views by less than
-this, on views of which 30 % are hidden by more."""
+The silhouette only adds to the misfit, so the hypothesis without it has a lower one: by more than this on 4 of 40 whole
+training views, and on all of 40 of which 30 % are hidden."""
 
 
 @dataclass(frozen=True, eq=False)
