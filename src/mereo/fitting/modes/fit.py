@@ -13,7 +13,7 @@ import numpy as np
 
 from mereo.fitting.modes.hypotheses import ALIKE, by_likeness, by_network
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.joints import positions
+from mereo.fitting.problem.joints import corner_places
 from mereo.fitting.problem.priors import Prior
 from mereo.fitting.problem.problem import Misfit, Problem
 from mereo.fitting.problem.residuals import Surface
@@ -22,8 +22,12 @@ from mereo.geometry.procrustes import robust_rigid
 
 def fit_modes(problem: Problem) -> "Judged":
     """The whole fit, and how well it explains the frame."""
-    first = fit_whole(problem)
-    return explored(problem, Judged.of(problem, first).better(problem, refine(problem, first)))
+    return explored(problem, refined(problem, fit_whole(problem)))
+
+
+def refined(problem: Problem, posed: Posed) -> "Judged":
+    """The better of a state and of what its refinement makes of it."""
+    return Judged.of(problem, posed).better(problem, refine(problem, posed))
 
 
 def explored(problem: Problem, best: "Judged") -> "Judged":
@@ -79,9 +83,7 @@ def likely(problem: Problem, best: Posed, number: int) -> list[Posed]:
 def distinct(problem: Problem, best: Posed, others: list[Posed]) -> list[Posed]:
     """Those that differ from ``best`` and from all before them: from alike starts a fit ends alike."""
     model = problem.model
-    z = np.stack([posed.z for posed in (best, *others)]).astype(np.float32)
-    unposed = positions(model, problem.joints.corners, z).reshape(len(z), -1, 3)
-    places = [posed.place(points) for posed, points in zip((best, *others), unposed, strict=True)]
+    places = corner_places(model, [best, *others])
     kept = [0]
     for index in range(1, len(places)):
         apart = [np.linalg.norm(places[index] - places[other], axis=1).max() for other in kept]
@@ -95,8 +97,13 @@ def fit_whole(problem: Problem) -> Posed:
     prior = Prior.whole(problem.model)
     z = np.zeros(problem.model.count)
     T = robust_rigid(problem.unposed(z), problem.network.target, problem.network.confidence, problem.network_sigma)
-    posed = fit_network(problem, Posed(T[:3, :3], T[:3, 3], z), prior)
+    return fit_wide(problem, fit_network(problem, Posed(T[:3, :3], T[:3, 3], z), prior))
+
+
+def fit_wide(problem: Problem, posed: Posed) -> Posed:
+    """Stage 2 from a state that may be far off, under the prior of all states."""
     config = problem.config
+    prior = Prior.whole(problem.model)
     return fit_cloud(problem, posed, prior, config.start_sigma, config.last_steps, config.pair_slack)
 
 

@@ -109,6 +109,13 @@ def positions(
     return model.mean[corners] + motion.reshape(len(z), *corners.shape, 3).astype(np.float64)
 
 
+def corner_places(model: StatisticalModel, states: list[Posed]) -> Float[np.ndarray, "n p 3"]:
+    """Places of the corners of all segments in states, by which these are told apart."""
+    z = np.stack([posed.z for posed in states]).astype(np.float32)
+    unposed = positions(model, corners_of(model), z).reshape(len(z), -1, 3)
+    return np.stack([posed.place(points) for posed, points in zip(states, unposed, strict=True)])
+
+
 def segment_poses(
     mean: Float[np.ndarray, "s c 3"], states: Float[np.ndarray, "n s c 3"]
 ) -> tuple[Float[np.ndarray, "n s 3 3"], Float[np.ndarray, "n s 3"]]:

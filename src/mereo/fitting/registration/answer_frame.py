@@ -130,9 +130,10 @@ def find(
 
 def is_forced(candidate: Candidate) -> bool:
     """Whether a fit explains the points only by a state that is far from usual, or lies where nothing was seen."""
-    assert candidate.modes is not None
-    misfit = candidate.modes.problem.misfit(candidate.modes.posed)
-    return misfit.witnesses + misfit.prior > FORCED
+    modes = candidate.modes
+    assert modes is not None
+    surface = modes.surface if modes.rest is None else Surface.of(modes.problem.model, modes.posed)
+    return modes.problem.witness_misfit(surface) + float(modes.posed.z @ modes.posed.z) > FORCED
 
 
 def more_evident(first: Candidate, second: Candidate) -> Candidate:

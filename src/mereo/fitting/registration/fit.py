@@ -131,6 +131,10 @@ class ModesFit:
 
     def registration(self) -> Registration:
         """The answer of the modes, or the rest model where the frame speaks for that."""
+        return self._registered
+
+    @cached_property
+    def _registered(self) -> Registration:
         if self.rest is not None:
             bent = self.posed.place(self.problem.model.material(self.posed.z))
             end = ModesOptimum(of_rest(self.problem, self.found), self.rest.posed, self.unit, bent)
@@ -170,7 +174,7 @@ class ModesFit:
             method=method,
             z=z,
             scene_unit=self.unit * float(np.exp(posed.log_scale)),
-            unit_known=self.problem.scale_std == KNOWN_SCALE_STD,
+            unit_known=not self.problem.is_scale_open,
             explained=explained,
             accepted=self._is_believed(explained, surface),
             seconds=self.seconds,

@@ -49,15 +49,13 @@ def search_modes(
     with one_blas_thread():
         unit = size_of(points, model) if scene_unit is None else scene_unit
         lines = SightLines.of_cloud() if lines is None else lines
-        partial = replace(lines, elsewhere="unknown") if lines.elsewhere is None else None
-
-        def problem_of(lines: SightLines, unit: float) -> Problem:
-            outliers = None if doubtful is None else doubtful / unit
-            evidence = Evidence.of(points / unit, outliers, lines=lines.scaled(1 / unit))
-            scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD
-            return Problem(model, NetworkTerm.none(model), evidence, scale_std, config)
-
-        found = search(problem_of(lines, unit), None if partial is None else problem_of(partial, unit))
+        outliers = None if doubtful is None else doubtful / unit
+        evidence = Evidence.of(points / unit, outliers, lines=lines.scaled(1 / unit))
+        scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD
+        whole = Problem(model, NetworkTerm.none(model), evidence, scale_std, config)
+        is_open = lines.elsewhere is None
+        partial = replace(whole, evidence=replace(evidence, elsewhere="unknown")) if is_open else None
+        found = search(whole, partial)
         problem, modes = found.problem, found.best
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)

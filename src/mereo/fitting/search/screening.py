@@ -68,6 +68,11 @@ class Poses:
         """Some of them."""
         return Poses(*(part[chosen] for part in vars(self).values()))
 
+    def place(self, unposed: Float32[np.ndarray, "n w 3"]) -> Float32[np.ndarray, "n w 3"]:
+        """Points of each state's frame in the camera frame."""
+        size = np.exp(self.log_scale)[:, None, None]
+        return size * np.matmul(unposed, self.rotation.transpose(0, 2, 1)) + self.translation[:, None]
+
     @classmethod
     def of_all(cls, parts: "list[Poses]") -> "Poses":
         """All of several."""
@@ -170,8 +175,7 @@ class Screen:
         squared = np.einsum("npi,npi->np", offset, offset) / narrow**2
         squared = np.where(facing, squared, squared + ROBUST**2)
         few = tables.place[poses.state, :: max(1, tables.place.shape[1] // LOOKED_UP)]
-        posed = size * np.matmul(few, inverse) + poses.translation[:, None]
-        direction, amount = self.sight.violations(posed, ROBUST * sigma)
+        direction, amount = self.sight.violations(poses.place(few), ROBUST * sigma)
         outside, robust = (amount / sigma) ** 2, (4 * ROBUST) ** 2
         cost = (squared / (1.0 + squared / ROBUST**2)).mean(axis=1)
         cost = cost + OUTSIDE * (outside / (1.0 + outside / robust)).mean(axis=1)

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mereo.fitting.modes.fit import Judged, explored, fit_cloud, refine
+from mereo.fitting.modes.fit import Judged, explored, fit_cloud, fit_wide, refined
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.joints import positions
+from mereo.fitting.problem.joints import corner_places
 from mereo.fitting.problem.priors import Prior
 from mereo.fitting.problem.problem import UNEXPLAINED, Problem
 from mereo.fitting.search.screening import Poses, Screen
@@ -79,7 +79,7 @@ training views, and on all of 40 of which 30 % are hidden."""
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchOutcome:
     """Outcome of a search.
 
     Attributes:
@@ -126,9 +126,6 @@ class _Trail:
         if not self.is_explained:
             self.fitted.append(explored(self.problem, self.best))
 
-    def try_too(self, posed: Posed) -> None:
-        self.fitted.append(Judged.of(self.problem, posed).better(self.problem, refine(self.problem, posed)))
-
     def as_noisy(self) -> "_Trail | None":
         """The same with the constants for what the best fit leaves over, where that is noise and not its own error.
 
@@ -139,17 +136,17 @@ class _Trail:
             return None
         states = [judged.posed for judged in sorted(self.fitted, key=_total)]
         rows = differing(noisy, states, BENT_APART)[:NOISY_FITS]
-        trail = _Trail(noisy, 0.0, [explored(noisy, _fitted(noisy, states[row])) for row in rows])
+        trail = _Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
         return trail if noisy.leaves_noise(trail.best.surface) else None
 
-    def found(self) -> Found:
+    def outcome(self) -> SearchOutcome:
         best = self.best
         likely = [judged for judged in self.fitted if judged.misfit.cloud < best.misfit.cloud + ALIKE]
         alike = differing(self.problem, [judged.posed for judged in sorted(likely, key=_total)], APART)
-        return Found(self.problem, best, len(alike), len(self.fitted))
+        return SearchOutcome(self.problem, best, len(alike), len(self.fitted))
 
 
-def search(whole: Problem, partial: Problem | None = None) -> Found:
+def search(whole: Problem, partial: Problem | None = None) -> SearchOutcome:
     """Search for the state that explains a frame.
 
     Args:
@@ -162,16 +159,16 @@ def search(whole: Problem, partial: Problem | None = None) -> Found:
         for trail in trails:
             trail.go_on(stage)
         for trail, other in permutations(trails, 2):  # either may have found what the other has missed
-            trail.try_too(other.best.posed)
+            trail.fitted.append(refined(trail.problem, other.best.posed))
         chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
         if chosen.is_explained or (number > 0 and chosen.best.misfit.cloud < UNEXPLAINED):
             break
         if number > 0:
             noisy = chosen.as_noisy()
             if noisy is not None:
-                return noisy.found()
+                return noisy.outcome()
             trails = [chosen]
-    return chosen.found()
+    return chosen.outcome()
 
 
 def _total(judged: Judged) -> float:
@@ -189,7 +186,7 @@ def fit_likely(problem: Problem, candidates: list[tuple[float, Posed]], most: in
     for cost, posed in candidates[:most]:
         if fitted and cost > RIVAL * candidates[0][0] and is_explained(problem, min(fitted, key=_total)):
             break
-        fitted.append(_fitted(problem, posed))
+        fitted.append(refined(problem, fit_wide(problem, posed)))
     return fitted
 
 
@@ -209,11 +206,7 @@ def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]
 
 def differing(problem: Problem, states: list[Posed], apart: float) -> list[int]:
     """Rows of the states of which each differs from all before it by ``apart`` half lengths in the mean."""
-    model = problem.model
-    z = np.stack([posed.z for posed in states]).astype(np.float32)
-    unposed = positions(model, problem.joints.corners, z).reshape(len(z), -1, 3)
-    places = np.stack([posed.place(points) for posed, points in zip(states, unposed, strict=True)])
-    return _first_of_each(places, apart * model.half)
+    return _first_of_each(corner_places(problem.model, states), apart * problem.model.half)
 
 
 def _first_of_each(places: Float[np.ndarray, "n p 3"], apart: float) -> list[int]:
@@ -236,9 +229,7 @@ def screened(problem: Problem, stage: SearchRound) -> list[Posed]:
         poses = poses if count >= len(poses) else poses.rows(np.argpartition(poses.cost, count)[:count])
     poses = screen.judged(poses, SIGMAS[-1][0])
     poses = poses.rows(np.argsort(poses.cost))
-    few = tables.place[poses.state, ::16]
-    size = np.exp(poses.log_scale)[:, None, None]
-    places = size * np.matmul(few, poses.rotation.transpose(0, 2, 1)) + poses.translation[:, None]
+    places = poses.place(tables.place[poses.state, ::16])
     return [_posed(screen, poses, row) for row in _first_of_each(places, APART * problem.model.half)[: stage.bent]]
 
 
@@ -246,10 +237,3 @@ def _posed(screen: Screen, poses: Poses, row: int) -> Posed:
     z = screen.tables.z[poses.state[row]].astype(np.float64)
     rotation = Rotation.from_matrix(poses.rotation[row]).as_matrix()
     return Posed(rotation, poses.translation[row].astype(np.float64), z, float(poses.log_scale[row]))
-
-
-def _fitted(problem: Problem, posed: Posed) -> Judged:
-    """Fit of a candidate, as a frame's fit ends."""
-    config, whole = problem.config, Prior.whole(problem.model)
-    posed = fit_cloud(problem, posed, whole, config.start_sigma, config.last_steps, config.pair_slack)
-    return Judged.of(problem, posed).better(problem, refine(problem, posed))

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Int, Int32
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
-from mereo.fitting.problem.gauss_newton import Posed, cross
+from mereo.fitting.problem.gauss_newton import cross
 from mereo.fitting.problem.sampled_surface import SampledSurface
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -68,10 +68,6 @@ class ShapeTables:
             for i in range(len(z))
         ]
         return cls(z, place, normal.reshape(place.shape), low, cell, np.stack(nearest).astype(np.int32))
-
-    def posed(self, state: int, pose: Posed) -> Posed:
-        """The pose with a state's coefficients."""
-        return Posed(pose.rotation, pose.translation, self.z[state].astype(np.float64), pose.log_scale)
 
 
 def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:

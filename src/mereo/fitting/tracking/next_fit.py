@@ -74,7 +74,7 @@ class Track:
         """Track that begins with a frame's own fit."""
         posed, scale = without_scale(fitted.posed)
         base, model = fitted.problem, fitted.problem.model
-        scale_std = KNOWN_SCALE_STD if base.scale_std == KNOWN_SCALE_STD else config.scale_std
+        scale_std = config.scale_std if base.is_scale_open else KNOWN_SCALE_STD
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
         share_surfaces(base, problem)
         still, noise = np.zeros(POSE + model.count), fitted.problem.noise_beside(fitted.surface)
