@@ -10,7 +10,7 @@ from answers import answer_to
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem import correspondences
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.answer_frame import misfit_in, more_evident
+from mereo.fitting.registration.answer_frame import ASTRAY, is_astray, misfit_in, more_evident
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.search_modes import search_modes
 from mereo.geometry.camera import PointCloud
@@ -94,6 +94,31 @@ def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(liver: M
     )
     halved = replace(halved, posed=replace(halved.posed, translation=right.posed.translation / 2))
     assert misfit_in(right, halved) == pytest.approx(misfit_in(right, right), rel=1e-6)
+
+
+def test_a_network_far_from_what_it_starts_is_no_start(liver: Model, cloud: PointCloud) -> None:
+    """Weights after a minute of training explain a frame by chance, with the object turned end for end."""
+    by_network = answer(liver, cloud).candidate
+    assert by_network is not None and by_network.modes is not None
+    assert not is_astray(by_network)
+    found = by_network.modes.found
+    guessed = replace(found, rest=np.random.default_rng(0).permutation(found.rest))
+    lucky = replace(by_network, modes=replace(by_network.modes, found=guessed))
+    assert lucky.is_accepted and is_astray(lucky)
+    displaced = lucky.displaced(by_network.modes.registration())
+    assert displaced is not None and displaced > ASTRAY
+
+
+def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: PointCloud) -> None:
+    """As a noisy one, although its misfit is greater in a problem that knows no noise."""
+    by_network = answer(liver, cloud).candidate
+    assert by_network is not None and by_network.modes is not None
+    strict = replace(by_network.modes.problem, config=replace(by_network.modes.problem.config, tolerance=1e-3))
+    refused = replace(by_network, modes=replace(by_network.modes, problem=strict))
+    astray = replace(by_network.modes.posed, translation=by_network.modes.posed.translation + 0.05)
+    searched = replace(by_network, modes=replace(by_network.modes, posed=astray), found_by="search")
+    assert searched.is_accepted and not refused.is_accepted
+    assert more_evident(refused, searched) is searched
 
 
 def test_a_search_finds_an_unknown_unit(liver: Model, cloud: PointCloud) -> None:

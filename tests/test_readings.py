@@ -11,7 +11,7 @@ from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.noise import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, noise_of, shared
+from mereo.fitting.problem.noise import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, looks_normal, noise_of, shared
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.hypotheses import fit_hypotheses
@@ -157,6 +157,13 @@ def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
     assert noise_of(half, around) == 0.0
     assert 0.97 < shared(own, around, 0.45) < SHARED
     assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
+
+
+def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
+    rng = np.random.default_rng(0)
+    windows = np.repeat(rng.normal(size=300), 9)
+    assert looks_normal(windows)
+    assert not looks_normal(np.where(rng.random(len(windows)) < 0.1, 6.0, windows))
 
 
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(

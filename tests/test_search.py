@@ -153,3 +153,16 @@ def test_noise_is_told_from_a_wrong_state(model: StatisticalModel) -> None:
     fitted = search_modes(noisy, model, 1.0, lines=SightLines.of_cloud("past"))
     assert fitted.problem.noisy and off(model, fitted.registration().material, posed) < 0.1
     assert not search_modes(points, model, 1.0, replace(FitConfig())).problem.noisy
+
+
+def test_errors_that_neighbours_share_are_noise_too(model: StatisticalModel) -> None:
+    """Of a stereo camera that matches windows: each patch of the frame is off by one amount."""
+    posed = state(model, 1)
+    points = view(model, posed)
+    across = points[:, :2] / points[:, 2:]
+    patch = np.unique((across // 0.012).astype(int), axis=0, return_inverse=True)[1].ravel()
+    off_by = np.random.default_rng(0).normal(scale=0.5, size=patch.max() + 1)[patch]
+    noisy = points * (1 + off_by / np.linalg.norm(points, axis=1))[:, None]
+    fitted = search_modes(noisy, model, 1.0, lines=SightLines.of_cloud("past"))
+    assert fitted.problem.noisy and fitted.registration().accepted
+    assert off(model, fitted.registration().material, posed) < 0.1

@@ -11,7 +11,17 @@ from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import MORE_PARTNERS, PARTNERS, Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed, Rows
 from mereo.fitting.problem.joints import Joints
-from mereo.fitting.problem.noise import SHARED, constants_for, is_noise, noise_of, shared
+from mereo.fitting.problem.noise import (
+    LARGEST,
+    SHARED,
+    SIGMAS,
+    constants_for,
+    is_noise,
+    looks_normal,
+    noise_of,
+    shared,
+    size_of,
+)
 from mereo.fitting.problem.priors import PairTerm, Prior
 from mereo.fitting.problem.residuals import (
     ROBUST,
@@ -127,9 +137,15 @@ class Problem:
         """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
         return noise_of(surface.offsets(self.evidence.points), self.evidence.around)
 
-    def as_noisy_as(self, surface: Surface) -> "Problem | None":
-        """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that."""
-        config = constants_for(self.noise_beside(surface), self.config)
+    def as_noisy_as(self, surface: Surface, is_shared: bool = False) -> "Problem | None":
+        """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that.
+
+        Args:
+            surface: the fit's.
+            is_shared: take for noise what neighbours share too.
+        """
+        noise = size_of(surface.offsets(self.evidence.points)) if is_shared else self.noise_beside(surface)
+        config = constants_for(noise, self.config)
         if config is self.config:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_partners, noisy=True)
@@ -154,9 +170,11 @@ class Problem:
         """The problem with other correspondences."""
         return replace(self, network=NetworkTerm.of(self.model, found))
 
-    def leaves_noise(self, surface: Surface) -> bool:
-        """Whether what a fit leaves over is noise, and not its own error."""
+    def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
+        """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
         offset = surface.offsets(self.evidence.points)
+        if is_shared:
+            return size_of(offset) * SIGMAS <= LARGEST and looks_normal(offset)
         return is_noise(offset, noise_of(offset, self.evidence.around))
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:

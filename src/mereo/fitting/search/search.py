@@ -129,15 +129,19 @@ class _Trail:
     def as_noisy(self) -> "_Trail | None":
         """The same with the constants for what the best fit leaves over, where that is noise and not its own error.
 
-        Not before other states were tried: a wrong state may leave over what looks like noise.
+        Each pixel's own, or shared by neighbours. Not before other states were tried: a wrong state may leave over
+        what looks like noise.
         """
-        noisy = self.problem.as_noisy_as(self.best.surface)
-        if noisy is None:
-            return None
         states = [judged.posed for judged in sorted(self.fitted, key=_total)]
-        rows = differing(noisy, states, BENT_APART)[:NOISY_FITS]
-        trail = _Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
-        return trail if noisy.leaves_noise(trail.best.surface) else None
+        for is_shared in (False, True):
+            noisy = self.problem.as_noisy_as(self.best.surface, is_shared)
+            if noisy is None:
+                continue
+            rows = differing(noisy, states, BENT_APART)[:NOISY_FITS]
+            trail = _Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
+            if noisy.leaves_noise(trail.best.surface, is_shared):
+                return trail
+        return None
 
     def outcome(self) -> SearchOutcome:
         best = self.best
