@@ -11,7 +11,17 @@ from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.noise import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, looks_normal, noise_of, shared
+from mereo.fitting.problem.noise import (
+    ACCEPTED,
+    CLEAN,
+    LARGEST,
+    SHARED,
+    constants_for,
+    is_noise,
+    looks_normal,
+    noise_of,
+    shared,
+)
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.hypotheses import fit_hypotheses

@@ -23,9 +23,6 @@ from mereo.fitting.modes.hypotheses import robust_poses
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.residuals import robust_square
 
-MOST_DRAWS = 120
-"""Scenes with more free numbers are left to the modes."""
-
 RANKED_BY = 150
 """Points by which random states are compared with a shape."""
 
@@ -37,9 +34,7 @@ SLIDES = 0.03
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
-    """The best of several starts; None where the scene has too many draws or plays none of them back."""
-    if problem.states.z.shape[1] > MOST_DRAWS:
-        return None
+    """The best of several starts; None where the scene plays none of them back."""
     found = like_modes(problem, modes, [])
     for _ in range(problem.config.passes):
         if explained(problem, found, problem.config.hopeless):

@@ -25,6 +25,9 @@ from mereo.scenes.statistical_model import StatisticalModel, following
 STATES_SEED = 400_000
 """A training seed."""
 
+MOST_DRAWS = 120
+"""Scenes with more free numbers are left to the modes."""
+
 MOST = 2.0
 """Standard deviations of a draw that is guessed."""
 
@@ -94,6 +97,11 @@ class Drawn:
             return scene.sample_deformations(Playback(self.seed, shares_of(z, self.sizes), checked))
         except (OutOfDraws, ValueError):
             return None
+
+
+def number_of_draws(scene: Scene) -> int:
+    """How many numbers a random state of a scene draws; in a few scenes, states differ in it."""
+    return len(Drawn.of(scene, STATES_SEED).z)
 
 
 def shares_of(z: Float[np.ndarray, " d"], sizes: tuple[int, ...]) -> list[Shares]:

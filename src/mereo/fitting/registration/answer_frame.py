@@ -128,8 +128,10 @@ def find(
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
     assert model is not None
     found, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
-    if registrar is None or not registrar.asks_search or (
-        found.is_accepted and not is_forced(found) and not is_astray(found)
+    if (
+        registrar is None
+        or not registrar.asks_search
+        or (found.is_accepted and not is_forced(found) and not is_astray(found))
     ):
         return found, likelier
     searched, _ = search_hypotheses(seen, registrar, keep_all, scene_unit)
@@ -154,7 +156,8 @@ def is_astray(candidate: Candidate) -> bool:
 def more_evident(first: Candidate, second: Candidate) -> Candidate:
     """The candidate whose state has the lower misfit in the problem of the first; the first where both do.
 
-    The second where it alone explains the frame: of a noisy one the first knows no noise. Where they differ in whether the object is seen whole, each in its own, as two hypotheses of a search.
+    The second where it alone explains the frame: of a noisy one the first knows no noise. Where they differ in whether
+    the object is seen whole, each in its own, as two hypotheses of a search.
     """
     if first.modes is None or second.modes is None:
         return first if second.modes is None else second

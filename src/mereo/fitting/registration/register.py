@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.fitting.config import AnswerMethod, FitConfig
-from mereo.fitting.draws.playback import DrawnStates
+from mereo.fitting.draws.playback import MOST_DRAWS, DrawnStates, number_of_draws
 from mereo.fitting.registration.fit import ModesFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.brief import listed
@@ -42,8 +42,8 @@ class Registrar:
         network: the weights, from whose correspondences a fit starts; None of an object without, which is searched.
         model: statistical model of the same object.
         method: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
-            misfit; "auto" does the same where the scene is at hand, and else, and without a network, fits the modes;
-            "search" fits the modes and does not ask the network.
+            misfit; "auto" does the same where the scene is at hand, and else fits the modes; "search" is "auto"
+            without the network.
         given: the object's scene, where it is not the built-in one that the weights were trained on.
         config: constants of the fit of the modes.
     """
@@ -94,16 +94,16 @@ class Registrar:
     def scene(self) -> Scene | None:
         """Scene whose draws can be played: the given one, or the built-in one of the weights; None where neither is.
 
-        Also None, with a ``ChangedSceneWarning``, where ``method`` is "auto" and the scene that the weights were
-        trained on has other meshes since. Raises ``ValueError`` for such a scene with other choices and for a given
-        scene of another object, and ``AssetUnavailable`` where its mesh cannot be had.
+        Also None, with a ``ChangedSceneWarning``, where the scene that the weights were trained on has other meshes
+        since, unless ``method`` is "full". Raises ``ValueError`` for such a scene with "full" and for a given scene
+        of another object, and ``AssetUnavailable`` where its mesh cannot be had.
         """
         name = self.trained_scene
         scene = self.given if self.given is not None else load_scene(name) if name in SCENES else None
         fault = None if scene is None else other_mesh(scene, self.model)
         if scene is None or fault is None:
             return scene
-        if self.method == "auto" and scene.name == name:
+        if self.method != "full" and scene.name == name:
             warnings.warn(
                 f"{fault}: it has changed since they were trained, so only the modes of that model are fitted; train "
                 "them again for the fit of its draws",
@@ -115,9 +115,14 @@ class Registrar:
 
     @cached_property
     def states(self) -> DrawnStates | None:
-        """Random states of the scene, among which a fit of its draws starts; they take seconds once."""
+        """Random states of the scene, among which a fit of its draws starts; they take seconds once.
+
+        None without a scene, and for one with more than ``MOST_DRAWS``, which is left to the modes.
+        """
+        if self.scene is None or number_of_draws(self.scene) > MOST_DRAWS:
+            return None
         with stage("simulate random states of the scene, once for an object"):
-            return None if self.scene is None else DrawnStates.of(self.scene, self.model)
+            return DrawnStates.of(self.scene, self.model)
 
     @property
     def asks_search(self) -> bool:
@@ -128,7 +133,7 @@ class Registrar:
     @property
     def fits_draws(self) -> bool:
         """Whether the scene's draws are fitted too, for which its states are simulated once, in seconds."""
-        return self.method == "full" or (self.method == "auto" and self.network is not None)
+        return self.method != "modes"
 
     @property
     def at_once(self) -> "Registrar":
@@ -196,11 +201,11 @@ class Registrar:
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer from a fit of the modes: the draws too where ``method`` asks for them.
 
-        With "auto" not where the modes do not explain the frame: the draws, which begin there and take longest
-        on such frames, did not explain one of them either (experiments, entry 62), and the network answers.
+        Unless that is "full", not where the modes do not explain the frame: the draws, which begin there and take
+        longest on such frames, did not explain one of them either (experiments, entry 62).
         """
         modes = fitted.registration()
-        hopeless = self.method == "auto" and not modes.accepted
+        hopeless = self.method != "full" and not modes.accepted
         states = None if not self.fits_draws or hopeless or not fitted.asks_draws else self.at_hand
         return modes if states is None else fitted.with_draws(states)
 
@@ -210,11 +215,14 @@ class Registrar:
 
     @cached_property
     def at_hand(self) -> DrawnStates | None:
-        """``states``, but None where "auto" cannot have the scene's mesh: the weights carry all that the modes need."""
+        """``states``, but None where the scene's mesh cannot be had: the weights carry all that the modes need.
+
+        With "full" that raises ``AssetUnavailable``.
+        """
         try:
             return self.states
         except AssetUnavailable:
-            if self.method == "auto":
+            if self.method != "full":
                 return None
             raise
 
