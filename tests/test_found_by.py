@@ -10,12 +10,14 @@ from answers import answer_to
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem import correspondences
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.answer_frame import ASTRAY, is_astray, misfit_in, more_evident
+from mereo.fitting.registration.answer_frame import ASTRAY, answer_frame, is_astray, misfit_in, more_evident
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.search_modes import search_modes
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.sight_lines import SightLines
 from mereo.models.model import Model
 from mereo.models.weights import load_model
+from mereo.reconstruction.observation import observe
 
 HYPOTHESES = "mereo.fitting.registration.hypotheses"
 
@@ -107,6 +109,30 @@ def test_a_network_far_from_what_it_starts_is_no_start(liver: Model, cloud: Poin
     assert lucky.is_accepted and is_astray(lucky)
     displaced = lucky.displaced(by_network.modes.registration())
     assert displaced is not None and displaced > ASTRAY
+
+
+def test_a_search_is_asked_too_where_a_part_is_hidden(
+    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the network's fit explains; the fit with the greater evidence is taken."""
+    across = cloud.points[:, 0] / cloud.points[:, 2]
+    kept = cloud.points[across > np.quantile(across, 0.2)]
+    asked = []
+    honest = search_modes
+
+    def searched(*given: Any) -> Any:
+        asked.append(given)
+        return honest(*given)
+
+    monkeypatch.setattr(f"{HYPOTHESES}.search_modes", searched)
+    registrar = Registrar.of(liver)
+    cut = cloud.points[across <= np.quantile(across, 0.2)]
+    lines = SightLines(np.empty((0, 3)), 0.5 * cut, "past")
+    seen = observe(PointCloud(kept))
+    vars(seen)["lines"] = lines
+    assert answer_frame(seen, liver, registrar, resolution=24).taken and asked
+    asked.clear()
+    assert answer_frame(observe(cloud), liver, registrar, resolution=24).taken and not asked
 
 
 def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: PointCloud) -> None:

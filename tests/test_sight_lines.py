@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from sight_parts import pixels
 
+from mereo.fitting.problem.evidence import Evidence
 from mereo.geometry.sight_lines import SightLines
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
@@ -135,3 +136,14 @@ def test_occluded_views_repeat_and_hide_what_was_asked_for(views: list[View]) ->
             assert (first.hidden > 0) == (kind != "none")
     with pytest.raises(ValueError, match=r"the hidden share is 1; it must be at least 0 and less than 1"):
         occlude(views[0], "screen", 1, np.random.default_rng(0))
+
+
+def test_the_share_of_the_outline_that_is_cut_is_told(views: list[View]) -> None:
+    for number, view in enumerate(views):
+        for kind in CUTS:
+            seen = find_object(occlude(view, kind, 0.3, np.random.default_rng(number), CLEAN).frame())
+            edge = Evidence.of(seen.cloud.points, lines=seen.lines).hidden_edge
+            assert edge < 0.05 if kind == "none" else edge > (0.01 if kind == "tool" else 0.1)
+        alone = find_object(occlude(view, "none", 0.0, np.random.default_rng(number), CLEAN).frame()).cloud.points
+        assert Evidence.of(alone, lines=SightLines.of_cloud("past")).hidden_edge == 0.0
+        assert Evidence.of(alone, lines=SightLines.of_cloud("unknown")).hidden_edge == 1.0

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.downsampling import means_along_sight
 from mereo.geometry.sight_lines import SightKind, SightLines
+from mereo.geometry.transforms import rotation_along
 
 MOST_POINTS = 6000
 """Denser clouds are averaged to so many points, which have less noise."""
@@ -36,6 +37,10 @@ AROUND_PITCHES = 1.6
 With a pixel's own depth alone, 6 to 13 % of the true surface counted as in front of what was seen."""
 
 AROUND = 9
+
+RIM_PITCHES, EDGE_PITCHES, EDGE_DIRECTIONS = 2.5, 3.5, 8
+"""Angles from the observed points, in pixels, between which lines of sight beside the object are sampled, and in how
+many directions: nearer lies the rim, of which nothing is known in any case (``lines_of_sight.RIM``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +137,20 @@ class Evidence:
     def may_be_cut(self) -> bool:
         """Whether something may hide a part of the object, or lie beside it where nothing is known."""
         return self.elsewhere == "unknown" or len(self.sight.data) > len(self.points)
+
+    @property
+    def hidden_edge(self) -> float:
+        """Share of the silhouette beside which nothing is known, as where an occluder or the picture's edge cuts it."""
+        toward = self.points / self.ranges[:, None]
+        across = rotation_along(toward.mean(axis=0))[:, :2].T
+        turns = np.arange(EDGE_DIRECTIONS) * (2 * np.pi / EDGE_DIRECTIONS)
+        steps = EDGE_PITCHES * self.pitch * np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across
+        around = (toward[:, None] + steps).reshape(-1, 3)
+        around = around / np.linalg.norm(around, axis=1, keepdims=True)
+        around = around[cKDTree(toward).query(around)[0] > RIM_PITCHES * self.pitch]
+        _, front, free = self.along(around)
+        is_hidden = np.where(free < 0, front == 0, free == 0)
+        return float(is_hidden.mean()) if len(is_hidden) else 0.0
 
     def violations(
         self, vertices: Float[np.ndarray, "n 3"], slack: float
