@@ -13,6 +13,8 @@ from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsProblem
 from mereo.fitting.draws.problem import narrowing as draws_narrowing
 from mereo.fitting.modes.rest import narrowing as modes_narrowing
+from mereo.fitting.problem.correspondences import nothing
+from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.fit import ModesFit, is_drawn
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -122,3 +124,16 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
     monkeypatch.setattr("mereo.fitting.draws.fit.second_pass", None)  # not called where the first explains the cloud
     assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None
+
+
+def test_after_a_search_nobody_is_asked_about_a_frame_that_is_not_explained(
+    model: StatisticalModel, states: DrawnStates
+) -> None:
+    """A search has no correspondences, and draws are fitted all the same."""
+    points, material = shown(model, 0.5)
+    fitted = ModesFit.of(points, said(model, material), model, 1.0)
+    base = replace(fitted.problem, network=NetworkTerm.none(model))
+    problem = DrawsProblem.of(base, states, nothing())
+    strict = replace(problem, config=replace(problem.config, explained=0.0, jumps=0))
+    assert strict.config.asked_again
+    assert fit_draws(strict, fitted.posed) is not None

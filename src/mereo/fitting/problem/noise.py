@@ -65,7 +65,7 @@ def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) ->
     return TO_STD * float(np.median(np.abs(unshared(offset, around))))
 
 
-def size_of(offset: Float[np.ndarray, " n"]) -> float:
+def noise_with_shared(offset: Float[np.ndarray, " n"]) -> float:
     """Standard deviation of all that a fit leaves over, shared by neighbours or not; robust."""
     return TO_STD * float(np.median(np.abs(offset)))
 
@@ -81,7 +81,7 @@ def looks_normal(offset: Float[np.ndarray, " n"]) -> bool:
 
 def is_noise(offset: Float[np.ndarray, " n"], noise: float) -> bool:
     """Whether what a fit leaves over is noise, and not the fit's own error."""
-    return size_of(offset) <= COHERENT * noise
+    return noise_with_shared(offset) <= COHERENT * noise
 
 
 def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float) -> float:

@@ -19,8 +19,8 @@ from mereo.fitting.problem.noise import (
     is_noise,
     looks_normal,
     noise_of,
+    noise_with_shared,
     shared,
-    size_of,
 )
 from mereo.fitting.problem.priors import PairTerm, Prior
 from mereo.fitting.problem.residuals import (
@@ -144,7 +144,7 @@ class Problem:
             surface: the fit's.
             is_shared: take for noise what neighbours share too.
         """
-        noise = size_of(surface.offsets(self.evidence.points)) if is_shared else self.noise_beside(surface)
+        noise = noise_with_shared(surface.offsets(self.evidence.points)) if is_shared else self.noise_beside(surface)
         config = constants_for(noise, self.config)
         if config is self.config:
             return None
@@ -174,7 +174,7 @@ class Problem:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
         offset = surface.offsets(self.evidence.points)
         if is_shared:
-            return size_of(offset) * SIGMAS <= LARGEST and looks_normal(offset)
+            return noise_with_shared(offset) * SIGMAS <= LARGEST and looks_normal(offset)
         return is_noise(offset, noise_of(offset, self.evidence.around))
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:

@@ -165,6 +165,8 @@ def is_hidden_in_part(seen: Observation, candidate: Candidate) -> bool:
     """Whether an occluder or the picture's edge cuts the object: networks are trained on whole ones."""
     frame = candidate.encoded
     lines = seen.lines.transformed(frame.T_camera_input)
+    if len(lines.unknown) == 0 and lines.elsewhere != "unknown":
+        return False
     return Evidence.of(frame.seen.points, lines=lines).hidden_edge > HIDDEN
 
 
