@@ -8,8 +8,8 @@ pixels), `picture50` (the picture's edge cuts off half), `tool30`, `hand30`, and
 pixels, `structured-light` and `time-of-flight`. Frames of the first kinds are whole depth images with a mask before a
 far wall; `whole` and those of cameras are cut out, so that they do not say what is beside the object.
 
-Finders: `search` (no network), `network` (its fit of modes and scene parameters), `both` (`--method auto`), and
-`before`, the network's fit that takes all beside the object for empty and asks no search.
+Finders: `search` (no network), `network` (both fit modes and, where there are few, scene parameters), `both` (`--method
+auto`), and `before`, the network's fit that takes all beside the object for empty and asks no search.
 
 A row: mean IoU / mIoU of the views on a grid of 60 cells, median and greatest seconds, share of views that the fit
 explains, and how many of those have an IoU below .8. With `--output` each row is kept in FOLDER/OBJECT-CONDITION.json
@@ -95,8 +95,7 @@ def measured(name: str, condition: str, finder: str, seed: int, index: int) -> l
     owned = loaded(name)
     registrar = owned.registrar(METHODS[finder])
     assert registrar is not None
-    if registrar.fits_draws:
-        _ = registrar.at_hand
+    registrar.prepare()
     registrar = registrar.at_once if finder == "before" else registrar
     started = time.perf_counter()
     answer = answer_frame(seen, owned.network, registrar, scene_unit=1.0)

@@ -134,8 +134,8 @@ def answer_in_tasks(
         from mereo.models.elsewhere import sent
 
         job = job.asking(sent(job.object.network, cluster))
-    if job.registrar is not None and job.registrar.fits_draws:
-        _ = job.registrar.at_hand  # the states in which a fit begins are drawn once, here, and not in every task
+    if job.registrar is not None:
+        job.registrar.prepare()  # once, here, and not in every task
     work = _Answering(job, cluster.gpus > 0)
     with closing(spread(work, frames(), cluster=cluster)) as answers:
         for frame, found in answers:

@@ -116,6 +116,7 @@ def score_search(
         begun: scores of the first views, which are not made again.
     """
     registrar = Registrar(None, kept_model(scene), given=scene)
+    registrar.prepare()  # no part of a frame's seconds
     names, started = scene.rest.names, time.monotonic()
     rows: list[tuple[Int[np.ndarray, "c c"], bool, float]] = []
     if begun is not None:

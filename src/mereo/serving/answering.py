@@ -64,8 +64,8 @@ class Loaded:
             found = load_object(ready_weights(served.weights, served.name, setup.inference), served.scene)
         loaded = cls(served, found, setup.method)
         registrar = loaded.registrar
-        if registrar is not None and registrar.fits_draws:
-            _ = registrar.at_hand  # takes seconds, once
+        if registrar is not None:
+            registrar.prepare()
         return loaded
 
     @property

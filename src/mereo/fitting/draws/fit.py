@@ -40,8 +40,8 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
         if explained(problem, found, problem.config.hopeless):
             break
         found += second_pass(problem, min(found, key=by_misfit, default=None))
-    asks = problem.config.asked_again and len(problem.found.points) > 0  # after a search nothing was asked
-    if asks and not explained(problem, found, problem.config.explained):
+    has_network = len(problem.found.points) > 0  # after a search there are no correspondences
+    if problem.config.asked_again and has_network and not explained(problem, found, problem.config.explained):
         camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
         found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
     best = min(found, key=by_misfit, default=None)

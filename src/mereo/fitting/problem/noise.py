@@ -79,6 +79,11 @@ def looks_normal(offset: Float[np.ndarray, " n"]) -> bool:
     return float(np.quantile(np.abs(offset), 0.95)) <= NORMAL * float(np.median(np.abs(offset)))
 
 
+def is_shared_noise(offset: Float[np.ndarray, " n"]) -> bool:
+    """Whether what a fit leaves over may be noise that neighbours share: it looks normal, and constants reach to it."""
+    return noise_with_shared(offset) * SIGMAS <= LARGEST and looks_normal(offset)
+
+
 def is_noise(offset: Float[np.ndarray, " n"], noise: float) -> bool:
     """Whether what a fit leaves over is noise, and not the fit's own error."""
     return noise_with_shared(offset) <= COHERENT * noise

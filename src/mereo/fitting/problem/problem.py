@@ -12,12 +12,10 @@ from mereo.fitting.problem.evidence import MORE_PARTNERS, PARTNERS, Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed, Rows
 from mereo.fitting.problem.joints import Joints
 from mereo.fitting.problem.noise import (
-    LARGEST,
     SHARED,
-    SIGMAS,
     constants_for,
     is_noise,
-    looks_normal,
+    is_shared_noise,
     noise_of,
     noise_with_shared,
     shared,
@@ -174,7 +172,7 @@ class Problem:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
         offset = surface.offsets(self.evidence.points)
         if is_shared:
-            return noise_with_shared(offset) * SIGMAS <= LARGEST and looks_normal(offset)
+            return is_shared_noise(offset)
         return is_noise(offset, noise_of(offset, self.evidence.around))
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:

@@ -135,6 +135,14 @@ class Registrar:
         """Whether the scene's draws are fitted too, for which its states are simulated once, in seconds."""
         return self.method != "modes"
 
+    def prepare(self) -> None:
+        """Do once what all frames need: simulate the states in which a fit of draws begins, where draws are fitted.
+
+        Raises as ``at_hand`` does.
+        """
+        if self.fits_draws:
+            _ = self.at_hand
+
     @property
     def at_once(self) -> "Registrar":
         """The same without the patience to ask about a frame again with the camera turned."""
