@@ -4,9 +4,10 @@
                                 [--processes P] [--output FOLDER]
 
 Conditions: `whole`, `screen30` and `screen50` (an occluder with a straight edge hides that share of the object's
-pixels), `picture50` (the picture's edge cuts off half), `tool30`, `hand30`, and views by simulated cameras at 96 x 96
-pixels, `structured-light` and `time-of-flight`. Frames of the first kinds are whole depth images with a mask before a
-far wall; `whole` and those of cameras are cut out, so that they do not say what is beside the object.
+pixels), `picture50` (the picture's edge cuts off half), `tool30`, `hand30`, and views by simulated cameras,
+`structured-light` and `time-of-flight` at 96 x 96 pixels, `structured-light-192` and `time-of-flight-192` at 192 x 192.
+Frames of the first kinds are whole depth images with a mask before a far wall; `whole` and those of cameras are cut
+out, so that they do not say what is beside the object.
 
 Finders: `search` (no network), `network` (both fit modes and, where there are few, scene parameters), `both` (`--method
 auto`), and `before`, the network's fit that takes all beside the object for empty and asks no search.
@@ -53,7 +54,14 @@ CUTS: dict[str, tuple[Cut, float]] = {
     "hand30": ("hand", 0.3),
 }
 
-CONDITIONS = ("whole", *CUTS, "structured-light", "time-of-flight")
+CAMERAS = {
+    "structured-light": ("structured-light", 96),
+    "time-of-flight": ("time-of-flight", 96),
+    "structured-light-192": ("structured-light", 192),
+    "time-of-flight-192": ("time-of-flight", 192),
+}
+
+CONDITIONS = ("whole", *CUTS, *CAMERAS)
 
 METHODS: dict[str, AnswerMethod] = {"search": "search", "network": "full", "both": "auto", "before": "auto"}
 
@@ -71,8 +79,8 @@ def loaded(name: str) -> Object:
 
 def frame_of(name: str, condition: str, seed: int, index: int) -> tuple[SensorFrame, SegmentedMesh]:
     """Frame in scene units, and its truth."""
-    sensor = OBSERVATIONS["paper" if condition in ("whole", *CUTS) else condition]
-    settings = GenerateConfig(sensor=sensor)
+    sensor, size = CAMERAS.get(condition, ("paper", GenerateConfig.image_size))
+    settings = GenerateConfig(image_size=size, sensor=OBSERVATIONS[sensor])
     view = sample_view(load_scene(name).for_seed(seed), settings, example_rng(seed, index))
     if condition not in CUTS:
         return SensorFrame(Path("simulated"), view.depth.to_points(), None, "camera", view.depth), view.mesh
