@@ -24,9 +24,9 @@ def measure(queries: int, rounds: int, beside: int) -> None:
     import torch  # before mereo, so that OpenMP finds the variable as this row has it
 
     from mereo.evaluation.sample_views import load_view
-    from mereo.experiments.speed.beside import busy_processes
-    from mereo.experiments.speed.stages import random_points
     from mereo.models.weights import load_model
+    from mereo_experiments.speed.beside import busy_processes
+    from mereo_experiments.speed.stages import random_points
 
     model, view = load_model("bunny"), load_view("bunny")
     code, points = model.encode(view.depth.to_points()), random_points(view, queries, seed=1)
@@ -47,8 +47,8 @@ def measure(queries: int, rounds: int, beside: int) -> None:
 
 def row(policy: str | None, threads: int | None, options: argparse.Namespace) -> float:
     """Print one row of the table; returns the times of the fair share."""
-    from mereo.experiments.speed.beside import fair_share
     from mereo.io.cores import cores
+    from mereo_experiments.speed.beside import fair_share
 
     variables = {
         name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "OMP_NUM_THREADS")
@@ -69,7 +69,7 @@ def row(policy: str | None, threads: int | None, options: argparse.Namespace) ->
 
 
 def main() -> None:
-    from mereo.experiments.speed.beside import LIMIT
+    from mereo_experiments.speed.beside import LIMIT
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--queries", type=int, default=40_000)

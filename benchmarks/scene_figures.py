@@ -19,12 +19,12 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import inverse_rigid
-from mereo.scenes.builtin import _robot_parts as parts
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_rendering import render_depth
 from mereo.synthesis.examples import sample_view
+from mereo_objects import _robot_parts as parts
 
 TELLING = 0.5
 """Units of depth: five times the camera's noise."""

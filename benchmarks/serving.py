@@ -33,8 +33,8 @@ from mereo.io.atomic_files import check_file_place, write_json
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
-from mereo.serving.messages import JSON, FrameRequest, Served, Setup
-from mereo.serving.workers import WorkerProcess
+from mereo_serving.messages import JSON, FrameRequest, Served, Setup
+from mereo_serving.workers import WorkerProcess
 
 HEADERS = {"Content-Type": "application/x-npy"}
 PATIENCE_S = 120.0

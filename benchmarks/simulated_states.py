@@ -16,13 +16,13 @@ from mereo.deformation.maps import invert, jacobian_determinant
 from mereo.deformation.surface_driven import Surface, SurfaceMap
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.scenes.builtin._liver_parts import MM
 from mereo.scenes.recorded_states import States, SurfaceFrames, load_states
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import synthesize
+from mereo_objects._liver_parts import MM
 
 STATES = Path(__file__).parents[1] / "src/mereo/states/liver.npz"
 POINTS = 1500

@@ -14,7 +14,7 @@ from mereo.evaluation.scoring import evaluate
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model
 from mereo.models.weights_place import shipped_names
-from mereo.scenes.assets import AssetUnavailable
+from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.visualization.error_maps import error_picture
 

@@ -26,8 +26,8 @@ from jaxtyping import Float, Int
 from mereo.deformation.tetrahedral import Tetrahedra
 from mereo.geometry.solids import Solids
 from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.scenes import assets
 from mereo.scenes.registry import load_scene
+from mereo_objects import assets
 
 YOUNG_PA, POISSON, DENSITY, GRAVITY = 5000.0, 0.4, 1060.0, 9.81
 BACK, HELD_MM = np.array([0.05, 0.6, 0.8]), 40.0

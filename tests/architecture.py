@@ -7,7 +7,7 @@ sentence each. An empty list means that the rule holds.
 import ast
 import re
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -28,8 +28,6 @@ ROOMS = (
     "visualization",
     "learning",
     "api",
-    "experiments",
-    "serving",
     "cli",
 )
 """From the ground up: a room imports only from itself and from those before it."""
@@ -43,12 +41,20 @@ DATA_FOLDERS = ("frames", "states", "weights")
 ROOT_MODULES = ("__init__", "__main__")
 """The public names and the entry point, which may import every room."""
 
-MAY_IMPORT_TORCH = ("models/", "training/", "experiments/speed/", "cli/doctor.py")
+MAY_IMPORT_TORCH = ("models/", "training/", "cli/doctor.py")
 
 HEAVY = ("numpy", "torch", "scipy", "trimesh", "matplotlib")
 """What settings must not load, so that ``--help`` is instant: the two, and libraries that bring them."""
 
-MOST_LINES = 300
+SATELLITES = {
+    "mereo_objects": ("cli/", "scenes/registry.py", "evaluation/scans.py"),
+    "mereo_serving": ("cli/",),
+    "mereo_experiments": ("cli/",),
+}
+"""Packages beside mereo, in the same wheel, and the modules of mereo that may import each."""
+
+BUDGET = {"src/mereo": (52_300, 413), "tests": (37_500, 255)}
+"""Lines and files that a folder may have at most; they fall to 35,000 and 200, and to 25,000 lines of tests."""
 
 ROOM_ROW = re.compile(r"^\| *\[?`(\w+)/`", re.MULTILINE)
 """How a row of the README's table of rooms begins; the room's name may be a link."""
@@ -180,8 +186,23 @@ def rooms_unlike_readme(package: Package, readme: str) -> list[str]:
     return missing + [f"the README's table of rooms names {room}/, which is no room" for room in sorted(named - there)]
 
 
-def long_files(top: Path, folders: Iterable[str]) -> list[str]:
-    """Python files in these folders of ``top`` that are too long to be read in one go."""
-    files = [file for folder in folders for file in sorted((top / folder).rglob("*.py"))]
-    lines = {file.relative_to(top).as_posix(): len(file.read_text("utf-8").splitlines()) for file in files}
-    return [f"{path} has {n} lines, more than {MOST_LINES}: split it" for path, n in lines.items() if n > MOST_LINES]
+def satellite_imports(package: Package) -> list[str]:
+    """Imports of a package beside mereo, lazy ones included, by modules that do without."""
+    return [
+        f"{i.place} imports {i.target}, which only {', '.join(SATELLITES[i.target])} may"
+        for i in package
+        if i.target in SATELLITES and not f"{i.source}.py".startswith(SATELLITES[i.target])
+    ]
+
+
+def over_budget(top: Path, budget: Mapping[str, tuple[int, int]]) -> list[str]:
+    """Folders of ``top`` with more lines of Python, or more files, than they may have."""
+    faults = list[str]()
+    for folder, (most_lines, most_files) in budget.items():
+        files = sorted((top / folder).rglob("*.py"))
+        lines = sum(len(file.read_text("utf-8").splitlines()) for file in files)
+        if lines > most_lines:
+            faults.append(f"{folder} has {lines:,} lines, more than {most_lines:,}: cut as much as you add")
+        if len(files) > most_files:
+            faults.append(f"{folder} has {len(files)} files, more than {most_files}: merge two that are one idea")
+    return faults

@@ -21,9 +21,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # before the first import of mereo: from here on a wrong shape or dtype is an error
-install_import_hook("mereo", "type_checker.check")
+install_import_hook(["mereo", "mereo_objects", "mereo_experiments", "mereo_serving"], "type_checker.check")
 
-from mereo.scenes import assets  # noqa: E402
+from mereo_objects import assets  # noqa: E402
 
 if TYPE_CHECKING:
     from mereo.fitting.draws.playback import DrawnStates

@@ -17,14 +17,14 @@ from test_reconstruction import BIG, NAMES, SMALL, front, two_balls
 
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
-from mereo.serving.answering import Answerer
-from mereo.serving.app import Service, make_app
-from mereo.serving.config import ServeConfig
-from mereo.serving.dispatcher import Dispatcher
-from mereo.serving.messages import FrameRequest, Reply, Served, Setup
-from mereo.serving.metrics import Metrics
-from mereo.serving.workers import WorkerDied
 from mereo.visualization.viewer.guard import Entry
+from mereo_serving.answering import Answerer
+from mereo_serving.app import Service, make_app
+from mereo_serving.config import ServeConfig
+from mereo_serving.dispatcher import Dispatcher
+from mereo_serving.messages import FrameRequest, Reply, Served, Setup
+from mereo_serving.metrics import Metrics
+from mereo_serving.workers import WorkerDied
 
 NPY = {"Content-Type": "application/x-npy"}
 CLOUD = np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)])

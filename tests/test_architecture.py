@@ -5,18 +5,19 @@ from pathlib import Path
 
 import pytest
 from architecture import (
+    BUDGET,
     HEAVY,
     MAY_IMPORT_TORCH,
-    MOST_LINES,
     ROOMS,
     SUBROOMS,
     bad_init_files,
     cycles,
     differences,
     heavy_settings,
-    long_files,
     misplaced,
+    over_budget,
     rooms_unlike_readme,
+    satellite_imports,
     torch_imports,
     upward_imports,
 )
@@ -54,7 +55,7 @@ def test_settings_are_light(mereo: Package) -> None:
 
 def test_only_charts_ask_for_the_extra_plots(mereo: Package) -> None:
     asking = {found.source for found in mereo if found.target == "matplotlib"}
-    assert asking == {"io/plots", "experiments/paper/result", "experiments/paper/sampling_figure"}
+    assert asking == {"io/plots"}
 
 
 def test_no_module_needs_itself(mereo: Package) -> None:
@@ -73,8 +74,12 @@ def test_readme_names_the_rooms(mereo: Package) -> None:
     assert_none(rooms_unlike_readme(mereo, (TOP / "README.md").read_text("utf-8")))
 
 
-def test_files_are_short() -> None:
-    assert_none(long_files(TOP, ("src", "tests", "benchmarks", "examples")))
+def test_the_core_does_without_its_satellites(mereo: Package) -> None:
+    assert_none(satellite_imports(mereo))
+
+
+def test_the_house_keeps_its_budget() -> None:
+    assert_none(over_budget(TOP, BUDGET))
 
 
 # --- that the rules can fail ------------------------------------------------------------------------------------------
@@ -167,8 +172,8 @@ def test_exceptions_pass_until_they_are_stale(tmp_path: Path) -> None:
     ["import torch.nn", "from torch import Tensor", "def f():\n    import torch", "m = import_module('torch.nn')"],
 )
 def test_torch_elsewhere_is_found(code: str, tmp_path: Path) -> None:
-    allowed = ("models/ops/svd.py", "training/loop.py", "experiments/speed/report.py", "cli/doctor.py")
-    free = ("fitting/registration/fit.py", "experiments/paper/store.py", "cli/demo.py", "__main__.py")
+    allowed = ("models/ops/svd.py", "training/loop.py", "cli/doctor.py")
+    free = ("fitting/registration/fit.py", "cli/demo.py", "__main__.py")
     package = package_of(tmp_path, dict.fromkeys((*allowed, *free), code))
     rule = f"imports torch, which only {', '.join(MAY_IMPORT_TORCH)} may"
     line = code.count("\n") + 1
@@ -243,8 +248,20 @@ def test_another_table_of_rooms_is_found(tmp_path: Path) -> None:
     ]
 
 
-def test_long_files_are_found(tmp_path: Path) -> None:
-    for name, lines in {"src/a/b.py": MOST_LINES + 1, "src/c.py": MOST_LINES, "docs/d.py": 999}.items():
+def test_an_import_of_a_satellite_is_found(tmp_path: Path) -> None:
+    code = "def f():\n    from mereo_objects.assets import get"
+    package = package_of(tmp_path, {"scenes/registry.py": code, "cli/demo.py": code, "io/readers.py": code})
+    assert satellite_imports(package) == [
+        "io/readers.py:2 imports mereo_objects, which only cli/, scenes/registry.py, evaluation/scans.py may"
+    ]
+
+
+def test_an_exceeded_budget_is_found(tmp_path: Path) -> None:
+    for name, lines in {"src/a/b.py": 3, "src/c.py": 2, "docs/d.py": 999}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("#\n" * lines, "utf-8")
-    assert long_files(tmp_path, ("src", "examples")) == ["src/a/b.py has 301 lines, more than 300: split it"]
+    assert over_budget(tmp_path, {"src": (5, 2)}) == []
+    assert over_budget(tmp_path, {"src": (4, 1)}) == [
+        "src has 5 lines, more than 4: cut as much as you add",
+        "src has 2 files, more than 1: merge two that are one idea",
+    ]

@@ -16,8 +16,9 @@ import pytest
 import trimesh
 
 from mereo.evaluation.scans import BUNNY_SCAN_POSES
-from mereo.scenes import assets
-from mereo.scenes.assets import ASSETS, Asset, AssetUnavailable
+from mereo.scenes.scene import AssetUnavailable
+from mereo_objects import assets
+from mereo_objects.assets import ASSETS, Asset
 
 CONTENT = b"OFF\n0 0 0\n"
 

@@ -11,15 +11,15 @@ import torch
 
 from mereo.cli import tool_commands
 from mereo.evaluation.sample_views import load_view
-from mereo.experiments.speed import fitted_model
-from mereo.experiments.speed.baseline import Rival, farthest_points
-from mereo.experiments.speed.beside import LIMIT, Share, busy_processes, fair_share, measure_beside, shares_table
-from mereo.experiments.speed.report import table
-from mereo.experiments.speed.roofline import Machine, Work, count_operations
-from mereo.experiments.speed.stages import Bench, Stage, needed_nodes, random_points
 from mereo.geometry.farthest_point_sampling import farthest_point_order
 from mereo.models.weights import load_model
 from mereo.training.config import PRESETS
+from mereo_experiments.speed import fitted_model
+from mereo_experiments.speed.baseline import Rival, farthest_points
+from mereo_experiments.speed.beside import LIMIT, Share, busy_processes, fair_share, measure_beside, shares_table
+from mereo_experiments.speed.report import table
+from mereo_experiments.speed.roofline import Machine, Work, count_operations
+from mereo_experiments.speed.stages import Bench, Stage, needed_nodes, random_points
 
 MACHINE = Machine(1e11, 1e10)
 
@@ -133,8 +133,8 @@ def test_the_fair_share_is_what_an_even_division_of_the_cores_gives() -> None:
 
 
 def test_work_beside_busy_processes_takes_the_threads_that_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.experiments.speed.beside.FreeCores.now", lambda _: 0.0)
-    monkeypatch.setattr("mereo.experiments.speed.beside.cores", lambda: 2)
+    monkeypatch.setattr("mereo_experiments.speed.beside.FreeCores.now", lambda _: 0.0)
+    monkeypatch.setattr("mereo_experiments.speed.beside.cores", lambda: 2)
     before, used = torch.get_num_threads(), []
     shares = measure_beside(lambda: used.append(torch.get_num_threads()), beside=1, rounds=2)
     assert used == 2 * [2, 1, 2] and torch.get_num_threads() == before

@@ -21,7 +21,8 @@ FENCE = re.compile(r"^ *```(\w*)[^\n]*\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 RELEASED = [page for page in PAGES if page != EXPERIMENTS]
 """Pages about the code as it is; an experiment is about the code of its commit."""
-ROOMS = "|".join(init.parent.name for init in sorted(ROOT.glob("src/mereo/*/__init__.py")))
+INITS = sorted([*ROOT.glob("src/mereo/*/__init__.py"), *ROOT.glob("src/mereo_*/__init__.py")])
+ROOMS = "|".join(init.parent.name for init in INITS)
 
 
 def prose(page: Path) -> str:
@@ -123,10 +124,11 @@ def test_imports_in_python_blocks_exist() -> None:
 def exists(name: str) -> bool:
     """Whether this is a module of mereo or a definition in one, as ``models.decoder.LocalAttention`` is."""
     parts = name.split(".")
-    depth = next(n for n in range(len(parts), 0, -1) if is_module(ROOT.joinpath("src", "mereo", *parts[:n])))
+    parts = parts if parts[0].startswith("mereo_") else ["mereo", *parts]
+    depth = next(n for n in range(len(parts), 0, -1) if is_module(ROOT.joinpath("src", *parts[:n])))
     if depth == len(parts):
         return True  # not imported: Triton's kernels cannot be everywhere
-    found: object = importlib.import_module(".".join(["mereo", *parts[:depth]]))
+    found: object = importlib.import_module(".".join(parts[:depth]))
     for part in parts[depth:]:
         if not hasattr(found, part) and part not in getattr(found, "__annotations__", {}):
             return False

@@ -5,9 +5,9 @@ import pytest
 from solid_pairs import gap, overlapping_pairs
 
 from mereo.deformation.maps import Deformation, jacobian_determinant
-from mereo.scenes.builtin import _engine_parts as parts
-from mereo.scenes.builtin import engine
 from mereo.scenes.registry import load_scene
+from mereo_objects import _engine_parts as parts
+from mereo_objects import engine
 
 ANGLES_RAD = np.linspace(0.0, engine.CYCLE_RAD, 19)[:-1] + 0.11
 NAMES = engine.rest_mesh().names

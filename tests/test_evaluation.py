@@ -21,13 +21,13 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.models.weights import save_model
-from mereo.scenes import assets
-from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 from mereo.visualization.evaluation_files import evaluate_weights
+from mereo_objects import assets
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 

@@ -10,8 +10,8 @@ from mereo.models.weights import load_model
 from mereo.models.weights_place import shipped_names
 from mereo.reconstruction.coarse_to_fine import Field, sample_coarse_to_fine, sample_dense
 from mereo.reconstruction.isosurfaces import Extraction, _grid, extract, extract_whole, locate
-from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.examples import GenerateConfig, sample_view
 

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from mereo.evaluation.sample_views import load_view
-from mereo.experiments.speed.stages import random_points
 from mereo.models import rigid_alignment
 from mereo.models.cuda_graphs import StaticFrames
 from mereo.models.model import Model
 from mereo.models.rigid_alignment import fit_rigid
 from mereo.models.weights import load_model
+from mereo_experiments.speed.stages import random_points
 
 KERNELS = """
 import numpy as np, torch

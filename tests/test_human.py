@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial import cKDTree
 from solid_pairs import crowded
 
-from mereo.scenes.builtin import human
-from mereo.scenes.builtin._human_joints import JOINTS, NAMES, rotations, turn_limits
-from mereo.scenes.builtin._human_parts import rest_mesh
-from mereo.scenes.builtin._human_skin import PosedBody
 from mereo.scenes.registry import load_scene
+from mereo_objects import human
+from mereo_objects._human_joints import JOINTS, NAMES, rotations, turn_limits
+from mereo_objects._human_parts import rest_mesh
+from mereo_objects._human_skin import PosedBody
 
 
 @pytest.fixture(autouse=True)

@@ -20,8 +20,8 @@ from mereo.reconstruction.isolation import select_object
 from mereo.reconstruction.lines_of_sight import DENSE, MOST_LINES, lines_of_frame, lines_of_image, lines_of_points
 from mereo.reconstruction.observation import find_object, observe
 from mereo.reconstruction.strays import Reading
-from mereo.serving.options import FrameOptions
 from mereo.visualization.sight_picture import OBJECT_COLOR, PAST_COLOR, UNKNOWN_COLOR, sight_picture
+from mereo_serving.options import FrameOptions
 
 
 def test_each_pixel_has_its_kind() -> None:

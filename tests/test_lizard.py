@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from manifold3d import Manifold
 
-from mereo.scenes.builtin import lizard
-from mereo.scenes.builtin._hinges import Hinged, Knuckle, follow
-from mereo.scenes.builtin._lizard_parts import SPINE, leg, spine_links
+from mereo_objects import lizard
+from mereo_objects._hinges import Hinged, Knuckle, follow
+from mereo_objects._lizard_parts import SPINE, leg, spine_links
 
 
 def vertices(solid: Manifold) -> np.ndarray:

@@ -14,8 +14,8 @@ from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.mesh_repair import close_holes, largest_piece
 from mereo.geometry.solids import Solids
-from mereo.scenes.builtin import _liver_parts, skull, tumor
 from mereo.scenes.registry import load_scene
+from mereo_objects import _liver_parts, skull, tumor
 
 Require = Callable[[str], Path]
 

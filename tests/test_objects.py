@@ -22,11 +22,11 @@ from mereo.reconstruction.observation import ClustersWarning
 from mereo.scenes.kept_model import CACHE_VARIABLE, kept_model
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
-from mereo.serving.answering import Answerer
-from mereo.serving.messages import JSON, FrameRequest, Served, Setup
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 from mereo.visualization.viewer.open_page import OpenPage
+from mereo_serving.answering import Answerer
+from mereo_serving.messages import JSON, FrameRequest, Served, Setup
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from mereo.experiments.speed.roofline import count_operations
 from mereo.models.ops import products
 from mereo.models.ops.products import ROWS, linear, onednn_gain
+from mereo_experiments.speed.roofline import count_operations
 
 
 @pytest.fixture

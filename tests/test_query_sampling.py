@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from balls import Balls
 
-from mereo.experiments.paper.sampling_figure import Polygons2D, read_outlines
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.synthesis import query_sampling
@@ -22,6 +21,7 @@ from mereo.synthesis.query_sampling import (
     sort_sample,
     volume_uniform,
 )
+from mereo_experiments.paper.sampling_figure import Polygons2D, read_outlines
 
 
 def square(low: float, high: float, shift: float = 0.0) -> np.ndarray:

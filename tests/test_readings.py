@@ -32,8 +32,8 @@ from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.reconstruction.strays import Reading, readings
-from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view

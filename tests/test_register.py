@@ -29,9 +29,8 @@ from mereo.geometry.solids import Solids
 from mereo.models.model import Model
 from mereo.models.weights import save_model
 from mereo.reconstruction.pipeline import Reconstruction
-from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.scene import AssetUnavailable, Scene
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,11 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
-from mereo.scenes.builtin import _robot_parts as parts
-from mereo.scenes.builtin import robot
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import State
 from mereo.synthesis.depth_rendering import render_depth
+from mereo_objects import _robot_parts as parts
+from mereo_objects import robot
 
 LINKS = ("base", "column", "upper_arm", "elbow", "forearm", "wrist", "hand")
 

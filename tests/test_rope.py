@@ -9,8 +9,8 @@ from overlapping import check_overlap
 from mereo.deformation.maps import jacobian_determinant
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.scenes.builtin import rope
 from mereo.scenes.registry import load_scene
+from mereo_objects import rope
 
 STATES = 100
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from mereo.experiments.paper.sampling_figure import Polygons2D, draw_figure, read_outlines
 from mereo.synthesis.query_sampling import Samples, extended_boxes, label_uniform, sort_sample
+from mereo_experiments.paper.sampling_figure import Polygons2D, draw_figure, read_outlines
 
 REPEATS = 30
 KEEP = 256

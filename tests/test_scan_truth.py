@@ -189,14 +189,14 @@ TOLERANCE = {"body": (0.25, 0.4), "tail": (0.7, 2.0)} | dict.fromkeys(("head", "
 
 def bunny_scale() -> float:
     """Metres per scene unit."""
-    from mereo.scenes.builtin.bunny import model_to_scene
+    from mereo_objects.bunny import model_to_scene
 
     return 1 / model_to_scene()[1]
 
 
 def bunny_truth_pose(name: str) -> tuple[SegmentedMesh, np.ndarray]:
     """The bunny at rest, and its published pose in a scan."""
-    from mereo.scenes.builtin.bunny import model_to_scene
+    from mereo_objects.bunny import model_to_scene
 
     T_model_scene = np.diag([bunny_scale()] * 3 + [1.0])
     T_model_scene[:3, 3] = model_to_scene()[0]

@@ -26,7 +26,7 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
-from mereo.serving.messages import GLB, Served, Setup
+from mereo_serving.messages import GLB, Served, Setup
 
 EXACT = InferenceConfig(precision="float32")
 

@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import serving as bench
 
 from mereo.models.config import InferenceConfig
-from mereo.serving.messages import Served, Setup
-from mereo.serving.workers import WorkerProcess
+from mereo_serving.messages import Served, Setup
+from mereo_serving.workers import WorkerProcess
 
 ADDRESS = "/v1/{weights}/reconstruct"
 

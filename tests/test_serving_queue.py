@@ -24,11 +24,11 @@ import uvicorn
 from serving_parts import ADDRESS, CLOUD, Server, ThreadWorker, balls, figures, npy, run, running, setup, until
 
 from mereo.cli.serve_command import ServeCommand
-from mereo.serving.answering import Answerer
-from mereo.serving.config import ServeConfig
-from mereo.serving.messages import Served
-from mereo.serving.names import served_objects
 from mereo.visualization.viewer.guard import bound_socket
+from mereo_serving.answering import Answerer
+from mereo_serving.config import ServeConfig
+from mereo_serving.messages import Served
+from mereo_serving.names import served_objects
 
 ROOT = Path(__file__).parents[1]
 
@@ -72,7 +72,7 @@ def test_a_full_queue_refuses_and_goes_on(tmp_path: Path) -> None:
 
 def test_impatience_leaves_no_work_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is begun is finished and its answer dropped; what waits is never begun."""
-    monkeypatch.setattr("mereo.serving.dispatcher.HANGS", 100.0)
+    monkeypatch.setattr("mereo_serving.dispatcher.HANGS", 100.0)
 
     async def ask() -> None:
         async with running(tmp_path, ServeConfig(timeout=0.3)) as server:
@@ -162,14 +162,14 @@ def test_a_frame_that_ends_its_process_costs_no_other(tmp_path: Path, caplog: py
 
 
 def test_a_process_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.serving.dispatcher.HANGS", 0.002)  # of a minute
+    monkeypatch.setattr("mereo_serving.dispatcher.HANGS", 0.002)  # of a minute
 
     async def ask() -> None:
         async with running(tmp_path) as server:
             worker = held_up(server)
             found = await server.post(npy())
             assert found.status_code == 500 and "or took far too long" in found.json()["error"]
-            monkeypatch.setattr("mereo.serving.dispatcher.HANGS", 2.0)
+            monkeypatch.setattr("mereo_serving.dispatcher.HANGS", 2.0)
             worker.dies = lambda message: False
             await until(lambda: worker.restarts == 1 and server.dispatcher.ready)
             assert (await server.post(npy())).status_code == 200

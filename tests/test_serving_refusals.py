@@ -19,7 +19,7 @@ from fuzz_mutations import damaged
 from serving_parts import ADDRESS, CLOUD, NPY, balls, figures, npy, run, running, setup, until
 
 from mereo.io.size_limits import LIMIT_VARIABLE
-from mereo.serving.config import ServeConfig
+from mereo_serving.config import ServeConfig
 
 PLY = {"Content-Type": "application/ply"}
 TEXT = {"Content-Type": "text/plain"}
@@ -189,7 +189,7 @@ def test_a_fault_of_the_server_is_logged_and_not_told(
     def fail(*_: object, **__: object) -> None:
         raise KeyError("inner secret")
 
-    monkeypatch.setattr("mereo.serving.answering.find_object", fail)
+    monkeypatch.setattr("mereo_serving.answering.find_object", fail)
 
     async def ask() -> None:
         async with running(root) as server:

@@ -7,9 +7,9 @@ from solid_pairs import crowded
 
 from mereo.deformation.maps import Deformation, jacobian
 from mereo.geometry.manifold import solid_of
-from mereo.scenes.builtin import sheet
-from mereo.scenes.builtin._sheet_parts import THICKNESS, middle_points
 from mereo.scenes.registry import load_scene
+from mereo_objects import sheet
+from mereo_objects._sheet_parts import THICKNESS, middle_points
 
 
 def underside_share(deformation: Deformation) -> float:

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from mereo.evaluation.sample_views import load_view
-from mereo.experiments.speed.roofline import count_operations
 from mereo.models.config import Precision
 from mereo.models.model import CPU_QUERY_CHUNK
 from mereo.models.threads import in_threads
 from mereo.models.weights import load_model
+from mereo_experiments.speed.roofline import count_operations
 
 
 @pytest.fixture

@@ -60,7 +60,7 @@ class AssetsList:
 
     def run(self) -> None:
         """Print every asset with its licence, credit and place."""
-        from mereo.scenes.assets import ASSETS, location
+        from mereo_objects.assets import ASSETS, location
 
         for asset in ASSETS.values():
             print(f"{asset.name}\n  {asset.description}\n  {asset.licence}; credit: {asset.credit}")
@@ -79,7 +79,7 @@ class AssetsGet:
 
     def run(self) -> None:
         """Fetch assets and print where they are."""
-        from mereo.scenes.assets import ASSETS, get
+        from mereo_objects.assets import ASSETS, get
 
         for name in self.names or ASSETS:
             print(get(name))

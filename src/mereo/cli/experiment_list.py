@@ -4,8 +4,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mereo.experiments.paper.plan import SEEN_PER_S, Listed, listed
 from mereo.geometry.brief import counted
+from mereo_experiments.paper.plan import SEEN_PER_S, Listed, listed
 
 
 def list_experiments(root: Path) -> None:

@@ -9,7 +9,7 @@ from tyro.conf import UseAppendAction, arg
 from mereo.fitting.config import AnswerMethod
 from mereo.io.bounds import Cells, Port, Workers
 from mereo.models.config import InferenceConfig
-from mereo.serving.config import ServeConfig
+from mereo_serving.config import ServeConfig
 
 NEEDED = ("fastapi", "uvicorn", "prometheus_client", "python_multipart")
 """Modules of the extra."""
@@ -57,7 +57,7 @@ class ServeCommand:
         if missing := [name for name in NEEDED if find_spec(name) is None]:
             raise ImportError(f"{missing[0]} is not installed; `mereo serve` needs it: run pip install 'mereo[serve]'")
         from mereo.io.cores import FreeCores, cores, threads_for
-        from mereo.serving.server import serve
+        from mereo_serving.server import serve
 
         serve(
             self.weights,

@@ -12,7 +12,6 @@ from tyro.conf import Positional, arg
 
 from mereo.cli.object_option import MeshUnits
 from mereo.cli.positionals import InputName, ScanCloud, WeightsName
-from mereo.experiments.paper.scales import ExperimentName, ScaleName
 from mereo.fitting.tracking.config import StreamMethod
 from mereo.io.bounds import Cells, Count, CountOrNone, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig
@@ -20,6 +19,7 @@ from mereo.io.cores import workers_for
 from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.reconstruction.config import IsolationConfig
 from mereo.training.config import PresetName
+from mereo_experiments.paper.scales import ExperimentName, ScaleName
 
 
 @dataclass(frozen=True)
@@ -178,8 +178,8 @@ class BenchCommand:
 
     def run(self) -> None:
         """Print the times of all stages of an answer."""
-        from mereo.experiments.speed.report import benchmark
         from mereo.models.device import find_device
+        from mereo_experiments.speed.report import benchmark
 
         device = find_device(self.device)
         benchmark(
@@ -225,7 +225,7 @@ class Experiment:
         from mereo.io.plots import pyplot
 
         pyplot()  # before the hours that it takes
-        from mereo.experiments.paper.registry import run_experiment
+        from mereo_experiments.paper.registry import run_experiment
 
         workers = workers_for(self.workers, self.threads)
         directory = run_experiment(self.name, self.scale, self.output, workers, self.objects)

@@ -15,10 +15,9 @@ from jaxtyping import Float
 from mereo.evaluation.scoring import true_material
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.farther_states import with_farther_states
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor

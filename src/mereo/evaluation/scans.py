@@ -17,7 +17,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import transform_points
 from mereo.io.readers import read_point_cloud
-from mereo.scenes import assets
+from mereo_objects import assets
 
 
 def _pose(*rows: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
@@ -72,7 +72,7 @@ def bunny_truth(name: str) -> SegmentedMesh:
 
     Accuracy: the scan lies within 0.1 mm (median) of this surface.
     """
-    from mereo.scenes.builtin.bunny import model_to_scene, rest_mesh
+    from mereo_objects.bunny import model_to_scene, rest_mesh
 
     center, scale = model_to_scene()
     T_model_scene = np.eye(4)
@@ -109,7 +109,7 @@ class PosedScan:
 
 def bunny_posed(name: str) -> PosedScan:
     """Real scan of the bunny with its truth; raises as ``bunny_scan`` does."""
-    from mereo.scenes.builtin.bunny import model_to_scene
+    from mereo_objects.bunny import model_to_scene
 
     return PosedScan(name, bunny_scan(name)[0], bunny_truth(name), "scanner", 1 / model_to_scene()[1])
 

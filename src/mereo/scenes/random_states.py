@@ -10,10 +10,9 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.io.cores import one_blas_thread
 from mereo.io.progress import tracked
-from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.principal_components import build_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES, Scene, State
+from mereo.scenes.scene import SCENES, AssetUnavailable, Scene, State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel, material_points
 

@@ -36,7 +36,7 @@ def files_of(name: str | Path) -> list[Path]:
         return listed
     if name not in SCENES:
         return [Path(name)]
-    from mereo.scenes.assets import ASSETS, location
+    from mereo_objects.assets import ASSETS, location
 
     return [path for path in map(location, ASSETS) if path is not None]
 
@@ -53,7 +53,7 @@ def load_scene(name: str | Path) -> Scene:
     elif Path(name).suffix == ".py":
         scene = replace(import_module("mereo.scenes.files.python").load(Path(name)), file=Path(name))
     elif name in SCENES:
-        scene = import_module(f"mereo.scenes.builtin.{str(name).replace('-', '_')}").scene()
+        scene = import_module(f"mereo_objects.{str(name).replace('-', '_')}").scene()
     else:
         raise ValueError(
             f"scene {str(name)!r} is unknown; it must be one of {', '.join(SCENES)}, or a file of your own (.yaml, as "

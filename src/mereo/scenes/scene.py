@@ -19,10 +19,14 @@ SCENES = (
     *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
     *("tumor", "liver-simulated"),
 )
-"""Built-in scenes, one module each in ``mereo.scenes.builtin``: the paper's ten, then ours."""
+"""Built-in scenes, one module each in ``mereo_objects``: the paper's ten, then ours."""
 
 PAPER_APERTURE_RAD = float(np.deg2rad(140.0))
 WHOLE_SPHERE_RAD = float(np.deg2rad(360.0))
+
+
+class AssetUnavailable(OSError):
+    """Error of a file that no mirror, cache or download gives; the text says how to get it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,9 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.sight_lines import SightLines
 from mereo.io.progress import stage
 from mereo.models.trained import EncodedCloud, Trained
-from mereo.scenes.assets import AssetUnavailable
 from mereo.scenes.random_states import built_in_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 ROUNDING = 1e-6

@@ -1,0 +1,118 @@
+"""Costs of experiments, told by running them on a store that only counts.
+
+So the figures of `mereo experiment list` follow what the experiments do, and cannot differ from it.
+"""
+
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mereo.evaluation.results import EvaluatedView
+from mereo.geometry.camera import PointCloud
+from mereo.synthesis.config import GenerateConfig
+from mereo.training.config import TrainConfig
+from mereo_experiments.paper.registry import EXPERIMENTS, experiment, results_directory
+from mereo_experiments.paper.scales import SCALES, ScaleName
+from mereo_experiments.paper.store import FINISHED, Score, Store, content_key, scene_of
+
+SEEN_PER_S = 27.0
+"""Examples that a core showed to networks of scale ``cpu`` per second, datasets and tests included: experiments 10."""
+
+UNKNOWN = Score(math.nan, math.nan, math.nan, math.nan, {})
+
+
+@dataclass(frozen=True)
+class Plan(Store):
+    """Store that makes nothing and counts what it is asked for.
+
+    Attributes:
+        made: examples of each dataset.
+        seen: examples that each training shows.
+        tested: views of each test.
+    """
+
+    made: dict[Path, int] = field(default_factory=dict)
+    seen: dict[Path, int] = field(default_factory=dict)
+    tested: dict[str, int] = field(default_factory=dict)
+
+    def dataset(self, scene: str, settings: GenerateConfig, examples: int) -> Path:
+        """Path that stands for a training set."""
+        path = Path(f"{scene}-{content_key([asdict(settings), examples])}")
+        self.made[path] = examples
+        return path
+
+    def run(self, dataset: Path, config: TrainConfig) -> Path:
+        """Path that stands for a training."""
+        path = Path(f"{scene_of(dataset)}-{content_key([dataset.name, config.to_dict()])}")
+        learnt = self.made[dataset] - min(config.holdout, self.made[dataset] // 10)
+        self.seen[path] = math.ceil(config.epochs * learnt / config.batch) * config.batch
+        return path / "weights.safetensors"
+
+    def score(self, weights: Path, settings: GenerateConfig, examples: int, cells: int) -> Score:
+        """Score of nothing."""
+        self.tested[content_key([str(weights), asdict(settings), examples, cells])] = examples
+        return UNKNOWN
+
+    def view(self, weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
+        """View of nothing."""
+        empty = np.zeros((1, 1, 1), dtype=np.uint8)
+        return EvaluatedView(str(weights), PointCloud(np.zeros((1, 3))), empty, empty, np.zeros(3), np.ones(3), ())
+
+    def scans(self, weights: Path, cells: int) -> tuple[Score, tuple[EvaluatedView, ...]]:
+        """Score of nothing."""
+        return UNKNOWN, ()
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of an experiment that finds nothing made.
+
+    Attributes:
+        trainings: number of networks.
+        made: examples of all datasets together.
+        seen: examples shown to all networks together.
+        tested: test views of all evaluations together.
+    """
+
+    trainings: int
+    made: int
+    seen: int
+    tested: int
+
+
+def cost(name: str, scale: str) -> Cost:
+    """Cost of an experiment at a scale."""
+    plan = Plan(Path())
+    experiment(name).run(plan, SCALES[scale])
+    return Cost(len(plan.seen), sum(plan.made.values()), sum(plan.seen.values()), sum(plan.tested.values()))
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Experiment as a list shows it.
+
+    Attributes:
+        name: as the command takes it.
+        question: what it answers.
+        costs: by scale.
+        here: scales of which a folder holds results, with the objects where these were chosen by name.
+    """
+
+    name: str
+    question: str
+    costs: dict[ScaleName, Cost]
+    here: tuple[str, ...]
+
+
+def listed(root: Path) -> tuple[list[Listed], int]:
+    """All experiments, with those results that are in ``root``, and how many finished trainings are there."""
+    found = []
+    for name in EXPERIMENTS:
+        places = [results_directory(root, name, scale) for scale in SCALES]
+        written = [path.parent.name for place in places for path in root.glob(f"results/{place.name}*/results.json")]
+        here = tuple(sorted(folder.removeprefix(f"{name}-") for folder in written))
+        costs = {scale.name: cost(name, scale.name) for scale in SCALES.values()}
+        found.append(Listed(name, experiment(name).QUESTION, costs, here))
+    return found, len(list(root.glob(f"runs/*/{FINISHED}")))

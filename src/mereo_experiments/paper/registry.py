@@ -1,0 +1,73 @@
+"""Experiments by name, and how one is run."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol, cast, get_args, runtime_checkable
+
+from mereo.io.output_folders import check_new_directory
+from mereo_experiments.paper.result import Result, write_result
+from mereo_experiments.paper.scales import SCALES, ExperimentName, ExperimentScale
+from mereo_experiments.paper.store import Store
+
+EXPERIMENTS = get_args(ExperimentName)
+
+
+@runtime_checkable
+class Experiment(Protocol):
+    """Module of an experiment: what it answers, on which objects, and how it is run."""
+
+    QUESTION: str
+    OBJECTS: tuple[str, ...]
+    run: Callable[[Store, ExperimentScale], Result]
+
+
+def experiment(name: str) -> Experiment:
+    """Module of an experiment."""
+    return cast(Experiment, import_module(f"mereo_experiments.paper.{name.replace('-', '_')}"))
+
+
+def results_directory(root: Path, name: str, scale: str, objects: Sequence[str] = ()) -> Path:
+    """Folder of an experiment's results at a scale, on these objects or on the scale's own."""
+    return root / "results" / "-".join([name, scale, *objects])
+
+
+def run_experiment(name: str, scale: str, root: Path, workers: int = 1, objects: Sequence[str] = ()) -> Path:
+    """Run or finish an experiment; returns the folder of its results, ``ROOT/results/NAME-SCALE``.
+
+    Datasets, runs and scores are kept in ``root`` and shared between experiments: the same command again continues
+    where it stopped, and when all is there it only writes the results again. With ``objects``, some of the
+    experiment's own instead of those that the scale takes, the folder has their names in its own.
+
+    Raises ``ValueError`` for an unknown name, scale or object, ``FileExistsError`` where that folder holds other
+    things.
+    """
+    if name not in EXPERIMENTS:
+        raise ValueError(f"experiment {name!r} is unknown; it must be one of {', '.join(EXPERIMENTS)}: correct it")
+    if scale not in SCALES:
+        raise ValueError(f"scale {scale!r} is unknown; it must be one of {', '.join(SCALES)}: correct it")
+    known = experiment(name).OBJECTS
+    if odd := [one for one in objects if one not in known]:
+        raise ValueError(f"experiment {name!r} has no object {odd[0]!r}; it has {', '.join(known)}: name some of these")
+    budget = replace(SCALES[scale], chosen=tuple(one for one in known if one in objects))
+    directory = results_directory(root, name, scale, budget.chosen)
+    _check_results(directory)  # before hours of work
+    result = experiment(name).run(Store(root, workers), budget)
+    if not budget.decides:
+        untried = tuple(replace(claim, holds={}) for claim in result.claims)
+        result = replace(result, claims=untried, notes=(*result.notes, "It only shows that the experiment runs."))
+    write_result(result, directory)
+    return directory
+
+
+def _check_results(directory: Path) -> None:
+    """Refuse a folder of results that is not, or not only, of this version; another --output would lose the work."""
+    try:
+        check_new_directory(directory, force=True)
+    except FileExistsError as error:
+        found = str(error).rpartition(": ")[0]
+        raise FileExistsError(
+            f"{found}: move it away or delete it, and run the same command again, which keeps the datasets, runs and "
+            "scores and writes these results anew"
+        ) from None

@@ -1,0 +1,161 @@
+"""Report of ``mereo bench``: what it prints and writes."""
+
+import os
+import platform
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mereo.evaluation.sample_views import SampleView, load_view, shipped_views
+from mereo.io.atomic_files import check_file_place, write_json
+from mereo.io.cores import FreeCores, cores
+from mereo.models.config import Precision
+from mereo.models.device import cpu_features
+from mereo.models.model import Model
+from mereo.models.weights import load_model
+from mereo_experiments.speed.beside import measure_beside, shares_table
+from mereo_experiments.speed.fitted_model import fitted_model
+from mereo_experiments.speed.roofline import Machine, measure_machine
+from mereo_experiments.speed.stages import Bench, Stage, random_points
+
+QUERIES = 40_000
+"""Number of points that precisions are compared at, and that are asked beside busy processes."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Change of a model's answers by a lower precision, at ``QUERIES`` points of the object's box.
+
+    Attributes:
+        labels: share of points with another label.
+        distance: mean change of the distance, as a share of half the longest visible side.
+    """
+
+    labels: float
+    distance: float
+
+
+def benchmark(
+    weights: str | None,
+    preset: str,
+    device: torch.device,
+    precision: Precision,
+    repeats: int,
+    rival: bool,
+    beside: int,
+    output: Path | None,
+    force: bool = False,
+) -> list[Stage]:
+    """Time all stages, print the tables, and write them as JSON where ``output`` says so.
+
+    Args:
+        weights: a shipped name or a file, with a shipped view of its object; None fits the preset's network first.
+        preset: name of the architecture to fit.
+        device: where the network runs.
+        precision: precision of the network's products.
+        repeats: repetitions of each stage.
+        rival: whether to time the straightforward implementation too.
+        beside: processes that never rest, beside which queries are timed again on a CPU; 0 leaves that out.
+        output: a JSON file, or None.
+        force: replace an existing file, unless it is the weights.
+
+    Raises ``FileExistsError`` as ``atomic_file`` does, and ``ValueError`` for weights of an object without a
+    shipped view.
+    """
+    check_file_place(output, force=force, inputs=[] if weights is None else [weights])
+    load = _load()
+    model, view = _subject(weights, preset)
+    model.network.to(device)
+    fast = replace(model, precision=precision)
+    machine = measure_machine(device, fast.working_dtype)
+    bench = Bench(fast, view, machine, repeats, rival)
+    stages = bench.run()
+    shares = measure_beside(bench.ask(QUERIES), beside, repeats) if beside and device.type == "cpu" else []
+    facts = load | _facts(weights or f"preset {preset}, fitted to one frame", fast, machine)
+    cost = _cost(model, fast, view) if fast.working_dtype is not torch.float32 else None
+    print(table(stages, facts, cost))
+    if shares:
+        print(shares_table(shares, f"{QUERIES:,} queries"))
+    if output is not None:
+        rows = [{**asdict(stage), "ratio": stage.ratio} for stage in stages]
+        told = [{**asdict(share), "fair": share.fair, "times": share.times} for share in shares]
+        found = {**facts, "cost": None if cost is None else asdict(cost), "stages": rows, "beside": told}
+        write_json(output, found, force=force)
+        print(f"wrote {output}")
+    return stages
+
+
+def _subject(weights: str | None, preset: str) -> tuple[Model, SampleView]:
+    if weights is None:
+        view = load_view(shipped_views()[0])
+        return fitted_model(preset, view), view
+    model = load_model(weights)
+    scene = str(model.provenance.get("scene"))
+    if scene not in shipped_views():
+        raise ValueError(
+            f"the weights know {scene!r}, of which no frame is shipped; there are frames of "
+            f"{', '.join(shipped_views())}: time the architecture instead, with --preset"
+        )
+    return model, load_view(scene)
+
+
+def _load() -> dict[str, Any]:
+    """How busy the machine is before anything is measured."""
+    return {
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "free_cores": FreeCores().now(),
+    }
+
+
+def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:
+    device = model.device
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
+    return {
+        "model": subject,
+        "device": f"{device.type}, {name}",
+        "cores": cores(),
+        "threads": torch.get_num_threads(),
+        "amx": bool(cpu_features()["amx"]),
+        "precision": model.working_precision,
+        "gigaflops": machine.operations / 1e9,
+        "gigabytes_per_second": machine.bandwidth / 1e9,
+    }
+
+
+def _cost(exact: Model, fast: Model, view: SampleView) -> Cost:
+    cloud = view.depth.to_points()
+    points = random_points(view, QUERIES, seed=1)
+    code = exact.encode(cloud)
+    one, two = exact.query(code, points), fast.query(fast.encode(cloud), points)
+    change = np.abs(one.distance - two.distance).mean() * code.normalizer.scale
+    return Cost(float((one.label != two.label).mean()), float(change))
+
+
+def table(stages: list[Stage], facts: dict[str, Any], cost: Cost | None = None) -> str:
+    """Markdown table of the stages, times in milliseconds, under a line of facts about model and machine."""
+    lines = [
+        f"{facts['model']}; {facts['device']}, {facts['threads']} threads of {facts['cores']} cores, AMX "
+        f"{'yes' if facts['amx'] else 'no'}, {facts['precision']}; products {facts['gigaflops']:.0f} GFLOP/s, "
+        f"copies {facts['gigabytes_per_second']:.0f} GB/s; before it began, {facts['free_cores']:.1f} cores were free"
+        + ("" if facts["load"] is None else f" (load {facts['load']:.1f})"),
+        "",
+        "| stage | median, ms | 99 %, ms | floor, ms | times the floor | straightforward, ms | faster | other labels |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for stage in stages:
+        cells = [stage.median, stage.slowest, stage.floor]
+        rival = "" if stage.rival is None else f"{1e3 * stage.rival:.0f}"
+        ratio = "" if stage.ratio is None else f"{stage.ratio:.1f}"
+        other = "" if stage.differing is None else f"{stage.differing:.3%}"
+        times = " | ".join(f"{1e3 * value:.3g}" for value in cells)
+        lines.append(f"| {stage.name} | {times} | {stage.median / stage.floor:.1f} | {rival} | {ratio} | {other} |")
+    if cost is not None:
+        lines += [
+            "",
+            f"Against float32: {cost.labels:.2%} of labels change, distances by {cost.distance:.2g} of half the "
+            "object's longest visible side on average.",
+        ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,265 @@
+"""Stages of an answer, each timed against its floor and, where there is one, the straightforward implementation."""
+
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from mereo.evaluation.sample_views import SampleView
+from mereo.geometry.normalizer import Normalizer
+from mereo.models.cuda_graphs import StaticFrames
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud
+from mereo.reconstruction.coarse_to_fine import changing_cells, over_corners, sample_coarse_to_fine, sample_dense
+from mereo.reconstruction.isosurfaces import extract, extract_whole, locate
+from mereo.reconstruction.pipeline import SEARCH_BOX
+from mereo_experiments.speed.baseline import Rival
+from mereo_experiments.speed.roofline import Machine, Work, count_operations, seconds
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Times of one stage in seconds.
+
+    Attributes:
+        name: what is done.
+        median: median of our repetitions.
+        slowest: their 99th percentile.
+        floor: the least that this machine could take.
+        rival: the straightforward implementation's median; None where it was not run.
+        differing: share of a grid's nodes that it labels otherwise; None where there is none to compare.
+    """
+
+    name: str
+    median: float
+    slowest: float
+    floor: float
+    rival: float | None = None
+    differing: float | None = None
+
+    @property
+    def ratio(self) -> float | None:
+        """Ratio of the rival's time to ours: how many times faster we are; None where it was not run."""
+        return None if self.rival is None else self.rival / self.median
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Timing of all stages of one model's answer about one view.
+
+    Attributes:
+        model: the model.
+        view: what it is asked about.
+        machine: measured rates, from which floors follow.
+        repeats: repetitions of each stage; the rival's grids run once.
+        rival: whether to time the straightforward implementation too, and to compare its labels.
+    """
+
+    model: Model
+    view: SampleView
+    machine: Machine
+    repeats: int = 7
+    rival: bool = False
+
+    def run(self) -> list[Stage]:
+        """Times of all stages, in the order of an answer. Raises ``RuntimeError`` where the rival's labels differ."""
+        self._warm_up()
+        return [self.prepare(), self.encode(), self.queries(40_000), self.whole_frame(), self.labels(), self.surfaces()]
+
+    def prepare(self) -> Stage:
+        """Times from depth image to normalized points in farthest-point order."""
+        cloud = self.view.depth.to_points()
+        points, kept = len(cloud), self.model.network.config.points
+        # each chosen point is compared with all: differences, squares, sums and the smaller distance
+        work = Work(operations=9.0 * points * min(points, kept), bytes=float(self.view.depth.depth.nbytes))
+        return self._stage("preprocessing", work, lambda: self.model.normalized_cloud(self.view.depth.to_points()))
+
+    def encode(self) -> Stage:
+        """Times of the network's encoder, without preprocessing."""
+        cloud, normalizer = self._input()
+        viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32)).to(self.model.device)
+        with torch.inference_mode():
+            return self._network_stage("encoder", lambda: self.model.inference.encode(cloud, viewpoint))
+
+    def queries(self, count: int) -> Stage:
+        """Times of class logits at random points of the object's box."""
+        points, ours = random_points(self.view, count), self.ask(count)
+        rival = partial(self._rival().logits, points) if self.rival else None
+        if rival is not None:  # which is exact; what a lower precision changes is told apart
+            exact = replace(self.model, precision="float32")
+            self._compare(exact.logits(exact.encode(self.view.depth.to_points()), points), rival())
+        return self._network_stage(f"{count // 1000}k queries", ours, rival)
+
+    def ask(self, count: int) -> Callable[[], Float[np.ndarray, "n c"]]:
+        """What ``queries`` times."""
+        return partial(self.model.logits, self._code, random_points(self.view, count))
+
+    def whole_frame(self) -> Stage:
+        """Times from depth image to labels of 10,000 and then 40,000 points, as in the authors' follow-up.
+
+        On CUDA by graphs of fixed shapes, which an autodecoder does not have.
+        """
+        coarse, fine = random_points(self.view, 10_000), random_points(self.view, 40_000)
+
+        def plain() -> None:
+            code = self.model.encode(self.view.depth.to_points())
+            self.model.logits(code, coarse)
+            self.model.logits(code, fine)
+
+        ours = plain if self.model.device.type == "cpu" else self._by_graphs(coarse, fine)
+
+        def straightforward() -> None:
+            rival = self._rival()
+            rival.logits(coarse)
+            rival.logits(fine)
+
+        name = "a frame: 10k + 40k queries"
+        return self._network_stage(name, ours, straightforward if self.rival else None, counted=plain)
+
+    def labels(self) -> Stage:
+        """Times of the labels of the evaluation's grid, 100^3 cells."""
+        grid = self.view.truth.grid
+        x, y, z = grid.labels.shape
+        field = partial(self.model.logits, self._code)
+
+        def ours() -> UInt8[np.ndarray, "x y z"]:
+            return sample_coarse_to_fine(field, grid.origin, grid.spacing, (x, y, z)).labels
+
+        work = self._grid_work(ours())
+
+        def straightforward() -> UInt8[np.ndarray, "x y z"]:
+            return sample_dense(self._rival().logits, grid.origin, grid.spacing, (x, y, z)).labels
+
+        return self._grid_stage(f"labels, {x} x {y} x {z}", work, ours, straightforward)
+
+    def surfaces(self) -> Stage:
+        """Times of closed meshes of all segments, 128 cells along the longest side, the search for the box included."""
+        model = self.model
+        field, search = partial(model.logits, self._code), self._code.normalizer.invert(SEARCH_BOX)
+
+        def ours() -> UInt8[np.ndarray, "x y z"]:
+            found = extract_whole(field, locate(field, search), 128, model.names, model.colors, model.nested)
+            return found.grid.labels
+
+        box = locate(field, search)
+
+        def straightforward() -> UInt8[np.ndarray, "x y z"]:
+            return extract(
+                self._rival().logits, box, 128, model.names, model.colors, model.nested, dense=True
+            ).grid.labels
+
+        return self._grid_stage("surfaces of all segments, 128", self._grid_work(ours()), ours, straightforward)
+
+    # --- parts ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _code(self) -> EncodedCloud:
+        return self.model.encode(self.view.depth.to_points())
+
+    def _by_graphs(
+        self, coarse: Float[np.ndarray, "n 3"], fine: Float[np.ndarray, "m 3"]
+    ) -> Callable[[], UInt8[np.ndarray, " m"]]:
+        frames = StaticFrames(self.model, self.view.depth.camera, (len(coarse), len(fine)))
+
+        def answer() -> UInt8[np.ndarray, " m"]:
+            frames.see(self.view.depth.depth)
+            frames.ask(coarse)
+            return frames.ask(fine)[0]
+
+        answer()  # records the graphs
+        return answer
+
+    def _warm_up(self) -> None:
+        self.model.logits(self._code, random_points(self.view, 8192))
+
+    def _input(self) -> tuple[torch.Tensor, Normalizer]:
+        cloud, normalizer = self.model.normalized_cloud(self.view.depth.to_points())
+        return cloud.to(self.model.device), normalizer
+
+    def _rival(self) -> Rival:
+        return Rival(self.model, *self._input())
+
+    def _grid_work(self, labels: UInt8[np.ndarray, "x y z"]) -> Work:
+        """Asking the corners of every cell that holds a change of label, and nothing else."""
+        points = random_points(self.view, 4096)
+        each = count_operations(lambda: self.model.logits(self._code, points)) / len(points)
+        return Work(each * int(needed_nodes(labels).sum()), float(labels.nbytes))
+
+    def _network_stage(
+        self,
+        name: str,
+        ours: Callable[[], object],
+        rival: Callable[[], object] | None = None,
+        counted: Callable[[], object] | None = None,
+    ) -> Stage:
+        """``counted`` does the same operations in a way that can be counted; by default ``ours`` does."""
+        weights = sum(parameter.nbytes for parameter in self.model.inference.parameters())
+        return self._stage(name, Work(count_operations(counted or ours), float(weights)), ours, rival)
+
+    def _grid_stage(
+        self,
+        name: str,
+        work: Work,
+        ours: Callable[[], UInt8[np.ndarray, "x y z"]],
+        straightforward: Callable[[], UInt8[np.ndarray, "x y z"]],
+    ) -> Stage:
+        """Stage that labels a grid; the rival does so once, and its labels are compared."""
+        if not self.rival:
+            return self._stage(name, work, ours)
+        theirs: list[UInt8[np.ndarray, "x y z"]] = []
+        stage = self._stage(name, work, ours, lambda: theirs.append(straightforward()), once=True)
+        return replace(stage, differing=_differing(ours(), theirs[0]))
+
+    def _stage(
+        self,
+        name: str,
+        work: Work,
+        ours: Callable[[], object],
+        rival: Callable[[], object] | None = None,
+        once: bool = False,
+    ) -> Stage:
+        """Ours and the rival's take turns, so that a busy machine slows both."""
+        mine, theirs, device = [], [], self.model.device
+        for repeat in range(self.repeats):
+            mine.append(seconds(ours, device))
+            if rival is not None and not (once and repeat):
+                theirs.append(seconds(rival, device))
+        slowest = float(np.quantile(mine, 0.99))
+        return Stage(
+            name,
+            statistics.median(mine),
+            slowest,
+            work.seconds(self.machine),
+            statistics.median(theirs) if theirs else None,
+        )
+
+    @staticmethod
+    def _compare(ours: Float[np.ndarray, "n c"], theirs: Float[np.ndarray, "n c"]) -> None:
+        """Labels must agree wherever the leading class leads by more than rounding."""
+        best = np.sort(theirs, axis=1)
+        clear = best[:, -1] - best[:, -2] > 1e-3 * np.abs(theirs).max()
+        wrong = int((ours.argmax(axis=1) != theirs.argmax(axis=1))[clear].sum())
+        if wrong:
+            raise RuntimeError(f"{wrong} of {len(ours)} labels differ between the model and the rival; they must agree")
+
+
+def _differing(ours: UInt8[np.ndarray, "x y z"], theirs: UInt8[np.ndarray, "u v w"]) -> float | None:
+    """Share of nodes with other labels; None for grids of other sizes, as where a box has grown."""
+    return float((ours != theirs).mean()) if ours.shape == theirs.shape else None
+
+
+def random_points(view: SampleView, count: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
+    """Random points in the box of the object in a view."""
+    grid = view.truth.grid
+    return grid.origin + np.random.default_rng(seed).random((count, 3)) * grid.spacing * grid.labels.shape
+
+
+def needed_nodes(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Whether each node is a corner of a cell whose corners do not all have one label."""
+    around = np.pad(changing_cells(labels), 1)  # cells beyond the grid change nothing
+    needed: np.ndarray = over_corners(around, np.logical_or)
+    return needed

@@ -1,0 +1,116 @@
+"""Parameters of a request: the options of ``mereo reconstruct`` by the same names, checked before anything is read."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic_core import ErrorDetails
+
+from mereo.geometry.conventions import CloudAxes
+from mereo.io.config import InputConfig
+from mereo.reconstruction.config import Extent, IsolationConfig
+from mereo_serving.refusals import Refused
+
+
+def _numbers(given: Any) -> Any:
+    """Numbers of ``0.4,0.9`` or ``0.4 0.9`` as of the parameter that is given twice."""
+    parts = given if isinstance(given, list) else [given]
+    return [word for part in parts for word in (part.replace(",", " ").split() if isinstance(part, str) else [part])]
+
+
+Numbers = Annotated[list[float], BeforeValidator(_numbers)]
+
+
+class FrameOptions(BaseModel):
+    """Parameters of a frame, in the query of its address."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    format: str | None = Field(None, description="Suffix of the frame's format, where its Content-Type does not say it")
+    intrinsics: str | None = Field(None, description="The depth camera as JSON; or send it as a part of that name")
+    depth_scale: float | None = Field(None, alias="depth-scale", description="Pixel value of one metre")
+    frame: CloudAxes = Field("camera", description="Axes of a point cloud")
+    drop_invalid: bool = Field(False, alias="drop-invalid", description="Leave out points without a measurement")
+    unit_m: float | None = Field(None, alias="unit-m", description="Metres per unit of a point cloud")
+    frame_index: int | None = Field(None, alias="frame-index", description="Frame of intrinsics that describe many")
+    depth_range: Numbers | None = Field(None, alias="depth-range", description="Nearest and farthest depth kept, m")
+    box: Numbers | None = Field(None, description="Corners of what is kept: x0,y0,z0,x1,y1,z1 in metres")
+    remove_plane: bool = Field(False, alias="remove-plane", description="Leave out the largest plane")
+    remove_outliers: bool = Field(False, alias="remove-outliers", description="Leave out lone points")
+    largest_cluster: bool = Field(False, alias="largest-cluster", description="Keep the largest group of points")
+    cluster_gap: float = Field(0.0, alias="cluster-gap", description="Gap across which groups belong to it, metres")
+    keep_all: bool = Field(False, alias="keep-all", description="Drop no strays")
+    extent: Extent = Field("auto", description="How much of the object the frame shows: whole, partial, auto")
+    resolution: int | None = Field(None, description="Cells along the longest side; by default the server's")
+
+    def reading(self, folder: Path, intrinsics: str | None, mask: str | None) -> InputConfig:
+        """How the frame is read, with the files of these names in a folder; raises ``Refused`` (422)."""
+        try:
+            return InputConfig(
+                intrinsics=None if intrinsics is None else folder / intrinsics,
+                depth_scale=self.depth_scale,
+                mask=None if mask is None else folder / mask,
+                frame=self.frame,
+                drop_invalid=self.drop_invalid,
+                unit_m=self.unit_m,
+                frame_index=self.frame_index,
+            )
+        except ValueError as error:
+            raise Refused(422, str(error)) from None
+
+    def isolation(self) -> IsolationConfig:
+        """What of the frame is left out; raises ``Refused`` (422)."""
+        try:
+            return IsolationConfig(
+                depth_range=_of(self.depth_range, 2, "depth-range"),
+                box=_of(self.box, 6, "box"),
+                remove_plane=self.remove_plane,
+                remove_outliers=self.remove_outliers,
+                largest_cluster=self.largest_cluster,
+                cluster_gap=self.cluster_gap,
+                keep_all=self.keep_all,
+                extent=self.extent,
+            )
+        except ValueError as error:
+            raise Refused(422, str(error)) from None
+
+    def cells(self, default: int, most: int) -> int:
+        """Cells along the longest side; raises ``Refused`` (422) for too few or too many."""
+        if self.resolution is None:
+            return default
+        if not 4 <= self.resolution <= most:
+            raise Refused(
+                422,
+                f"resolution is {self.resolution}; it must be a whole number, from 4 to {most}: give for example 128",
+            )
+        return self.resolution
+
+
+def _of(numbers: list[float] | None, count: int, name: str) -> Any:
+    if numbers is None:
+        return None
+    if len(numbers) != count:
+        raise ValueError(
+            f"{name} has {len(numbers)} numbers; it needs {count}: give for example {name}={EXAMPLES[name]}"
+        )
+    return tuple(numbers)
+
+
+EXAMPLES = {"depth-range": "0.4,0.9", "box": "-0.2,-0.2,0.4,0.2,0.2,0.9"}
+
+
+def sentence_of(error: ErrorDetails | dict[str, Any]) -> str:
+    """Sentence about a parameter that pydantic refuses."""
+    name = str(error["loc"][-1] if error["loc"][-1] != "query" else "query")
+    if error["type"] == "extra_forbidden":
+        known = ", ".join(field.alias or key for key, field in FrameOptions.model_fields.items())
+        return f"there is no parameter {_brief(name)}; the parameters are {known}: correct the spelling"
+    # what a list is of is named before the number in it
+    names = [str(part) for part in error["loc"] if part != "query" and not isinstance(part, int)]
+    rule = str(error["msg"]).removeprefix("Input should be ").partition(",")[0]
+    return f"{names[0] if names else name} is {_brief(error.get('input'))}; it must be {rule}: correct it"
+
+
+def _brief(value: Any) -> str:
+    text = ascii(value)
+    return text if len(text) <= 60 else f"{text[:60]}..."

@@ -1,0 +1,150 @@
+"""``mereo serve``: load the weights in processes of their own, listen, and answer until a signal asks for the end."""
+
+import asyncio
+import logging
+import signal
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import uvicorn
+
+from mereo.fitting.config import AnswerMethod
+from mereo.io.scratch_folders import scratch_folder
+from mereo.models.config import InferenceConfig
+from mereo.visualization.viewer.guard import LOOPBACK, Entry, bound_socket
+from mereo_serving.app import Service, make_app
+from mereo_serving.config import ServeConfig
+from mereo_serving.dispatcher import Dispatcher
+from mereo_serving.messages import Setup
+from mereo_serving.metrics import Metrics
+from mereo_serving.names import served_objects
+from mereo_serving.workers import WorkerProcess
+
+CONNECTIONS = 256
+"""Connections beyond those of frames that wait; more are turned away before they are read."""
+
+
+def serve(
+    weights: Sequence[str],
+    *,
+    objects: Sequence[str] = (),
+    scenes: Sequence[str] = (),
+    method: AnswerMethod = "auto",
+    resolution: int = 128,
+    host: str = LOOPBACK,
+    port: int = 8000,
+    workers: int = 1,
+    config: ServeConfig | None = None,
+    inference: InferenceConfig | None = None,
+) -> None:
+    """Serve objects until Ctrl-C, TERM or HUP: then what is begun is answered, and the rest refused.
+
+    Args:
+        weights: shipped names or files, each as it is or as NAME=FILE.
+        objects: scenes, or meshes joined by commas, each as it is or as NAME=FILE.
+        scenes: NAME=FILE of the scenes whose draws are fitted, where they are not the weights' built-in ones.
+        method: source of the answers.
+        resolution: cells along the longest side where a request does not say.
+        host: address of this machine; others than its own need the token of the printed address.
+        port: 0 takes any that is free.
+        workers: processes that answer.
+        config: limits.
+        inference: where and how exactly the networks compute.
+
+    Raises ``ValueError`` and ``OSError`` for weights that cannot be served, and ``OSError`` for an address that is
+    taken or not this machine's.
+    """
+    config = config or ServeConfig()
+    served = served_objects(weights, scenes, objects)
+    setup = Setup(served, method, inference or InferenceConfig(), config.max_points, config.max_body)
+    entry, metrics = Entry.of(host), Metrics()
+    with ExitStack() as stack:
+        socket = stack.enter_context(bound_socket(host, port))
+        processes = stack.enter_context(started(setup, workers))
+        root = stack.enter_context(private_folder())
+        dispatcher = Dispatcher(processes, config, metrics)
+        service = Service(dispatcher, metrics, config, root, processes[0].ready.facts, resolution, entry)
+        names = ", ".join(service.names)
+        address = entry.address(socket.getsockname()[1])
+        many = "1 process" if workers == 1 else f"{workers} processes"
+        said = f"serving {names} at {address} ({many}; /docs says how to ask); Ctrl-C ends"
+        settings = uvicorn.Config(
+            make_app(service),
+            http="h11",
+            ws="none",
+            loop="asyncio",
+            lifespan="on",
+            log_level=logging.WARNING,
+            access_log=False,
+            server_header=False,
+            limit_concurrency=config.queue + CONNECTIONS,
+        )
+        GracefulServer(settings, dispatcher, said).run(sockets=[socket])
+
+
+class GracefulServer(uvicorn.Server):
+    """Server that refuses what waits as soon as it is asked to end, and answers what is begun."""
+
+    def __init__(self, config: uvicorn.Config, dispatcher: Dispatcher, said: str) -> None:
+        super().__init__(config)
+        self._dispatcher, self._said = dispatcher, said
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    async def serve(self, sockets: Any = None) -> None:
+        """Serve until a signal; a closed terminal (HUP) is one too, unless it is ignored (``nohup``)."""
+        self._loop = asyncio.get_running_loop()
+        await super().serve(sockets)
+
+    async def startup(self, sockets: Any = None) -> None:
+        """Listen, and only then say so."""
+        await super().startup(sockets)
+        if not self.should_exit:
+            print(self._said, flush=True)
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Take HUP as the others, which ``uvicorn`` knows."""
+        hang_up = getattr(signal, "SIGHUP", None)
+        before = None if hang_up is None else signal.getsignal(hang_up)
+        with super().capture_signals():
+            if hang_up is not None and before not in (signal.SIG_IGN, None):
+                signal.signal(hang_up, self.handle_exit)
+            try:
+                yield
+            finally:
+                if hang_up is not None and before is not None:
+                    signal.signal(hang_up, before)
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begin to end."""
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._dispatcher.stop)
+        super().handle_exit(sig, frame)
+
+
+@contextmanager
+def started(setup: Setup, workers: int) -> Iterator[list[WorkerProcess]]:
+    """Processes that have loaded the weights; they end with the block. Raises what loading raises."""
+    processes: list[WorkerProcess] = []
+    try:
+        processes.append(WorkerProcess(setup))
+        processes[0].wait_until_ready()  # alone: what is wrong with the weights is said once, and the precision settled
+        processes += [WorkerProcess(processes[0].setup) for _ in range(workers - 1)]
+        for process in processes[1:]:
+            process.wait_until_ready()
+        yield processes
+    finally:
+        for process in processes:
+            process.kill()
+
+
+@contextmanager
+def private_folder() -> Iterator[Path]:
+    """Folder that only this user reads, for what requests bring; removed at the end, or by the next server."""
+    with scratch_folder(Path(tempfile.gettempdir()) / "mereo-serve") as folder:
+        folder.chmod(0o700)
+        yield folder
