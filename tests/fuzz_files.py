@@ -215,8 +215,7 @@ def checkpoint() -> Checkpoint:
 def state(path: Path) -> None:
     import test_registration_state as cases
 
-    from mereo.fitting.registration.state import state_of
-    from mereo.fitting.registration.state_file import save_state
+    from mereo.fitting.registration.state import save_state, state_of
 
     found = state_of(cases.by_modes(statistical_model()), "toy", weights="w", frame="camera", unit_m=1.0,
                      T_camera_input=np.eye(4))  # fmt: skip

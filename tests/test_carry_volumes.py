@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from test_carry import SCENE, Shear, T, registered, transform_points, untrained
 
-from mereo.fitting.registration import carry_volumes
-from mereo.fitting.registration.carry import CarriedVolume, carry, place
-from mereo.fitting.registration.carry_volumes import resampled
+from mereo.fitting.registration import carry as carrying
+from mereo.fitting.registration.carry import CarriedVolume, carry, place, resampled
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.solids import Solids
@@ -111,8 +110,8 @@ def test_few_points_are_asked_where_the_motion_is_smooth(
     model: StatisticalModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
-    own = carry_volumes._source_index
-    monkeypatch.setattr(carry_volumes, "_source_index", lambda places, *a: asked.append(len(places)) or own(places, *a))
+    own = carrying._source_index
+    monkeypatch.setattr(carrying, "_source_index", lambda places, *a: asked.append(len(places)) or own(places, *a))
     found = resampled(ramp(), registered(model, transform_points(T, model.rest_points)))
     assert sum(asked) < 0.3 * found.inside
 
@@ -126,7 +125,7 @@ def test_far_from_the_object_there_is_background(model: StatisticalModel) -> Non
     index = np.argwhere(np.ones(found.volume.values.shape, dtype=bool))
     centers = transform_points(found.volume.T_world_index, index.astype(float))
     distance = here.solids.nearest(centers).distance * (here.solids.label(centers) == 0)
-    width = carry_volumes.MARGIN * model.half
+    width = carrying.MARGIN * model.half
     assert (found.volume.values.ravel()[distance > 1.001 * width] == source.values.min()).all()
     assert (found.volume.values.ravel()[distance < 0.999 * width] > source.values.min()).all()
     half = replace(source, values=source.values[:, :, : source.values.shape[2] // 2])

@@ -12,8 +12,7 @@ from mereo.api.frames import load_frame
 from mereo.api.objects import Object
 from mereo.cli import demo
 from mereo.evaluation.sample_views import GUESSED_UNIT_M
-from mereo.fitting.registration.state import load_state
-from mereo.fitting.registration.state_file import STATE
+from mereo.fitting.registration.state import STATE, load_state
 from mereo.geometry.solids import Solids
 from mereo.io.output_folders import MARKER, new_directory
 from mereo.models.model import Model

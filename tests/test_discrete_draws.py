@@ -10,7 +10,7 @@ from toy_scene import Shear, rest_mesh, toy_scene
 
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation
-from mereo.fitting.draws.discrete import chosen_otherwise
+from mereo.fitting.draws.fit import chosen_otherwise
 from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.registration.fit import ModesFit
 from mereo.geometry.transforms import transform_points

@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 from toy_scene import toy_scene
 
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.correspondences import Correspondences, estimate_unit
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
-from mereo.fitting.problem.scene_unit import estimate_unit
 from mereo.fitting.registration.fit import fit_correspondences
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.registration import Registration

@@ -12,7 +12,7 @@ from mereo.fitting.draws.fit import fit_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsProblem
 from mereo.fitting.draws.problem import narrowing as draws_narrowing
-from mereo.fitting.modes.rest import narrowing as modes_narrowing
+from mereo.fitting.modes.fit import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.fit import ModesFit, is_drawn

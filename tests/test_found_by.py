@@ -11,8 +11,8 @@ from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem import correspondences
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import ASTRAY, answer_frame, is_astray, misfit_in, more_evident
+from mereo.fitting.registration.hypotheses import search_modes
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.registration.search_modes import search_modes
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.sight_lines import SightLines
 from mereo.models.model import Model

@@ -16,7 +16,7 @@ from shapes import ball, box
 from toy_scene import toy_scene
 
 import mereo
-from mereo.fitting.registration.state_file import STATE
+from mereo.fitting.registration.state import STATE
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids

@@ -17,9 +17,8 @@ from mereo.cli.stream_answers import Answering, Seen
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.hypotheses import search_hypotheses
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.tracking import background_search
-from mereo.fitting.tracking.background_search import BackgroundSearch, SynchronousExecutor, TrackedFrame
-from mereo.fitting.tracking.tracker import Tracker
+from mereo.fitting.tracking import tracker as tracking
+from mereo.fitting.tracking.tracker import BackgroundSearch, SynchronousExecutor, TrackedFrame, Tracker
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.reconstruction.observation import Observation, observe
@@ -103,7 +102,7 @@ def searches(
         return candidate, likelier
 
     monkeypatch.setattr("mereo.fitting.registration.answer_frame.search_hypotheses", search)
-    monkeypatch.setattr(background_search, "search_hypotheses", search)
+    monkeypatch.setattr(tracking, "search_hypotheses", search)
     return asked
 
 
@@ -204,14 +203,14 @@ def test_the_own_thread_blocks_no_frame_and_ends(
     searches: Searches,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    waiting, goes_on, search = threading.Event(), threading.Event(), background_search.search_hypotheses
+    waiting, goes_on, search = threading.Event(), threading.Event(), tracking.search_hypotheses
 
     def slow(seen: Observation, *rest: Any) -> tuple[Candidate, EncodedFrame]:
         waiting.set()
         assert goes_on.wait(60) and threading.current_thread().name.startswith("mereo-search")
         return search(seen, *rest)
 
-    monkeypatch.setattr(background_search, "search_hypotheses", slow)
+    monkeypatch.setattr(tracking, "search_hypotheses", slow)
 
     def threads() -> list[str]:
         return [one.name for one in threading.enumerate() if one.name.startswith("mereo-search")]
@@ -250,7 +249,7 @@ def test_faults_of_a_search_are_raised_and_unusable_frames_are_none(registrar: R
         else:
             with pytest.raises(OSError, match="broken"):
                 search.take()
-    assert len(held.held) == 2 and search.registrar.config.search_rounds == background_search.ROUNDS < 3
+    assert len(held.held) == 2 and search.registrar.config.search_rounds == tracking.ROUNDS < 3
 
 
 def test_a_stream_says_it(

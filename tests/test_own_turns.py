@@ -13,8 +13,7 @@ from test_fitting_theorems import IN_FRONT, said, seen
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.fitting.config import MANY_DRAWS
-from mereo.fitting.draws.descent import descend
-from mereo.fitting.draws.fit import jump, likely_to_jump
+from mereo.fitting.draws.fit import descend, jump, likely_to_jump
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsProblem, played
 from mereo.fitting.problem.gauss_newton import Posed

@@ -13,8 +13,18 @@ from toy_scene import toy_scene
 
 from mereo.fitting.draws.playback import Drawn, material_moved
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.registration.state import load_state, model_digest, played_state, restored, state_of
-from mereo.fitting.registration.state_file import STATE, RegistrationState, is_state, read_state, save_state
+from mereo.fitting.registration.state import (
+    STATE,
+    RegistrationState,
+    is_state,
+    load_state,
+    model_digest,
+    played_state,
+    read_state,
+    restored,
+    save_state,
+    state_of,
+)
 from mereo.geometry.transforms import rigid
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model

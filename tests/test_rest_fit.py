@@ -8,7 +8,7 @@ from test_fitting_theorems import IN_FRONT, SCENE, said, seen, shown
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.playback import DrawnStates
-from mereo.fitting.modes.rest import narrowing
+from mereo.fitting.modes.fit import narrowing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem

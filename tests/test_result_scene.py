@@ -18,8 +18,7 @@ from mereo.evaluation.sample_views import load_view
 from mereo.fitting.draws.playback import Drawn, material_moved
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.registration.state import state_of
-from mereo.fitting.registration.state_file import STATE, save_state
+from mereo.fitting.registration.state import STATE, save_state, state_of
 from mereo.io.atomic_files import write_json
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model

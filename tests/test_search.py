@@ -10,11 +10,9 @@ from test_fitting_theorems import seen
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.registration.search_modes import search_modes, size_of
-from mereo.fitting.search.screening import Poses, Screen
+from mereo.fitting.registration.hypotheses import search_modes, size_of
+from mereo.fitting.search.screening import CELLS, Poses, Screen, SightTable, medoids, tables_of
 from mereo.fitting.search.search import rotations
-from mereo.fitting.search.shape_tables import CELLS, medoids, tables_of
-from mereo.fitting.search.sight_table import SightTable
 from mereo.geometry.sight_lines import SightLines
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel

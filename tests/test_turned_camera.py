@@ -5,7 +5,7 @@ import pytest
 from test_fitting_theorems import IN_FRONT, SCENE, said, shown
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.modes.turned_camera import turns
+from mereo.fitting.modes.fit import turns
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.registration.fit import ModesFit
 from mereo.scenes.random_states import scene_model

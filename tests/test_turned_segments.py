@@ -11,11 +11,9 @@ from test_fitting_theorems import IN_FRONT, said, seen
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
-from mereo.fitting.draws.descent import descend, lower
-from mereo.fitting.draws.fit import by_sight, with_twins_turned
+from mereo.fitting.draws.fit import by_sight, descend, lower, turned, twins, with_twins_turned
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, played
-from mereo.fitting.draws.turned_segments import turned, twins
 from mereo.fitting.problem.evidence import PARTNERS
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.fit import ModesFit

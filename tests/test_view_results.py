@@ -16,8 +16,7 @@ from test_report import ball, example, wall
 from test_view_states import by_modes
 
 from mereo.__main__ import main
-from mereo.fitting.registration.state import state_of
-from mereo.fitting.registration.state_file import STATE, save_state
+from mereo.fitting.registration.state import STATE, save_state, state_of
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.radii import Radii

@@ -15,8 +15,7 @@ from mereo.evaluation.sample_views import load_view
 from mereo.fitting.draws.playback import Drawn, material_moved
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.registration.state import load_state, state_of
-from mereo.fitting.registration.state_file import STATE, save_state
+from mereo.fitting.registration.state import STATE, load_state, save_state, state_of
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA

@@ -74,7 +74,7 @@ class ViewCommand:
         """Find an object in a frame, and keep the page of the answer open."""
         if self.input is None:
             raise ValueError("no frame is given; --object is looked for in one: mereo view FRAME --object PART.stl")
-        from mereo.fitting.registration.state_file import is_state
+        from mereo.fitting.registration.state import is_state
 
         if self.state is not None:
             raise ValueError(f"--state is {self.state}, which has its own object: leave out --object")

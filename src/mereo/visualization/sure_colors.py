@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.uncertainty.explanation import Explanation
+from mereo.fitting.uncertainty.uncertainty import Explanation
 from mereo.geometry.color_stops import between_stops
 from mereo.geometry.mesh import Color, Segment
 from mereo.geometry.radii import STOPS, Radii, level_told

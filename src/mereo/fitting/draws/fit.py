@@ -4,24 +4,32 @@ Around a state the scene is linear in its draws (``draws.problem``); it is playe
 and so on, from several starts.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import igl
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.fitting.draws.approach import Near, Shape, approach, near
-from mereo.fitting.draws.descent import descend, first_sigma
-from mereo.fitting.draws.discrete import chosen_otherwise
-from mereo.fitting.draws.playback import Drawn
-from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, beside, misfit, played
-from mereo.fitting.draws.turned_segments import turned, twins
-from mereo.fitting.modes.fit import refine
-from mereo.fitting.modes.hypotheses import robust_poses
-from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.draws.approach import Near, Shape, approach, derivatives, near, secant
+from mereo.fitting.draws.playback import Drawn, shares_of
+from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, beside, misfit, normal_equations, played
+from mereo.fitting.modes.fit import refine, robust_poses
+from mereo.fitting.problem.gauss_newton import POSE, Posed
+from mereo.fitting.problem.joints import branches
+from mereo.fitting.problem.own_turns import OwnTurn, own_turns
 from mereo.fitting.problem.residuals import robust_square
+from mereo.geometry.transforms import fit_rigid
+from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder
+from mereo.scenes.given_draws import played_back
+from mereo.scenes.parameters import play
+from mereo.scenes.scene import Scene
+from mereo.scenes.statistical_model import StatisticalModel
 
 RANKED_BY = 150
 """Points by which random states are compared with a shape."""
@@ -237,3 +245,153 @@ def likely_to_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"
     moved, off = (motion**2).sum(axis=(0, 1)), (np.einsum("ac,acd->ad", normal, motion) ** 2).sum(axis=0)
     farthest = np.sqrt((motion**2).sum(axis=1).max(axis=0, initial=0.0))
     return smooth[(off < problem.config.sliding * moved) & (farthest > SLIDES * model.half)]
+
+
+# --- descent on simulated states --------------------------------------------------------------------------------------
+
+# Levenberg and Marquardt's method on played states: from a start to the nearest state that explains the frame.
+#
+# DrawsFit -derivatives-> motion of the played points -normal_equations-> a step of pose and draws -played-> DrawsFit
+
+
+def first_sigma(problem: DrawsProblem) -> float:
+    """The cloud's first standard deviation, scene units."""
+    return max(problem.config.start_sigma * problem.model.half, problem.base.config.cloud_sigma)
+
+
+def descend(
+    problem: DrawsProblem, fit: DrawsFit, fresh: int, motion: Float32[np.ndarray, "a 3 d"] | None = None
+) -> DrawsFit:
+    """Levenberg and Marquardt's method on played states, by ``fresh`` sets of differences after the given one."""
+    config, least = problem.config, problem.base.config.cloud_sigma
+    index, sigma, damping = problem.states.played.index, first_sigma(problem), config.damping
+    for number in range(fresh + (motion is not None)):
+        if number or motion is None:
+            motion = derivatives(problem.states, fit.drawn, fit.z, fit.material[index])
+        start = fit.misfit
+        for _ in range(config.steps):
+            before = misfit(problem, fit, sigma)
+            fit, motion, damping = lower(problem, fit, motion, sigma, damping)
+            gain = before - misfit(problem, fit, sigma)
+            if gain == 0 or (gain < config.gain * before and sigma <= least):
+                break
+            sigma = max(sigma * config.cooling, least)
+        if sigma <= least and start - fit.misfit < config.gain * start:
+            break
+        damping = min(damping, 1.0)
+    return replace(fit, motion=motion)
+
+
+def lower(
+    problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float, damping: float
+) -> tuple[DrawsFit, Float32[np.ndarray, "a 3 d"], float]:
+    """A state of lower misfit, or the same; what was learnt of the motion; the next damping."""
+    index, least = problem.states.played.index, misfit(problem, fit, sigma)
+    for _ in range(problem.config.tries):
+        step = normal_equations(problem, fit, motion, sigma).step(damping)
+        tried = played(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))
+        if tried is not None:
+            motion = secant(motion, step[POSE:], (tried.material - fit.material)[index])
+            if misfit(problem, tried, sigma) < least:
+                return tried, motion, max(damping / 6.0, 1e-3)
+        damping *= 6.0
+    return fit, motion, damping
+
+
+# --- other discrete choices -------------------------------------------------------------------------------------------
+
+# States that differ from another in discrete draws: how many corners of a sheet are folded, and which.
+#
+# Derivatives do not reach across them, and random states hold one combination too seldom to be near everything else.
+# So a state that is right but for such a choice keeps all that it has drawn; the choice, and what it asks for, is drawn
+# anew.
+
+MORE_CALLS = 12
+"""Calls that another choice may ask for in addition; a scene that asks for more has thrown its first attempt away."""
+
+
+def chosen_otherwise(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
+    """States with some of the discrete draws, and what they ask for, drawn anew; fewer than ``count`` where refused.
+
+    Nothing where the scene has no discrete draws. The same state gives the same ones.
+    """
+    calls = played_back(scene, drawn.seed, shares_of(drawn.z, drawn.sizes)).calls
+    discrete = [number for number, call in enumerate(calls) if call.kind not in SMOOTH]
+    if not discrete:
+        return []
+    rng = np.random.default_rng(drawn.seed)
+    found = [_drawn_anew(scene, calls, _some(discrete, rng), int(rng.integers(2**31))) for _ in range(count)]
+    return [one for one in found if one is not None]
+
+
+def _some(numbers: Sequence[int], rng: np.random.Generator) -> set[int]:
+    """At least one of them, each with probability one half or more."""
+    taken = rng.random(len(numbers)) < 0.5
+    taken[rng.integers(len(numbers))] = True
+    return {number for number, take in zip(numbers, taken, strict=True) if take}
+
+
+def _drawn_anew(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: int) -> Drawn | None:
+    given = {call.key: call.shares for number, call in enumerate(calls) if number not in left_out}
+    recorder = Recorder(seed, given, len(calls) + MORE_CALLS)
+    try:
+        play(scene, recorder)
+    except (OutOfDraws, ValueError):
+        return None
+    return Drawn.recorded(recorder.calls, seed)
+
+
+# --- segments turned by their symmetries ------------------------------------------------------------------------------
+
+# Shapes in which segments that look alike turned are turned together, as a target for the draws.
+#
+#     rest shapes, joints -own_turns-> OwnTurn -twins-> groups -turned-> a shape -fit-> another state
+#
+# An arm looks the same with the forearm half a turn round, the wrist bent the other way and the hand turned back. No
+# small step leads there, and no jump of one draw: several change at once. But the shape is known, so that the draws can
+# be drawn towards it as towards that of the modes. Lengths are scene units.
+#
+# Notation: m material points.
+
+NEXT = np.deg2rad(15.0)
+"""Turns that are no farther apart than this are one: the angles asked about are 10 degrees apart."""
+
+Twins = tuple[tuple[OwnTurn, float], ...]
+"""Segments that hang on each other, and the angle by which each is turned."""
+
+
+@lru_cache(maxsize=8)
+def twins(model: StatisticalModel) -> tuple[Twins, ...]:
+    """Groups of two segments or more that hang on each other and each look alike in exactly one other turn.
+
+    A segment that spins, or looks alike in many turns, is left to single draws, which slide along its surface.
+    """
+    single = {turn.label - 1: (turn, angle) for turn, angle in map(_only_angle, own_turns(model)) if angle is not None}
+    if len(single) < 2:
+        return ()
+    touch = np.zeros((len(model.anchors),) * 2, dtype=bool)
+    for a, b, _ in branches(model):
+        touch[a, b] = a in single and b in single
+    count, group = connected_components(touch, directed=False)
+    members = [
+        [single[label] for label in np.flatnonzero(group == number).tolist() if label in single]
+        for number in range(count)
+    ]
+    return tuple(tuple(some) for some in members if len(some) > 1)
+
+
+def _only_angle(turn: OwnTurn) -> tuple[OwnTurn, float | None]:
+    """The middle of a turn's angles where these are one run no wider than ``NEXT`` on either side, else None."""
+    middle = float(turn.angles.mean())
+    return turn, middle if np.abs(turn.angles - middle).max() <= NEXT else None
+
+
+def turned(model: StatisticalModel, material: Float[np.ndarray, "m 3"], together: Twins) -> Float[np.ndarray, "m 3"]:
+    """Material points of a state with some segments turned, each stiffly about its own axis."""
+    moved = material.copy()
+    for turn, angle in together:
+        rows = np.flatnonzero(model.labels == turn.label)
+        T = fit_rigid(model.rest_points[rows], material[rows])
+        center, axis = T[:3, :3] @ turn.center + T[:3, 3], T[:3, :3] @ turn.axis
+        moved[rows] = Rotation.from_rotvec(angle * axis).apply(material[rows] - center) + center
+    return moved

@@ -7,17 +7,25 @@
 4. While the cloud is not explained, other states of the library, where the states lie on a curved set at all.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
+from jaxtyping import Float, Float32, Int
+from scipy.spatial.transform import Rotation
 
-from mereo.fitting.modes.hypotheses import ALIKE, by_likeness, by_network
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.evidence import MOST_POINTS
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.joints import corner_places
 from mereo.fitting.problem.priors import Prior
-from mereo.fitting.problem.problem import Misfit, Problem
-from mereo.fitting.problem.residuals import Surface
-from mereo.geometry.procrustes import robust_rigid
+from mereo.fitting.problem.problem import UNEXPLAINED, Misfit, Problem
+from mereo.fitting.problem.residuals import NetworkTerm, Surface
+from mereo.geometry.downsampling import means_along_sight
+from mereo.geometry.procrustes import best_rotations, robust_rigid
+from mereo.geometry.smoothing import smoothed
+from mereo.geometry.transforms import fit_rigid, rotation_along
 
 
 def fit_modes(problem: Problem) -> "Judged":
@@ -139,3 +147,238 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
         exact = steps - step <= config.exact_steps and sigma <= 2 * config.cloud_sigma
         posed = posed.moved(problem.seen(normal, posed, sigma, worth, exact).step(config.damping))
     return posed
+
+
+# --- states of the library from which a fit may start -----------------------------------------------------------------
+
+# States of the library from which a fit may start: those that the network's answer resembles, or another fit does.
+
+ROUNDS = 4
+"""Rounds of robust reweighting."""
+
+RANKED_BY = 64
+"""Correspondences that rank the library."""
+
+POOL = 80
+"""States most alike, among which different ones are chosen."""
+
+SEARCHED = 700
+"""States of the library among which they are searched."""
+
+FEWER = 64
+"""Material points that find this pool."""
+
+ALIKE = 0.03
+"""Tolerance, of half the rest box's longest side: points nearer than this agree."""
+
+
+def robust_poses(
+    states: Float32[np.ndarray, "n p 3"],
+    target: Float32[np.ndarray, "p 3"],
+    weight: Float32[np.ndarray, " p"],
+    sigma: float,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
+    """Robust rigid poses of many shapes at once on the same points: cost in 0..1, rotations, translations."""
+    share = np.broadcast_to(weight / weight.sum(), states.shape[:2])
+    for _ in range(ROUNDS):
+        center, goal = np.matmul(share[:, None], states), (share @ target)[:, None]
+        covariance = np.matmul((states - center).transpose(0, 2, 1) * share[:, None], target - goal)
+        rotation = best_rotations(covariance)
+        squared = ((np.matmul(states - center, rotation.transpose(0, 2, 1)) + goal - target) ** 2).sum(axis=2)
+        scale = np.maximum(np.median(squared, axis=1, keepdims=True), sigma**2)
+        share = weight / (1.0 + squared / scale)
+        share = share / share.sum(axis=1, keepdims=True)
+    cost = squared / (sigma**2 + squared) @ (weight / weight.sum())
+    translation = goal - np.matmul(center, rotation.transpose(0, 2, 1))
+    return cost, rotation.astype(np.float64), translation[:, 0].astype(np.float64)
+
+
+def by_network(problem: Problem, count: int) -> list[Posed]:
+    """The states of the library that explain the correspondences best, posed on them."""
+    network, library = problem.network, problem.model.library
+    if len(network.target) == 0:
+        return []
+    few = np.arange(0, len(network.target), max(1, len(network.target) // RANKED_BY))
+    library = library[:: max(1, len(library) // SEARCHED)]
+    motion = library @ network.modes[few].reshape(-1, library.shape[1]).T
+    states = network.mean[few].astype(np.float32) + motion.reshape(len(library), -1, 3)
+    target, weight = network.target[few].astype(np.float32), network.confidence[few].astype(np.float32)
+    cost, rotation, translation = robust_poses(states, target, weight, problem.network_sigma)
+    best = np.argsort(cost)[:count]
+    return [Posed(rotation[i], translation[i], library[i].astype(np.float64)) for i in best]
+
+
+def by_likeness(problem: Problem, posed: Posed, count: int) -> list[Posed]:
+    """States of the library that agree with a fit in most points but differ in others, as different as there are.
+
+    A wheel that is seen on one side only may be half a turn off, or a finger taken for the other: everything else is
+    right already.
+    """
+    model = problem.model
+    goal = model.material(posed.z)[model.sparse].astype(np.float32)
+    equal = np.ones(len(goal), dtype=np.float32)
+    step = max(1, len(model.library) // SEARCHED)
+    few = model.sparse_library[::step, :FEWER]
+    alike = step * np.argsort(robust_poses(few, goal[:FEWER], equal[:FEWER], ALIKE * model.half)[0])[:POOL]
+    _, rotation, translation = robust_poses(model.sparse_library[alike], goal, equal, ALIKE * model.half)
+    shapes = np.matmul(model.sparse_library[alike], rotation.transpose(0, 2, 1)) + translation[:, None]
+    place, z = posed.place(translation), model.library[alike].astype(np.float64)
+    return [
+        Posed(posed.rotation @ rotation[i], place[i], z[i], posed.log_scale)
+        for i in _different(shapes.reshape(len(alike), -1), count)
+    ]
+
+
+def _different(shapes: Float[np.ndarray, "n c"], count: int) -> Int[np.ndarray, " m"]:
+    """The first, then each time the one farthest from all before it."""
+    chosen, distance = [0], ((shapes - shapes[0]) ** 2).sum(axis=1)
+    while len(chosen) < min(count, len(shapes)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, ((shapes - shapes[chosen[-1]]) ** 2).sum(axis=1))
+    return np.array(chosen)
+
+
+# --- the object at rest -----------------------------------------------------------------------------------------------
+
+# The object at rest: the hypothesis that nothing is bent, judged against the modes by its evidence.
+#
+# Modes can imitate noise, so their misfit is always lower; a hypothesis with fewer free numbers is right when the
+# difference is smaller than what that freedom buys. By Laplace's approximation (MacKay, Neural Computation 1992) that
+# is the logarithm of how much the frame narrows the coefficients, ``log det`` of their posterior precision, as the
+# prior is N(0, 1) each.
+
+
+def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> Judged:
+    """Fit of the rest model's pose, from that of the modes; its ``posed.z`` is empty."""
+    model, config, rest = problem.model, problem.config, of_rest(problem, found)
+    T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
+    start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
+    prior = Prior(np.empty(0), np.empty((0, 0)))
+    posed = fit_cloud(rest, start, prior, config.refine_sigma, config.refine_steps, 0.0)
+    return Judged.of(rest, posed)
+
+
+def of_rest(problem: Problem, found: Correspondences) -> Problem:
+    """The problem of the rest model's pose alone."""
+    model = problem.model
+    rigid = model.around(model.rest_points, np.zeros((len(model.rest_points), 3, 0), dtype=np.float32))
+    return replace(problem, model=rigid, network=NetworkTerm.of(rigid, found))
+
+
+def is_at_rest(problem: Problem, modes: Judged, rest: Judged) -> bool:
+    """Whether the evidence of the rest model is greater than that of the modes."""
+    return rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
+
+
+def narrowing(problem: Problem, modes: Posed) -> float:
+    """``NormalEquations.narrowing`` of the modes at a state."""
+    config = problem.config
+    known = problem.known(modes, Prior.whole(problem.model), 0.0)
+    return problem.seen(known, modes, config.cloud_sigma, config.network_worth[1], True).narrowing()
+
+
+# --- noisy frames -----------------------------------------------------------------------------------------------------
+
+# A frame as it is understood: what the network states of it, and the fit to both; a noisy one is fitted once more.
+
+Ask = Callable[[Float[np.ndarray, "n 3"]], Correspondences]
+"""What the network states about points of the camera frame, in their unit."""
+
+Understood = tuple[Problem, Correspondences, Judged]
+"""A frame with what the network states of it, and the fit to both."""
+
+
+def as_noisy(start: Understood, points: Float[np.ndarray, "n 3"], ask: Ask | None) -> Understood:
+    """The fit to a noisy frame where what a fit leaves over is noise, else that one.
+
+    Whether that is so is asked of the second fit: noise throws the first off by more than it is itself.
+
+    Args:
+        start: the frame, taken for a clean one.
+        points: its cloud, scene units.
+        ask: the network, which is also asked about the smoothed cloud.
+    """
+    problem, found, modes = start
+    noisy = problem.as_noisy_as(modes.surface)
+    if noisy is None:
+        return start
+    others = [] if ask is None else [ask(smoothed(means_along_sight(points, MOST_POINTS)))]
+    candidates = [(noisy, found), *((noisy.with_network(other), other) for other in others)]
+    fits = [(*candidate, fit_modes(candidate[0])) for candidate in candidates]
+    best = min(fits, key=lambda fit: fit[2].misfit.without_network)
+    return best if best[0].leaves_noise(best[2].surface) else start
+
+
+# --- the network's answers with the camera turned ---------------------------------------------------------------------
+
+# The network asked again with the camera turned, where a fit does not explain what is seen.
+#
+# A camera that turns about its own centre sees the same points along the same lines of sight, so the answer may only
+# turn along with it. A network's does so where it understands what it sees; where it does not, each turn is another
+# guess, and the fit tells which is right.
+
+ROLL = np.pi / 4
+"""Between one turn and the next about the line of sight to the object, rad."""
+
+TILTS = np.deg2rad([0.0, 15.0, 15.0, 25.0])
+"""Of the camera away from the object, one after the other for all rolls, rad."""
+
+TILTED = 2.0
+"""Angle between the directions of one tilt and the next."""
+
+ROUND = 8
+"""Turns that are tried at once; the best of them are fitted."""
+
+FITTED = 2
+"""How many."""
+
+
+def turns(axis: Float[np.ndarray, "3"]) -> Iterator[Float[np.ndarray, "3 3"]]:
+    """Rotations of the camera frame: rolls about a line of sight, without and with tilts away from it."""
+    axis = axis / np.linalg.norm(axis)
+    across = rotation_along(axis)[:, :2]
+    count = round(2 * np.pi / ROLL)
+    for number in range(1, count * len(TILTS)):
+        toward = TILTED * number
+        tilt = across @ np.array([np.cos(toward), np.sin(toward)]) * TILTS[number // count]
+        yield (Rotation.from_rotvec(tilt) * Rotation.from_rotvec(number * ROLL * axis)).as_matrix()
+
+
+def with_turns(start: Understood, ask: Ask | None) -> Understood:
+    """A fit as it is, or where much is unexplained the best of it and of those with the camera turned.
+
+    Args:
+        start: the frame as it is.
+        ask: the network, in scene units.
+    """
+    problem, _, modes = start
+    if ask is None or not problem.config.turned or not problem.wants_turns(modes.misfit.cloud, modes.surface):
+        return start
+    points, anyway = problem.evidence.points, problem.config.turned_anyway
+    best, waiting = start, turns(points.mean(axis=0))
+    while rounds := list(islice(waiting, ROUND)):
+        for problem, found in best_turned([seen_turned(start[0], points, turn, ask) for turn in rounds]):
+            modes = Judged.of(problem, refine(problem, fit_whole(problem)))
+            if modes.misfit.without_network < best[2].misfit.without_network:
+                best = problem, found, modes
+        if best[2].misfit.cloud < UNEXPLAINED or (anyway and best[0].leaves_noise(best[2].surface)):
+            break
+    return best if best is start else (best[0], best[1], explored(best[0], best[2]))
+
+
+def seen_turned(
+    problem: Problem, points: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "3 3"], ask: Ask
+) -> tuple[Problem, Correspondences]:
+    """The frame with what the network states when the camera is turned, turned back."""
+    found = ask(points @ turn.T).turned(turn.T)
+    return problem.with_network(found), found
+
+
+def best_turned(frames: list[tuple[Problem, Correspondences]]) -> list[tuple[Problem, Correspondences]]:
+    """Those whose fit by few points explains the frame best."""
+    costs = []
+    for problem, _ in frames:
+        coarse = problem.coarse
+        posed = refine(coarse, fit_whole(coarse), 2.0, problem.config.screen_steps)
+        costs.append(problem.screen(posed, problem.config.cloud_sigma).without_network)
+    return [frames[index] for index in np.argsort(costs)[:FITTED]]

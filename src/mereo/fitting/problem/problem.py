@@ -25,13 +25,13 @@ from mereo.fitting.problem.residuals import (
     ROBUST,
     WITNESS_WEIGHT,
     NetworkTerm,
+    SampledSurface,
     Surface,
     add_cloud,
     add_witnesses,
     cloud_rows,
     robust_square,
 )
-from mereo.fitting.problem.sampled_surface import SampledSurface
 from mereo.scenes.statistical_model import WITNESSES, StatisticalModel
 
 COARSE = 3

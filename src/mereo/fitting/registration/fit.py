@@ -15,19 +15,15 @@ from mereo.fitting.draws.fit import fit_draws
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws.problem import narrowing as draws_narrowing
-from mereo.fitting.modes.fit import Judged, fit_modes
-from mereo.fitting.modes.rest import fit_rest, is_at_rest, of_rest
-from mereo.fitting.modes.rest import narrowing as modes_narrowing
-from mereo.fitting.modes.turned_camera import with_turns
-from mereo.fitting.modes.understood import Ask, as_noisy
-from mereo.fitting.problem.correspondences import Correspondences, find_correspondences
+from mereo.fitting.modes.fit import Ask, Judged, as_noisy, fit_modes, fit_rest, is_at_rest, of_rest, with_turns
+from mereo.fitting.modes.fit import narrowing as modes_narrowing
+from mereo.fitting.problem.correspondences import Correspondences, agree, estimate_unit, find_correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Surface
-from mereo.fitting.problem.scene_unit import agree, estimate_unit
 from mereo.fitting.registration.registration import Method, Registration
-from mereo.fitting.uncertainty.optimum import DrawsOptimum, ModesOptimum, Optimum
+from mereo.fitting.uncertainty.uncertainty import DrawsOptimum, ModesOptimum, Optimum
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.sight_lines import SightLines
 from mereo.io.cores import one_blas_thread
@@ -74,7 +70,7 @@ class ModesFit:
     ) -> "ModesFit":
         """Fit of the modes to a cloud, seen from the origin, with correspondences in its unit.
 
-        Where much is unexplained, the network is asked again with the camera turned (``turned_camera``); where what is
+        Where much is unexplained, the network is asked again with the camera turned (``with_turns``); where what is
         left is noise, the frame is fitted once more as a noisy one.
 
         Args:

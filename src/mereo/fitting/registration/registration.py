@@ -11,9 +11,7 @@ from numpy.typing import ArrayLike
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
 from mereo.fitting.draws.playback import Drawn
-from mereo.fitting.uncertainty.explanation import Explanation
-from mereo.fitting.uncertainty.optimum import Optimum
-from mereo.fitting.uncertainty.uncertainty import Uncertainty
+from mereo.fitting.uncertainty.uncertainty import Explanation, Optimum, Uncertainty
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.moments import owned_centroids

@@ -10,18 +10,186 @@ Notation: n poses, p observed points, w samples that are looked up.
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, Int32
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.residuals import ROBUST, WITNESS_WEIGHT
-from mereo.fitting.search.shape_tables import CELLS, ShapeTables
-from mereo.fitting.search.sight_table import SightTable, clipped
+from mereo.fitting.problem.gauss_newton import cross
+from mereo.fitting.problem.residuals import ROBUST, WITNESS_WEIGHT, SampledSurface
 from mereo.geometry.transforms import rotation_along
 from mereo.io.cores import cores
-from mereo.scenes.statistical_model import WITNESSES
+from mereo.scenes.statistical_model import WITNESSES, StatisticalModel
+
+# --- table of lines of sight ------------------------------------------------------------------------------------------
+
+# What a frame rules out as a table, in which many places are looked up at once.
+#
+# Notation: n poses, w places of each, c cells.
+
+SIDE = 96
+"""Cells along each side of the table of what a frame rules out; about as many as a depth image has pixels there."""
+
+
+def clipped(place: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndarray, "n w d"]:
+    """Index of a cell along each axis, of ``count``: that at the border for what lies beyond, or nowhere."""
+    index: Int32[np.ndarray, "n w d"] = np.fmax(np.fmin(place, np.float32(count - 1)), np.float32(0)).astype(np.int32)
+    return index
+
+
+@dataclass(frozen=True, eq=False)
+class SightTable:
+    """What a frame rules out, as a table of lines of sight; the rules are those of ``Evidence.violations``.
+
+    Attributes:
+        T: rotation into the axes of the table, whose third is the direction of the cloud.
+        low, cell: corner of the table and length of a cell, as slopes across the direction.
+        toward: unit vector of the nearest line of sight to each cell that met the object, or of which nothing is known.
+        front: distance before which it is free.
+        free: distance up to which a cell beside these is free; negative where it is not beside.
+        pitch: angle between neighbouring lines of sight.
+    """
+
+    T: Float32[np.ndarray, "3 3"]
+    low: Float32[np.ndarray, "2"]
+    cell: float
+    toward: Float32[np.ndarray, "c 3"]
+    front: Float32[np.ndarray, " c"]
+    free: Float32[np.ndarray, " c"]
+    pitch: float
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> "SightTable":
+        """Table around the cloud, three times as wide; beyond, the nearest cell of the border stands for a place."""
+        direction = evidence.sight.data[: len(evidence.points)]
+        T = rotation_along(direction.mean(axis=0) / np.linalg.norm(direction.mean(axis=0))).T
+        turned = evidence.points @ T.T
+        slope = turned[:, :2] / np.maximum(turned[:, 2:], 0.1 * np.linalg.norm(turned, axis=1, keepdims=True))
+        low, high = slope.min(axis=0), slope.max(axis=0)
+        side = 3.0 * float((high - low).max()) + 4 * evidence.pitch
+        corner = (low + high - side) / 2
+        cells = min(SIDE, max(16, int(side / evidence.pitch)))
+        across = corner + (np.stack(np.meshgrid(*(np.arange(cells) + 0.5,) * 2, indexing="ij"), -1)) * side / cells
+        sight = np.concatenate([across.reshape(-1, 2), np.ones((cells * cells, 1))], axis=1) @ T
+        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        toward, front, free = evidence.along(sight)
+        return cls(
+            T.astype(np.float32),
+            corner.astype(np.float32),
+            side / cells,
+            toward.astype(np.float32),
+            front.astype(np.float32),
+            free.astype(np.float32),
+            evidence.pitch,
+        )
+
+    def violations(
+        self, place: Float32[np.ndarray, "n w 3"], slack: float
+    ) -> tuple[Float32[np.ndarray, "n w 3"], Float32[np.ndarray, "n w"]]:
+        """``Evidence.violations`` of many places, up to a cell."""
+        cells = round(np.sqrt(len(self.front)))
+        turned = place @ self.T.T
+        slope = turned[..., :2] / np.maximum(turned[..., 2:], 1e-6)
+        index = clipped((slope - self.low) / self.cell, cells)
+        row = index[..., 0] * cells + index[..., 1]
+        distance = np.sqrt(np.einsum("nwi,nwi->nw", place, place))
+        toward, free = self.toward[row], self.free[row]
+        beside = free > distance - slack
+        sideways = toward * distance[..., None] - place
+        length = np.sqrt(np.einsum("nwi,nwi->nw", sideways, sideways))
+        direction = np.where(beside[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
+        ahead = np.where(free < 0, self.front[row] - slack - distance, 0.0)
+        amount = np.where(beside, length - self.pitch * distance, ahead)
+        return direction, np.maximum(amount, 0.0).astype(np.float32)
+
+
+# --- tables of shapes -------------------------------------------------------------------------------------------------
+
+# Some states of an object as tables: evenly spread samples of the surface, and the nearest of them to every place.
+#
+# A table is made once for an object. With it, thousands of poses are compared with a cloud in single array operations.
+#
+# Notation: q states, s samples, r cells along each side of a table.
+
+SAMPLES = 512
+"""Samples of the surface: they are 2 to 4 % of half its longest side apart, far less than the first sigma."""
+
+CELLS = 32
+"""Cells along each side of a table."""
+
+MARGIN = 0.5
+"""By so much of its half length is a table larger than its state on each side; beyond, all points are outliers."""
+
+MODELS = 4
+"""Objects whose tables are kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeTables:
+    """Tables of some states, model frame.
+
+    Attributes:
+        z: coefficients of each state.
+        place, normal: of its samples.
+        low, cell: corner of each table's box, and the length of a cell.
+        nearest: index of the sample nearest to the centre of each cell.
+    """
+
+    z: Float32[np.ndarray, "q k"]
+    place: Float32[np.ndarray, "q s 3"]
+    normal: Float32[np.ndarray, "q s 3"]
+    low: Float32[np.ndarray, "q 3"]
+    cell: Float32[np.ndarray, " q"]
+    nearest: Int32[np.ndarray, "q c"]
+
+    @classmethod
+    def of(cls, model: StatisticalModel, z: Float32[np.ndarray, "q k"], surface: SampledSurface) -> "ShapeTables":
+        """Tables of states with the coefficients ``z``."""
+        flat = z @ surface.modes.reshape(-1, model.count).T
+        frame = surface.mean + flat.reshape(len(z), *surface.mean.shape)
+        place = np.ascontiguousarray(frame[:, :, 0])
+        normal = cross(frame[:, :, 1].reshape(-1, 3), frame[:, :, 2].reshape(-1, 3))
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        margin = np.float32(MARGIN * model.half)
+        low, high = place.min(axis=1) - margin, place.max(axis=1) + margin
+        cell = (high - low).max(axis=1) / CELLS
+        low = (low + high - CELLS * cell[:, None]) / 2
+        steps = np.stack(np.meshgrid(*(np.arange(CELLS, dtype=np.float32) + 0.5,) * 3, indexing="ij"), axis=-1)
+        nearest = [
+            cKDTree(place[i], balanced_tree=False, compact_nodes=False).query(low[i] + cell[i] * steps.reshape(-1, 3))[
+                1
+            ]
+            for i in range(len(z))
+        ]
+        return cls(z, place, normal.reshape(place.shape), low, cell, np.stack(nearest).astype(np.int32))
+
+
+def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
+    """Rows of the library's states that stand for all of them: those nearest to the centres of so many clusters."""
+    if count >= len(model.library):
+        return np.arange(len(model.library))
+    shape = (model.library * model.motion).astype(np.float64)
+    center, owner = kmeans2(shape, count, minit="++", rng=0)
+    sizes = np.bincount(owner, minlength=count)
+    order = np.argsort(-sizes, kind="stable")[: np.count_nonzero(sizes)]
+    distance = ((shape[None] - center[order, None]) ** 2).sum(axis=2)
+    rows: Int[np.ndarray, " q"] = np.unique(distance.argmin(axis=1))
+    return rows
+
+
+@lru_cache(maxsize=MODELS)
+def tables_of(model: StatisticalModel, count: int) -> ShapeTables:
+    """Tables of the mean state (``count`` 0), or of ``count`` medoids of the library; those of few models are kept."""
+    surface = SampledSurface.of(model, SAMPLES)
+    z = np.zeros((1, model.count), dtype=np.float32) if count == 0 else model.library[medoids(model, count)]
+    return ShapeTables.of(model, z, surface)
+
+
+# --- screening --------------------------------------------------------------------------------------------------------
 
 POINTS = 128
 """Observed points that a pose is compared with."""

@@ -21,8 +21,7 @@ from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.joints import corner_places
 from mereo.fitting.problem.priors import Prior
 from mereo.fitting.problem.problem import UNEXPLAINED, Problem
-from mereo.fitting.search.screening import Poses, Screen
-from mereo.fitting.search.shape_tables import tables_of
+from mereo.fitting.search.screening import Poses, Screen, tables_of
 
 
 @dataclass(frozen=True)

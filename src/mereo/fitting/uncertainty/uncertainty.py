@@ -5,17 +5,261 @@ Optimum -Posterior-> Uncertainty: radii that hold 95 % of the true places
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
-from mereo.fitting.problem.posterior import WITHIN, Posterior, RadiusParts, radius95
-from mereo.fitting.uncertainty.explanation import Decided, Weighing
-from mereo.fitting.uncertainty.optimum import Optimum
+from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
+from mereo.fitting.draws.problem import terms as terms_of_draws
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.problem.own_turns import left_open
+from mereo.fitting.problem.posterior import WITHIN, Observed, Posterior, RadiusParts, Terms, radius95
+from mereo.fitting.problem.priors import Prior
+from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.residuals import Surface, add_witnesses
+from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.moments import owned_gradients
 from mereo.geometry.radii import Radii
+from mereo.geometry.transforms import transform_points
+from mereo.io.cores import one_blas_thread
 from mereo.scenes.statistical_model import StatisticalModel
+
+# --- the optimum and its posterior ------------------------------------------------------------------------------------
+
+# Where fits of modes, of the rest model and of draws have ended, from which a posterior is made when it is asked for.
+#
+# ModesOptimum, DrawsOptimum -> Terms of the normal equations -> Posterior
+
+
+@dataclass(frozen=True, eq=False)
+class ModesOptimum:
+    """End of a fit of the modes, or, with a model that has none, of the pose alone.
+
+    Attributes:
+        problem: everything the fit worked on.
+        posed: coefficients and pose.
+        unit: length of a scene unit in the input's unit, before the fit's own scale.
+        bent: places of the material points by a fit of the modes, where the answer is the rest model: an object that
+            is hardly bent may pass for one at rest. None else.
+    """
+
+    problem: Problem
+    posed: Posed
+    unit: float
+    bent: Float[np.ndarray, "m 3"] | None = None
+
+    @property
+    def tolerance(self) -> float:
+        """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
+        return self.problem.config.tolerance
+
+    @cached_property
+    def terms(self) -> Terms:
+        """Terms under the prior of all states; that of the states near the answer is too sure (design note 22)."""
+        problem, posed, config = self.problem, self.posed, self.problem.config
+        nothing = NormalEquations.nothing(POSE + len(posed.z))
+        with one_blas_thread():
+            samples = problem.samples.posed(posed).few(config.witnesses)
+            return Terms(
+                known=problem.known(posed, Prior.whole(problem.model), 0.0),
+                network=problem.network.add_to(
+                    nothing, posed, problem.network_sigma, config.network_worth[1], robust=True
+                ),
+                cloud=problem.cloud_rows(posed),
+                partners=problem.evidence.partners,
+                ruled_out=add_witnesses(nothing, posed, samples, problem.evidence, config.cloud_sigma),
+            )
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The posed surface."""
+        return Surface.of(self.problem.model, self.posed)
+
+    @cached_property
+    def observed(self) -> Observed:
+        """Observed points beside the surface."""
+        points = self.problem.evidence.points
+        return points, self.surface.nearest(points)[0]
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Posterior of pose, scale and coefficients."""
+        model = self.problem.model
+        material = self.posed.place(model.material(self.posed.z))
+        with one_blas_thread():
+            beside = turns_left_open(self.problem, material)
+            if self.bent is not None:
+                beside = np.concatenate([beside, (self.bent - material)[:, :, None].astype(np.float32)], axis=2)
+            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, beside)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawsOptimum:
+    """End of a fit of a scene's draws.
+
+    Attributes:
+        problem: everything the fit worked on.
+        fit: the played state.
+        unit: length of a scene unit in the input's unit, before the fit's own scale.
+    """
+
+    problem: DrawsProblem
+    fit: DrawsFit
+    unit: float
+
+    @property
+    def tolerance(self) -> float:
+        """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
+        return self.problem.base.config.tolerance
+
+    @cached_property
+    def terms(self) -> Terms:
+        """Terms of the neighbourhood in which the scene is linear in its draws."""
+        with one_blas_thread():
+            return terms_of_draws(self.problem, self.fit, self._motion, self.problem.base.config.cloud_sigma)
+
+    @property
+    def surface(self) -> Surface:
+        """The posed surface."""
+        return self.fit.surface
+
+    @property
+    def _motion(self) -> Float32[np.ndarray, "a 3 d"]:
+        assert self.fit.motion is not None
+        return self.fit.motion
+
+    @cached_property
+    def observed(self) -> Observed:
+        """Observed points beside the surface."""
+        points = self.problem.base.evidence.points
+        return points, self.fit.surface.nearest(points)[0]
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Posterior of pose, scale and draws."""
+        motion, spread = self._motion, self.problem.states.played.spread
+        modes: Float32[np.ndarray, "m 3 d"] = (spread @ motion.reshape(len(motion), -1)).reshape(
+            spread.shape[0], *motion.shape[1:]
+        )
+        material: Float[np.ndarray, "m 3"] = self.fit.placed()
+        with one_blas_thread():
+            turns = turns_left_open(self.problem.base, material)
+            return Posterior.of(self.terms.total, self.fit.posed, material, modes, open=turns)
+
+
+def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:
+    """How far turns of single segments that the frame does not tell apart may have moved the material points."""
+    config = problem.config
+    return left_open(problem.model, material, problem.evidence.partners, config.cloud_sigma, config.cloud_worth)
+
+
+Optimum = ModesOptimum | DrawsOptimum
+"""Where a fit has ended, with all that it worked on."""
+
+
+# --- what decides a point ---------------------------------------------------------------------------------------------
+
+# Explanation of a place: which observed points decide it, and what leaves it unsure.
+#
+# At the optimum a point of the object is ``x = A u`` for parameters u of covariance S. Where an observed point moves by
+# d along its surface's normal, x moves by ``A S J_i^T w_i d``: its leverage. Each term of the fit adds its part H_t to
+# the precision ``S^-1``, so that the variance of x is a sum over the terms of what the error of each contributes to it:
+#
+#     A S A^T = sum_t A S H_t S A^T
+#
+# Notation: n observed partners, p parameters, J_i and w_i derivatives and weight of a partner's residual.
+
+Evidence = Literal["points", "network", "silhouette", "states"]
+"""What leaves a place unsure by its errors: the observed points, what the network says of them, what the frame rules
+out, and what was known of the object's states before the frame was seen."""
+
+Decided = tuple[dict[Evidence, float], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
+"""Shares of each kind of evidence in what is unsure, weight of each partner, and its influence in the camera's axes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What decides where a point of the object is; frame and unit of the registration.
+
+    Attributes:
+        place: of the point.
+        shares: of each kind of evidence in the variance that is left; they sum to one. What a hidden point is unsure by
+            comes largely from ``states``: from how far the object's own state may be from the likely ones.
+        points: observed points that the surface was fitted to, evenly spread.
+        influence: how the place moves, in multiples of its motion, when one of them moves along its surface's normal.
+        weights: how much each of them decides the place: the length of its influence over the sum of all.
+        unexplained: observed points, of all that were seen, that are farther from the registered surface than the
+            tolerance.
+    """
+
+    place: Float[np.ndarray, "3"]
+    shares: dict[Evidence, float]
+    points: Float[np.ndarray, "n 3"]
+    weights: Float[np.ndarray, " n"]
+    influence: Float[np.ndarray, "n 3"]
+    unexplained: Float[np.ndarray, "k 3"]
+
+    @classmethod
+    def of(
+        cls, place: Float[np.ndarray, "3"], decided: Decided, optimum: Optimum, T_here_fit: Float[np.ndarray, "4 4"]
+    ) -> "Explanation":
+        """Explanation in the frame to which ``T_here_fit`` leads from the fit's, both in the input's unit."""
+        unit, (observed, distance), (shares, weights, influence) = optimum.unit, optimum.observed, decided
+        return cls(
+            place=place,
+            shares=shares,
+            points=transform_points(T_here_fit, unit * optimum.terms.partners),
+            weights=weights,
+            influence=influence @ T_here_fit[:3, :3].T,
+            unexplained=transform_points(T_here_fit, unit * observed[distance > optimum.tolerance]),
+        )
+
+    def __repr__(self) -> str:
+        told = ", ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
+        return f"Explanation(unsure by {told}; {counted(len(self.unexplained), 'point')} unexplained)"
+
+
+@dataclass(frozen=True, eq=False)
+class Weighing:
+    """Terms of a fit in parameters that are independent and standard normal after it (u = F v, ``F F^T = S``).
+
+    Attributes:
+        rows: derivatives of the partners' residuals.
+        weight: of the residuals.
+        parts: of each kind of evidence but the points in the unit matrix that is their sum.
+    """
+
+    rows: Float[np.ndarray, "n p"]
+    weight: Float[np.ndarray, " n"]
+    parts: dict[Evidence, Float[np.ndarray, "p p"]]
+
+    @classmethod
+    def of(cls, terms: Terms, posterior: Posterior) -> "Weighing":
+        """Weighing of a fit's terms."""
+        factor = posterior.factor
+        others: dict[Evidence, Float[np.ndarray, "p p"]] = {
+            "network": terms.network.matrix,
+            "silhouette": terms.ruled_out.matrix,
+            "states": terms.known.matrix,
+        }
+        parts = {name: factor.T @ matrix @ factor for name, matrix in others.items()}
+        return cls(terms.cloud[0].astype(np.float64) @ factor, terms.cloud[2], parts)
+
+    def decided(self, motion: Float[np.ndarray, "3 p"]) -> Decided:
+        """What decides a place that moves so."""
+        motion = motion.astype(np.float64)
+        whole, leverage = float((motion**2).sum()), self.rows @ motion.T
+        shares: dict[Evidence, float] = {"points": float((self.weight[:, None] * leverage**2).sum()) / whole}
+        for name, part in self.parts.items():
+            shares[name] = float(((motion @ part) * motion).sum()) / whole
+        influence = self.weight[:, None] * leverage
+        length = np.linalg.norm(influence, axis=1)
+        return shares, length / max(float(length.sum()), np.finfo(np.float64).tiny), influence
+
+
+# --- uncertainty ------------------------------------------------------------------------------------------------------
 
 AT_ONCE = 20_000
 """Points whose motion is in memory at once."""

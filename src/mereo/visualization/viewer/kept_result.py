@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mereo.fitting.registration.state_file import STATE, read_state
+from mereo.fitting.registration.state import STATE, read_state
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii

@@ -11,8 +11,7 @@ from mereo.evaluation.sample_views import shipped_frame, shipped_views
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import registrar_for, statistical_model_of
-from mereo.fitting.registration.state import played_state, restored
-from mereo.fitting.registration.state_file import RegistrationState, is_state, read_state
+from mereo.fitting.registration.state import RegistrationState, is_state, played_state, read_state, restored
 from mereo.io.config import InputConfig
 from mereo.io.glb_scene import is_glb
 from mereo.io.progress import shown_stages

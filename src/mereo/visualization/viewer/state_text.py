@@ -4,7 +4,7 @@
     {"scene": "rope", "model": "9f...", "z": [0.3, ...]}                  coefficients of a statistical model
 
 Shares are those of ``scenes.draw_recorder``, 0 to 1; with ``"rest": true`` the object is at rest, and they are where
-the sliders stand. A ``state.json`` (``fitting.registration.state_file``) has the pose and the frame of a registration
+the sliders stand. A ``state.json`` (``fitting.registration.state``) has the pose and the frame of a registration
 too, which the laboratory does not need.
 """
 
@@ -15,8 +15,16 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, FiniteFloat, NonNegativeInt, ValidationError, model_validator
 
-from mereo.fitting.registration.state import model_digest, played_state
-from mereo.fitting.registration.state_file import MOST_NUMBERS, Block, RegistrationState, Text, parse_state, said
+from mereo.fitting.registration.state import (
+    MOST_NUMBERS,
+    Block,
+    RegistrationState,
+    Text,
+    model_digest,
+    parse_state,
+    played_state,
+    said,
+)
 from mereo.scenes.given_draws import played_back
 from mereo.scenes.parameters import Played
 from mereo.scenes.rest_pose import at_rest, is_at_rest
