@@ -39,7 +39,7 @@ from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.synthesis.config import SENSORS, Occluder
-from mereo.synthesis.depth_rendering import add_depth_noise
+from mereo.synthesis.depth_sensor import add_depth_noise
 from mereo.synthesis.sequence_config import SequenceConfig
 from mereo.synthesis.sequences import Moment, sequence
 

@@ -29,10 +29,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from mereo.evaluation.calibrate import VIEWS, calibrate
-from mereo.evaluation.calibration_views import CalibrationView, frames_beyond, other_objects, own_views, strange_frames
+from mereo.evaluation.calibrate import (
+    VIEWS,
+    CalibrationView,
+    calibrate,
+    ece_of,
+    frames_beyond,
+    other_objects,
+    own_views,
+    strange_frames,
+)
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.probability_scaling import ece_of
 from mereo.evaluation.reliability import AskedCells
 from mereo.evaluation.scoring import trained_scene
 from mereo.fitting.config import AnswerMethod

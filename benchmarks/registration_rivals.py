@@ -49,8 +49,7 @@ from mereo.fitting.registration.fit import fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.procrustes import robust_rigid
-from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.geometry.transforms import fit_rigid, robust_rigid, transform_points
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import scene_model

@@ -22,7 +22,7 @@ from mereo.geometry.transforms import inverse_rigid
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.depth_rendering import render_depth
+from mereo.synthesis.depth_sensor import render_depth
 from mereo.synthesis.examples import sample_view
 from mereo_objects import _robot_parts as parts
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mereo.deformation.maps import invert, jacobian_determinant
-from mereo.deformation.surface_driven import Surface, SurfaceMap
+from mereo.deformation.tetrahedral import Surface, SurfaceMap
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.scenes.recorded_states import States, SurfaceFrames, load_states

@@ -31,7 +31,7 @@ from mereo.scenes.draw_recorder import Recorder
 from mereo.scenes.parameters import Played, play, random_state, turned
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
+from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 from mereo.visualization.contact_sheets import INK, Picture, depth_to_rgb, fit_font, font
 from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
 from mereo.visualization.viridis import viridis

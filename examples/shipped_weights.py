@@ -9,7 +9,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from mereo.evaluation.results import EvaluatedView
+from mereo.evaluation.cases import EvaluatedView
 from mereo.evaluation.scoring import evaluate
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model

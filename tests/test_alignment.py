@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mereo.models.alignment_network import AlignmentNet
-from mereo.models.network import Network
+from mereo.models.network import AlignmentNet, Network
 from mereo.models.rigid_alignment import Alignment, fit_rigid
 from mereo.training.config import PRESETS
 from mereo.training.losses import rest_loss

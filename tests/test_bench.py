@@ -11,7 +11,7 @@ import torch
 
 from mereo.cli import tool_commands
 from mereo.evaluation.sample_views import load_view
-from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.geometry.downsampling import farthest_point_order
 from mereo.models.weights import load_model
 from mereo.training.config import PRESETS
 from mereo_experiments.speed import fitted_model

@@ -15,7 +15,6 @@ from mereo.deformation.maps import Rigid
 from mereo.deformation.samplers import cubic_cells
 from mereo.deformation.warps import Squash
 from mereo.geometry.camera import Camera
-from mereo.geometry.contacts import contacts
 from mereo.geometry.manifold import mesh_of
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.overlap import overlaps
@@ -23,11 +22,11 @@ from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.learning.object_files import told_of
+from mereo.scenes.files.build import TOLERANCE, refined
 from mereo.scenes.files.check import check_scene
-from mereo.scenes.files.defaults import MOTION, UNPLACED, default_deformations, random_motion
-from mereo.scenes.files.refinement import TOLERANCE, refined
+from mereo.scenes.files.defaults import MOTION, UNPLACED, default_deformations, material_points, motion, random_motion
+from mereo.scenes.files.joints import contacts
 from mereo.scenes.files.template import write_scene_file
-from mereo.scenes.motion import material_points, motion
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng

@@ -11,9 +11,8 @@ from analytic import AnalyticModel, ball, logits_of, untrained
 from safetensors import safe_open
 
 from mereo import __main__ as command_line
-from mereo.evaluation.calibrate import calibrate
+from mereo.evaluation.calibrate import GOOD_ENOUGH, calibrate, ece_of, fit_scaling
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.probability_scaling import GOOD_ENOUGH, ece_of, fit_scaling
 from mereo.evaluation.reliability import BINS, AskedCells, Reliability
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.evaluation.candidates import RegistrationErrors, find_candidates
+from mereo.evaluation.cases import Evaluation, RegistrationErrors, find_candidates
 from mereo.evaluation.coverage import seen_points
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores
-from mereo.evaluation.results import Evaluation
 from mereo.evaluation.scoring import evaluate
 from mereo.evaluation.tables import markdown_table, metrics
 from mereo.fitting.registration.register import Registrar

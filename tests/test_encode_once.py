@@ -8,8 +8,7 @@ from answers import answer_to, reconstruct
 
 import mereo
 from mereo.evaluation.sample_views import load_view
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.scanner_axes import into_camera
+from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud

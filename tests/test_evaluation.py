@@ -10,10 +10,9 @@ from analytic import AnalyticModel, untrained
 from mereo.api.frames import load_frame
 from mereo.api.objects import Object
 from mereo.cli import demo
-from mereo.evaluation.cases import PICTURE_MARGIN, TestCase
+from mereo.evaluation.cases import PICTURE_MARGIN, Evaluation, TestCase, grid_confusion
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union
-from mereo.evaluation.results import Evaluation, grid_confusion
 from mereo.evaluation.sample_views import DEPTH_STEP, load_view, make_view, save_view
 from mereo.evaluation.scoring import evaluate, grid_scores, predict_grid, score_cases, trained_scene
 from mereo.evaluation.tables import markdown_table

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from mereo import __main__ as command_line
-from mereo.evaluation.results import EvaluatedView
+from mereo.evaluation.cases import EvaluatedView
 from mereo.geometry.camera import PointCloud
 from mereo.synthesis.config import GenerateConfig
 from mereo.training.config import PRESETS

@@ -16,7 +16,7 @@ from exported import CASES, NAMES, model_of, seen
 
 from mereo.__main__ import parse
 from mereo.cli.commands import Export
-from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import PALETTE
 from mereo.models.export.mereo_onnx import main, prepare
 from mereo.models.export.onnx_export import ANSWERS, RUNNER, code_tensors, export_weights

@@ -6,10 +6,8 @@ from scipy.spatial.transform import Rotation
 from toy_scene import sample_deformations, toy_scene
 
 from mereo.deformation.moving_least_squares import Anchors
-from mereo.geometry.procrustes import robust_rigid
-from mereo.geometry.transforms import fit_rigid
-from mereo.scenes.principal_components import build_model
-from mereo.scenes.random_states import interior_nodes, sample_states, state_points
+from mereo.geometry.transforms import fit_rigid, robust_rigid
+from mereo.scenes.random_states import build_model, interior_nodes, sample_states, state_points
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 

@@ -13,7 +13,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.scenes.random_states import state_points
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis.depth_rendering import render_depth
+from mereo.synthesis.depth_sensor import render_depth
 
 SCENE = toy_scene()
 IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matrix(), np.array([1.0, 2.0, 120.0]))

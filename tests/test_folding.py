@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import nn
 
-from mereo.models.batch_norm_fusion import fold_batch_norm
 from mereo.models.config import NetworkConfig
+from mereo.models.model import fold_batch_norm
 from mereo.models.network import Network
 from mereo.training.config import PRESETS
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from toy_scene import toy_scene
 
-from mereo.scenes.given_draws import draw_names, played_back
-from mereo.scenes.parameters import Played, Refused, parameters, random_state, set_value
+from mereo.scenes.parameters import Played, Refused, draw_names, parameters, played_back, random_state, set_value
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 

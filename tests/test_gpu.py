@@ -12,17 +12,16 @@ import torch
 
 from mereo.evaluation.sample_views import load_view
 from mereo.models import rigid_alignment
-from mereo.models.cuda_graphs import StaticFrames
 from mereo.models.model import Model
 from mereo.models.rigid_alignment import fit_rigid
 from mereo.models.weights import load_model
-from mereo_experiments.speed.stages import random_points
+from mereo_experiments.speed.stages import StaticFrames, random_points
 
 KERNELS = """
 import numpy as np, torch
 from mereo.models.ops.triton_kernels import farthest_points, nearest
 from mereo.models.ops.neighbors import nearest as expected
-from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.geometry.downsampling import farthest_point_order
 
 torch.manual_seed(0)
 points, valid = torch.randn(2, 300, 3), torch.rand(2, 300) > 0.3

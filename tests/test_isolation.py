@@ -11,10 +11,9 @@ from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import grid_scores
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.downsampling import spacing, thin_to_grid
-from mereo.geometry.plane_fitting import largest_plane
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.isolation import clusters, isolate
+from mereo.reconstruction.isolation import clusters, isolate, largest_plane
 
 
 def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:

@@ -8,7 +8,7 @@ from shapes import box
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.joints import Joints, different
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.scenes.principal_components import build_model
+from mereo.scenes.random_states import build_model
 from mereo.scenes.statistical_model import StatisticalModel
 
 NONE = np.empty((0, 3)), np.empty(0, dtype=np.uint8)

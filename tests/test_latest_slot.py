@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from mereo.reconstruction import latest_slot
-from mereo.reconstruction.latest_slot import LatestSlot
+from mereo.reconstruction import stream
+from mereo.reconstruction.stream import LatestSlot
 
 
 def test_the_newest_item_is_taken_once_and_counts_those_it_replaced() -> None:
@@ -23,7 +23,7 @@ def test_the_newest_item_is_taken_once_and_counts_those_it_replaced() -> None:
 
 def test_a_patient_item_waits_its_turn_and_arrives_then(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [1.0]
-    monkeypatch.setattr(latest_slot, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(stream, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     slot = LatestSlot[str]()
     slot.put("first")
     thread = threading.Thread(target=lambda: slot.put("second", wait=True))

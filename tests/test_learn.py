@@ -18,7 +18,7 @@ from mereo.fitting.draws.playback import DrawnStates
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.learning import learn as learning
-from mereo.learning import outcome, probe, schedule, search_stage
+from mereo.learning import schedule, search_stage
 from mereo.learning.example_frame import write_example_frame
 from mereo.learning.learn import learn
 from mereo.learning.object_files import check, deformation, scene_for
@@ -26,7 +26,7 @@ from mereo.learning.schedule import Plan, Rates, epochs_for, holdout, plan_for, 
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object, size_warning
-from mereo.scenes.files import check_states
+from mereo.scenes.files import check as checks
 from mereo.scenes.kept_model import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
 from mereo.synthesis import shards
@@ -108,7 +108,7 @@ def test_what_hardly_deforms_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_a_faulty_object_is_refused_with_what_may_mend_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(check_states, "STATES", 3)
+    monkeypatch.setattr(checks, "STATES", 3)
     path = write_bar(tmp_path)
     (tmp_path / "right.stl").write_bytes((tmp_path / "left.stl").read_bytes())
     with pytest.raises(ValueError, match=r"bar.yaml --repair` try, and learn .*bar-repaired.yaml"):
@@ -165,16 +165,16 @@ def test_the_example_frame_is_as_long_as_the_object(tmp_path: Path) -> None:
 
 def test_bad_scores_come_with_advice_and_good_ones_without() -> None:
     bad, each = {"iou": 0.5, "miou": 0.1}, {"left": 0.1, "right": None}
-    lines = "\n".join(outcome.advice_after_training(bad, each, 10.0))
+    lines = "\n".join(learning.advice_after_training(bad, each, 10.0))
     assert "0.10 is too low to rely on" in lines and "right is the weakest" in lines and "--minutes 30" in lines
-    assert not outcome.advice_after_training({**bad, "miou": 0.8}, each, 10.0)
-    assert outcome.advice_after_training({**bad, "miou": None, "iou": 0.9}, each, 10.0) == []
+    assert not learning.advice_after_training({**bad, "miou": 0.8}, each, 10.0)
+    assert learning.advice_after_training({**bad, "miou": None, "iou": 0.9}, each, 10.0) == []
 
 
 def test_the_command_names_the_scene_where_it_is_not_built_in() -> None:
     built_in = "mereo reconstruct out/frame.ply --weights out/weights.safetensors --output out/result"
-    assert outcome.command(Path("out"), "rope") == built_in
-    assert "--scene 'my lamp.yaml' --method search" in outcome.command(Path("out"), "my lamp.yaml", method="search")
+    assert learning.command(Path("out"), "rope") == built_in
+    assert "--scene 'my lamp.yaml' --method search" in learning.command(Path("out"), "my lamp.yaml", method="search")
 
 
 # --- the whole --------------------------------------------------------------------------------------------------------
@@ -190,8 +190,8 @@ def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, cache: Path) -> 
     """So little of everything that a run takes seconds."""
     monkeypatch.setenv(CACHE_VARIABLE, str(cache))
     for module, name, value in (
-        (check_states, "STATES", 3),
-        (probe, "EXAMPLES", 12),
+        (checks, "STATES", 3),
+        (learning, "EXAMPLES", 12),
         (shards, "states_for", lambda _: 12),
         (DrawnStates, "of", partial(DrawnStates.of, count=30)),
         (trial, "STEPS", 2),
@@ -269,7 +269,7 @@ def test_the_nearest_weights_are_those_that_adapt_fastest(
     small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trial, "shipped_names", lambda: ("rope", "skull"))
-    _, name = probe.measure(str(write_bar(tmp_path)), tmp_path, LIGHT, init="", seed=1, workers=1)
+    _, name = learning.measure(str(write_bar(tmp_path)), tmp_path, LIGHT, init="", seed=1, workers=1)
     printed = capsys.readouterr()
     assert f"measure: {trial.trial_steps(compared=True)} steps in" in printed.err
     losses = re.findall(r"(rope|skull) (\d+\.\d+)", printed.out)

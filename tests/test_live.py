@@ -22,7 +22,7 @@ from mereo.reconstruction.stream import StreamFrame
 from mereo.reconstruction.stream_sources import frames_of
 from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.scenes.registry import load_scene
-from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
+from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
 FRAMES, BAD, RATE_HZ = 12, 5, 30.0
 UNIT_M = 0.005

@@ -15,7 +15,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import examine, likely_unit
 from mereo.geometry.mesh_repair import repaired, without_overlaps
 from mereo.geometry.overlap import overlaps
-from mereo.scenes.files import check_states
+from mereo.scenes.files import check
 from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.registry import load_scene
@@ -163,7 +163,7 @@ def test_likely_units() -> None:
 def test_check_counts_faults_and_repair_leaves_the_users_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(check_states, "STATES", 3)
+    monkeypatch.setattr(check, "STATES", 3)
     path = write_bar(tmp_path, "# kept here\nsize: 15\n")
     check_scene(str(path))
     assert "bar: 2 segments, closed, outward oriented, without overlap" in capsys.readouterr().out

@@ -22,10 +22,10 @@ from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import sample_view, synthesize
-from mereo.synthesis.label_rules import owner_labels
 from mereo.synthesis.query_sampling import (
     label_uniform,
     nested_sort_sample,
+    owner_labels,
     sample_queries,
     sort_sample,
     volume_uniform,

@@ -13,9 +13,9 @@ from shapes import box
 import mereo
 from mereo import __main__ as command_line
 from mereo.cli.object_option import loaded_object
+from mereo.evaluation.cases import grid_confusion, labels_on
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import intersection_over_union
-from mereo.evaluation.results import grid_confusion, labels_on
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import ClustersWarning

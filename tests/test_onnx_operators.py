@@ -5,8 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from mereo.models.export.onnx_operators import trilinear
-from mereo.models.ops.svd import svd3
-from mereo.models.rigid_alignment import fit_rigid
+from mereo.models.rigid_alignment import fit_rigid, svd3
 
 
 def matrices(count: int) -> torch.Tensor:

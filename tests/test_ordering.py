@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mereo.geometry import farthest_point_sampling
-from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.geometry import downsampling
+from mereo.geometry.downsampling import farthest_point_order
 
 
 def lattice(side: int) -> np.ndarray:
@@ -104,6 +104,6 @@ def test_each_point_costs_eight_operations_for_each_one_chosen(monkeypatch: pyte
     points = np.random.default_rng(7).normal(size=(1500, 3))
     expected = farthest_point_order(points, 1024, 0)
     others = {name: getattr(np, name) for name in dir(np) if name not in functions and not name.startswith("_")}
-    monkeypatch.setattr(farthest_point_sampling, "np", SimpleNamespace(**others | functions))
+    monkeypatch.setattr(downsampling, "np", SimpleNamespace(**others | functions))
     assert np.array_equal(farthest_point_order(points, 1024, 0), expected)
     assert sum(written) == 8 * 1024 * 1500

@@ -21,7 +21,7 @@ import mereo
 from mereo.api import reconstruct
 from mereo.api.result import SINGLE, Result
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
-from mereo.evaluation.results import Evaluation
+from mereo.evaluation.cases import Evaluation
 from mereo.fitting.registration.registration import Located
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.output_folders import MARKER

@@ -10,13 +10,14 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.synthesis import query_sampling
 from mereo.synthesis.config import SamplingConfig
-from mereo.synthesis.label_rules import Shape, owner_labels
 from mereo.synthesis.query_sampling import (
     Samples,
+    Shape,
     extended_boxes,
     joint_box,
     label_uniform,
     nested_sort_sample,
+    owner_labels,
     sample_queries,
     sort_sample,
     volume_uniform,

@@ -7,15 +7,16 @@ import pytest
 from answers import answer_to
 from toy_scene import Shear, toy_scene
 
-from mereo.evaluation.calibration_views import (
+from mereo.evaluation.calibrate import (
     CalibrationView,
+    RecognitionGauge,
     clean_views,
     frames_beyond,
     other_objects,
     own_views,
     strange_frames,
+    usual_of,
 )
-from mereo.evaluation.recognition_gauge import RecognitionGauge, usual_of
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem.correspondences import CLIPPED
 from mereo.fitting.problem.noise import ACCEPTED
@@ -33,7 +34,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.models.calibration import Calibration, Recognizing, Usual
 from mereo.models.weights import load_model
-from mereo.scenes.farther_states import FartherDraws, with_farther_states
+from mereo.scenes.draw_recorder import FartherDraws, with_farther_states
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
@@ -241,12 +242,12 @@ def test_further_views_are_clean_and_others_than_those_before_them() -> None:
 
 
 def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.evaluation.calibration_views.SCENES", ("rope", "robot", "liver", "tumor"))
+    monkeypatch.setattr("mereo.evaluation.calibrate.SCENES", ("rope", "robot", "liver", "tumor"))
     rope: Scene = load_scene("rope")
     load_scene("liver")  # or the test is skipped, where its mesh is missing
     assert [other.name for other in other_objects(rope)] == ["robot", "liver"]
     assert [other.name for other in other_objects(load_scene("liver"))] == ["rope", "robot"]
-    monkeypatch.setattr("mereo.evaluation.calibration_views.SCENES", ("rope", "robot"))
+    monkeypatch.setattr("mereo.evaluation.calibrate.SCENES", ("rope", "robot"))
     frames = list(strange_frames(rope, other_objects(rope), 1, 710_000))
     assert [frame.kind for frame in frames] == ["other object"] + ["plane or clutter"] * 8
     low, high = rope.rest.bounds

@@ -19,8 +19,8 @@ from mereo.api.result import Result
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.cli.stream import stream_reconstructions
 from mereo.fitting.registration.answer import Answer
+from mereo.geometry.camera import scanner_to_camera
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.scanner_axes import scanner_to_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.config import InputConfig
 from mereo.models.weights import save_model

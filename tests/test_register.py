@@ -22,9 +22,8 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.solids import Solids
 from mereo.models.model import Model
 from mereo.models.weights import save_model

@@ -7,7 +7,7 @@ from shapes import ball, box, one
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
+from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
 CAMERA = Camera.from_fov(96, 96, float(np.deg2rad(30)))
 

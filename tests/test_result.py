@@ -12,8 +12,8 @@ import mereo
 from mereo.api.result import Result
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration.register import Registrar
+from mereo.geometry.camera import SCANNER_TO_CAMERA
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
 from mereo.scenes.source_frame import SourceFrame

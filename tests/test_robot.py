@@ -13,7 +13,7 @@ from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import State
-from mereo.synthesis.depth_rendering import render_depth
+from mereo.synthesis.depth_sensor import render_depth
 from mereo_objects import _robot_parts as parts
 from mereo_objects import robot
 

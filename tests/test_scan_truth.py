@@ -14,12 +14,11 @@ from analytic import AnalyticModel
 
 from mereo.__main__ import main
 from mereo.evaluation.metrics import Scores
-from mereo.evaluation.registration.initial_poses import start_from_model
-from mereo.evaluation.registration.placement import Start, place
+from mereo.evaluation.registration.icp import moved
+from mereo.evaluation.registration.placement import Start, place, start_from_model
 from mereo.evaluation.registration.truth_file import read_truth
-from mereo.evaluation.registration.visible_surface import moved
-from mereo.evaluation.scan_scoring import evaluate_scans
 from mereo.evaluation.scans import BUNNY_SCAN_POSES, SCANS, bunny_posed, bunny_scan
+from mereo.evaluation.scoring import evaluate_scans
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.io.mesh_formats import read_segmented_mesh
@@ -129,8 +128,8 @@ def test_a_truth_file_never_runs_a_python_scene_that_the_user_has_not_named(
         assert not (folder / "was-run").exists()
     model = AnalyticModel.of(lambda points: points, ("left", "right"))
     monkeypatch.setattr("mereo.api.steps.load_for", lambda *_: model)
-    monkeypatch.setattr("mereo.evaluation.scan_scoring.check_names", lambda _, names: named.append(names))
-    monkeypatch.setattr("mereo.evaluation.scan_scoring.registrar_for", lambda *_: sys.exit("read"))
+    monkeypatch.setattr("mereo.evaluation.scoring.check_names", lambda _, names: named.append(names))
+    monkeypatch.setattr("mereo.evaluation.scoring.registrar_for", lambda *_: sys.exit("read"))
     named: list[tuple[str, ...]] = []
     options = ["--scans", str(truth), "--scene", str(folder / "evil.py"), "--output", str(folder / "test")]
     with pytest.raises(SystemExit, match="read"):

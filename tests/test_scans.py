@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mereo.evaluation.scans import SCANS, bunny_scan, bunny_truth, scan_in_camera
+from mereo.geometry.camera import VIEW_DISTANCE, scanner_to_camera
 from mereo.geometry.normalizer import Normalizer
-from mereo.geometry.scanner_axes import VIEW_DISTANCE, scanner_to_camera
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, transform_points
 

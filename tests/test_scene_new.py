@@ -14,7 +14,7 @@ import mereo.__main__ as command_line
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.camera import Camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.scenes.files import check_states
+from mereo.scenes.files import check
 from mereo.scenes.files.template import identifier, write_scene_file
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES
@@ -112,7 +112,7 @@ def test_names_are_valid_and_new() -> None:
 
 
 def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(check_states, "STATES", 3)
+    monkeypatch.setattr(check, "STATES", 3)
     write_mesh(ball((0, 0, 0), 30.0), tmp_path / "a.ply")
     monkeypatch.chdir(tmp_path)
     assert command_line.main(["scene", "new", "a.ply", "--units", "cm"]) == 0

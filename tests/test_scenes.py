@@ -21,7 +21,7 @@ from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene, State, Workspace
 from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.depth_rendering import render_depth
+from mereo.synthesis.depth_sensor import render_depth
 
 STATES, MANY_STATES, CAMERAS = 12, 200, 50
 

@@ -11,15 +11,16 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.synthesis.config import SENSOR_TERMS, SENSORS, SensorConfig, SensorModel
-from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
 from mereo.synthesis.depth_sensor import (
     SimulatedView,
+    add_depth_noise,
     axial_std_m,
     dropout_probability,
     lateral_std,
     mix_edges,
     observe,
     quantize,
+    render_depth,
     sample_mask,
     smooth_field,
 )

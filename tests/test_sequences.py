@@ -14,8 +14,7 @@ from mereo import __main__ as command_line
 from mereo.deformation.maps import Deformation
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.scenes.given_draws import played_back
-from mereo.scenes.parameters import random_state
+from mereo.scenes.parameters import played_back, random_state
 from mereo.scenes.scene import Scene
 from mereo.scenes.walks import process_weights, switches, walk
 from mereo.synthesis.clutter import OCCLUDER

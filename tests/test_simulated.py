@@ -11,8 +11,7 @@ from shapes import ball
 from toy_scene import toy_scene
 
 from mereo.deformation.maps import invert, jacobian_determinant
-from mereo.deformation.surface_driven import Surface, SurfaceMap
-from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
+from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
 from mereo.evaluation.scoring import evaluate
 from mereo.io.simulation_states import TetrahedralRecord, read_states
 from mereo.scenes.recorded_states import load_states

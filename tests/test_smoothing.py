@@ -6,7 +6,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.camera import Camera
-from mereo.geometry.smoothing import smoothed
+from mereo.geometry.surface_patches import smoothed
 
 SIGHT = Camera.from_fov(48, 48, 0.5).directions().reshape(-1, 3)
 

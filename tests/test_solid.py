@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from shapes import ball, box, knobbly_torus, one, segment
 
-from mereo.geometry import winding_number
+from mereo.geometry import solids
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.overlap import overlaps
 from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
@@ -201,8 +201,8 @@ def test_a_large_grid_tests_columns_and_not_nodes(monkeypatch: pytest.MonkeyPatc
         pairs.append(len(found[0]))
         return found
 
-    covered_columns = winding_number._covered_columns
-    monkeypatch.setattr(winding_number, "_covered_columns", counted)
+    covered_columns = solids._covered_columns
+    monkeypatch.setattr(solids, "_covered_columns", counted)
     part = ball((0, 0, 0), 1.0, level=4)  # 5,120 faces
     axis = np.linspace(-1.1, 1.1, 100)
     label_grid(one(part), axis, axis, axis)

@@ -9,8 +9,8 @@ from shapes import one
 from toy_scene import toy_scene
 
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.models.decoder import RestLookup
 from mereo.models.network import Network
-from mereo.models.template_lookup import RestLookup
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig

@@ -12,8 +12,8 @@ import torch
 
 from mereo.evaluation.sample_views import load_view
 from mereo.models.config import Precision
+from mereo.models.device import in_threads
 from mereo.models.model import CPU_QUERY_CHUNK
-from mereo.models.threads import in_threads
 from mereo.models.weights import load_model
 from mereo_experiments.speed.roofline import count_operations
 
@@ -78,7 +78,7 @@ def test_operations_are_counted_whoever_does_them() -> None:
 
 FORKED = """
 import os, torch
-from mereo.models.threads import in_threads
+from mereo.models.device import in_threads
 torch.set_num_threads(2)
 assert in_threads(str, range(4)) == list("0123")
 child = os.fork()

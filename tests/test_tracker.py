@@ -16,9 +16,8 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking.config import TrackConfig
 from mereo.fitting.tracking.next_fit import Expectation, Track, between
 from mereo.fitting.tracking.tracker import Tracker
-from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
 from mereo.models.model import Model
@@ -28,7 +27,7 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.walks import walk
-from mereo.synthesis.depth_rendering import add_depth_noise, render_depth
+from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
 SEED, RATE_HZ = 740_000, 30.0
 

@@ -14,14 +14,13 @@ from scene_files import write_bar
 import mereo
 from mereo import __main__ as command_line
 from mereo.cli.object_option import loaded_object
-from mereo.evaluation import search_scores as scoring
-from mereo.evaluation.search_scores import SearchScores
 from mereo.learning import learn as learning
-from mereo.learning import outcome, search_stage
+from mereo.learning import search_stage
+from mereo.learning import search_stage as scoring
 from mereo.learning.learn import learn
 from mereo.learning.object_files import scene_of_folder
-from mereo.learning.training_choice import best_method, is_to_train, shortcomings
-from mereo.scenes.files import check_states
+from mereo.learning.search_stage import SearchScores, best_method, is_to_train, shortcomings
+from mereo.scenes.files import check
 from mereo.scenes.kept_model import CACHE_VARIABLE
 
 GOOD = {"examples": 16, "iou": 0.96, "miou": 0.92, "lowest_miou": 0.8, "explained": 1.0, "seconds": 1.5}
@@ -189,7 +188,7 @@ def test_a_folder_knows_its_scene(scored: list[SearchScores], tmp_path: Path) ->
     content = json.loads((out / "search.json").read_text())
     (out / "search.json").write_text(json.dumps({**content, "scene": "mine.py"}))  # never run by a folder's word
     assert scene_of_folder(out) is None
-    assert "--object mine.py" in outcome.command(out, "mine.py", is_trained=False)
+    assert "--object mine.py" in learning.command(out, "mine.py", is_trained=False)
 
 
 def test_a_folder_without_weights_is_an_object(
@@ -200,7 +199,7 @@ def test_a_folder_without_weights_is_an_object(
         (search_stage, "LEAST_VIEWS", 1),
         (search_stage, "VIEWS", 1),
         (learning, "search_scores", partial(search_stage.search_scores, cells=24)),
-        (check_states, "STATES", 3),
+        (check, "STATES", 3),
     ):
         monkeypatch.setattr(module, name, value)
     out, meshes = tmp_path / "out", [str(path) for path in write_angle(tmp_path)]

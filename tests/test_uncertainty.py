@@ -20,7 +20,7 @@ from mereo.geometry.moments import owned_centroids, owned_gradients
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis.depth_rendering import render_depth
+from mereo.synthesis.depth_sensor import render_depth
 
 SCENE = toy_scene()
 IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matrix(), np.array([1.0, 2.0, 120.0]))

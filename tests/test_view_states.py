@@ -16,9 +16,8 @@ from mereo.fitting.draws.playback import Drawn, material_moved
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.registration.state import STATE, load_state, save_state, state_of
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.scanner_axes import SCANNER_TO_CAMERA
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model

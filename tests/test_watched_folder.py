@@ -13,8 +13,7 @@ from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.stream import stream
-from mereo.reconstruction.stream_sources import watched_frames
-from mereo.reconstruction.watched_folder import PATIENCE_S, WatchedFolder
+from mereo.reconstruction.stream_sources import PATIENCE_S, WatchedFolder, watched_frames
 
 
 def points_of(seen: Observation) -> int:

@@ -21,12 +21,13 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import mereo
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import Scene
 from mereo_objects._liver_parts import MM, PLACEMENT, SOURCE, UNIT_M, WORKSPACE, organs
 
-STATES = Path(__file__).parents[2] / "states" / "liver.npz"
+STATES = Path(mereo.__file__).parent / "states" / "liver.npz"
 
 
 @cache

@@ -15,15 +15,15 @@ from typing import Any, Literal, get_args
 
 from mereo.api.words import python_words
 from mereo.evaluation import scoring
+from mereo.evaluation.cases import Evaluation
 from mereo.evaluation.metrics import format_score
-from mereo.evaluation.results import Evaluation
-from mereo.evaluation.scan_scoring import evaluate_scans
+from mereo.evaluation.scoring import evaluate_scans
 from mereo.fitting.config import AnswerMethod
 from mereo.io.object_storage import ObjectPath, place_of
 from mereo.learning import learn as learning
 from mereo.learning.example_frame import FRAME
 from mereo.learning.object_files import scene_for
-from mereo.learning.training_choice import TrainChoice
+from mereo.learning.search_stage import TrainChoice
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.models.elsewhere import for_tasks
 from mereo.models.export.onnx_export import export_weights

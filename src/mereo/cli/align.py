@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.evaluation.registration.icp import load_icp
-from mereo.evaluation.registration.initial_poses import read_start, start_from_model
-from mereo.evaluation.registration.placement import Placement, Start, place
+from mereo.evaluation.registration.placement import Placement, Start, place, read_start, start_from_model
 from mereo.evaluation.registration.truth_file import TRUTH, ScanFile, write_truth
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import UNITS_M

@@ -19,7 +19,7 @@ class DatasetCheck:
 
     def run(self) -> None:
         """Print what is wrong, a line for each file."""
-        from mereo.synthesis.dataset_check import check_dataset
+        from mereo.synthesis.dataset_contents import check_dataset
 
         check_dataset(self.dataset, self.write)
 

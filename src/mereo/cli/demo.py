@@ -19,9 +19,9 @@ from mereo.api.objects import Object, load_object
 from mereo.api.reconstruct import reconstruct
 from mereo.api.result import Result
 from mereo.cli.reconstruct import print_source
+from mereo.evaluation.cases import grid_confusion, labels_on
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.results import grid_confusion, labels_on
 from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view, shipped_frame
 from mereo.evaluation.scans import BUNNY_SCAN_POSES
 from mereo.fitting.config import AnswerMethod

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.geometry.downsampling import farthest_point_order
 
 ANCHORS = 200
 """Surface vertices of each segment that points may follow, spread evenly: the nearest of all lie on one small patch,

@@ -6,33 +6,324 @@ What a case leaves is small, so cases may be scored anywhere; they are put toget
 same bits wherever each one comes from.
 """
 
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
-from mereo.evaluation.candidates import (
-    AnswerName,
-    Candidate,
-    Candidates,
-    RegistrationErrors,
-    find_candidates,
-    names_for,
-)
 from mereo.evaluation.coverage import RadiusRatios, seen_points
 from mereo.evaluation.ground_truth import TruthGrid
+from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.evaluation.reliability import Reliability
-from mereo.evaluation.results import EvaluatedView, Evaluation, Tally, grid_confusion
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
+from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.mesh import Color
+from mereo.geometry.labels import LabelGrid
+from mereo.geometry.mesh import Color, SegmentedMesh
+from mereo.geometry.solids import label_grid
 from mereo.models.elsewhere import arrived
 from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud, Trained
+from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
+from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.statistical_model import StatisticalModel
+
+# --- answers to a test case -------------------------------------------------------------------------------------------
+
+# Answers to one test case: the network's, that of the modes, that of the scene's own draws, and which a user gets.
+
+AnswerName = Literal["network", "modes", "full"]
+"""Who answers: the network alone, the registered modes, the better of these and the scene's own draws."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One answer to a frame.
+
+    Attributes:
+        labels: on the grid of the truth.
+        seconds: from the cloud to the answer.
+        registration: behind it; None for the network's.
+    """
+
+    labels: UInt8[np.ndarray, "x y z"]
+    seconds: float
+    registration: Registration | None = None
+
+    def labels_on(self, grid: LabelGrid, model: Trained, code: EncodedCloud) -> UInt8[np.ndarray, "x y z"]:
+        """Labels on another grid."""
+        if self.registration is None:
+            return network_labels(model, code, grid)
+        return label_grid(self.registration.mesh, *grid.axes())
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """All answers to a frame.
+
+    Attributes:
+        code: what the network made of the cloud.
+        each: answers by who gives them.
+        default: whose answer a user gets.
+        known: whether the frame is said to show the object; None where no registration was asked for.
+        seconds: from the cloud to the answer that a user gets, all that led to it included.
+    """
+
+    code: EncodedCloud
+    each: dict[AnswerName, Candidate]
+    default: AnswerName
+    known: Known | None = None
+    seconds: float = 0.0
+
+    @property
+    def answer(self) -> Candidate:
+        """The answer that a user gets."""
+        return self.each[self.default]
+
+    @property
+    def source(self) -> str:
+        """Where that answer comes from: network, rest, modes or draws."""
+        found = self.answer.registration
+        return "network" if found is None else found.method
+
+
+def network_labels(model: Trained, code: EncodedCloud, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
+    """Labels by the network at the voxels of a grid, evaluated coarse to fine."""
+    x, y, z = grid.labels.shape
+
+    def logits(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+        return model.logits(code, points)
+
+    return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
+
+
+def find_candidates(
+    model: Trained, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
+) -> Candidates:
+    """Answers to a frame, scored on a grid: the one that a user gets, and all others that led to it."""
+    answer = answer_frame(observe(cloud), model, registrar, scene_unit=scene_unit)
+    assert answer.likelier is not None and answer.candidate is not None and answer.likelier.code is not None
+    started = time.perf_counter()
+    code, encoding = answer.likelier.code, answer.likelier.timings_s["encode"]
+    labels = network_labels(model, code, grid)
+    each: dict[AnswerName, Candidate] = {"network": Candidate(labels, encoding + time.perf_counter() - started)}
+    if registrar is None:
+        return Candidates(code, each, "network", seconds=each["network"].seconds)
+    known, names = answer.recognition.known, names_for(registrar)
+    if answer.candidate.modes is None or answer.registration is None:  # too little is found, whoever is scored
+        return Candidates(code, dict.fromkeys(names, each["network"]), "network", known, answer.seconds)
+    each["modes"] = _registered(answer.candidate.modes.registration(), grid, encoding)
+    if "full" in names:
+        each["full"] = _registered(answer.registration, grid, encoding)
+    return Candidates(code, each, names[-1] if answer.taken else "network", known, answer.seconds)
+
+
+def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
+    """Names of the answers that can be had: the draws only of an object whose scene is at hand."""
+    if registrar is None:
+        return ("network",)
+    if registrar.method == "modes" or registrar.at_hand is None:
+        return ("network", "modes")
+    return ("network", "modes", "full")
+
+
+def _registered(registration: Registration, grid: LabelGrid, encoding: float) -> Candidate:
+    labels = label_grid(registration.mesh, *grid.axes())
+    return Candidate(labels, encoding + registration.seconds, registration)
+
+
+@dataclass(frozen=True, eq=False)
+class RegistrationErrors:
+    """Distances of registered material points from where they truly are, scene units.
+
+    Attributes:
+        seen: of those near an observed point.
+        hidden: of all others.
+    """
+
+    seen: Float[np.ndarray, " n"]
+    hidden: Float[np.ndarray, " m"]
+
+    @classmethod
+    def of(
+        cls,
+        registration: Registration,
+        truth: Float[np.ndarray, "m 3"],
+        seen: Bool[np.ndarray, " m"],
+        scene_unit: float,
+    ) -> "RegistrationErrors":
+        """Errors at the material points whose true places are given, the first ones, in the registration's unit.
+
+        ``seen`` says which of these the cloud shows (``coverage.seen_points``).
+        """
+        error = np.linalg.norm(registration.material[: len(truth)] - truth, axis=1) / scene_unit
+        return cls(error[seen], error[~seen])
+
+    @classmethod
+    def together(cls, each: list["RegistrationErrors"]) -> "RegistrationErrors":
+        """Errors of several frames as one set."""
+        nothing = [np.empty(0)]
+        return cls(
+            np.concatenate([*nothing, *(one.seen for one in each)]),
+            np.concatenate([*nothing, *(one.hidden for one in each)]),
+        )
+
+    def summary(self, unit_mm: float | None) -> dict[str, dict[str, float | None]]:
+        """Median and 95 % quantile of the seen and of the hidden points, in scene units, and in mm where known."""
+        return {"seen": _quantiles(self.seen, unit_mm), "hidden": _quantiles(self.hidden, unit_mm)}
+
+
+def _quantiles(errors: Float[np.ndarray, " n"], unit_mm: float | None) -> dict[str, float | None]:
+    if len(errors) == 0:
+        return {"median": None, "p95": None, "median_mm": None, "p95_mm": None}
+    median, p95 = (float(value) for value in np.quantile(errors, [0.5, 0.95]))
+    millimetres = [None if unit_mm is None else value * unit_mm for value in (median, p95)]
+    return {"median": median, "p95": p95, "median_mm": millimetres[0], "p95_mm": millimetres[1]}
+
+
+# --- results of a test set --------------------------------------------------------------------------------------------
+
+# Result of a test set: scores of the answer that a user gets, and of each that could have answered.
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedView:
+    """View with its true and its predicted labels: a row of the paper's figure of reconstructions.
+
+    Attributes:
+        name: label at the left of the row.
+        cloud: what the model was given.
+        reference: true labels; 0 is empty space.
+        predicted: labels by the model, on the same grid.
+        origin: centre of voxel [0, 0, 0] in the cloud's frame; that of [i, j, k] is ``origin + [i, j, k] * spacing``.
+        spacing: distances of the voxels' centres along each axis.
+        colors: colours of the segments; label k has ``colors[k - 1]``.
+    """
+
+    name: str
+    cloud: PointCloud
+    reference: UInt8[np.ndarray, "x y z"]
+    predicted: UInt8[np.ndarray, "x y z"]
+    origin: Float[np.ndarray, "3"]
+    spacing: Float[np.ndarray, "3"]
+    colors: Sequence[Color]
+
+
+@dataclass(frozen=True, eq=False)
+class AnswerScores:
+    """Scores of one of the answers over a test set.
+
+    Attributes:
+        confusion: points by true (row) and predicted (column) label, summed over the set.
+        examples: scores of each test case, in order.
+        seconds: of each, from the cloud to the answer.
+    """
+
+    confusion: Int[np.ndarray, "c c"]
+    examples: tuple[Scores, ...]
+    seconds: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Result of a test set: its confusion matrix, from which its scores come, and the scores of each example.
+
+    Attributes:
+        names: names of the segments.
+        confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
+        examples: scores of each test case by its name.
+        views: the first few with their labels, for pictures.
+        segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
+        answers: the same of each that could have answered; ``confusion`` and ``examples`` are of what a user gets.
+        sources: where that answer came from, in each example: network, modes or draws.
+        known: whether each example was said to show the object, where a registration was asked for.
+        errors: distances of registered points from their true places, where a registration was taken.
+        unit_mm: millimetres per scene unit, where they are known.
+        coverage: distances of the same points over the radii that are told of them.
+        radii_calibrated: whether all of these are.
+        reliability: of the network's probabilities.
+        calibrated: whether these are.
+        seconds: of each example, from the cloud to the answer that a user gets.
+    """
+
+    names: tuple[str, ...]
+    confusion: Int[np.ndarray, "c c"]
+    examples: dict[str, Scores]
+    views: tuple[EvaluatedView, ...] = field(default=())
+    segmented: bool = True
+    answers: dict[AnswerName, AnswerScores] = field(default_factory=dict)
+    sources: tuple[str, ...] = ()
+    known: tuple[Known, ...] = ()
+    errors: RegistrationErrors | None = None
+    unit_mm: float | None = None
+    coverage: RadiusRatios | None = None
+    radii_calibrated: bool = False
+    reliability: Reliability = field(default_factory=Reliability)
+    calibrated: bool = False
+    seconds: tuple[float, ...] = ()
+
+    def __repr__(self) -> str:
+        scores, count = self.scores, counted(len(self.examples), "example")
+        miou = "" if np.isnan(scores.miou) else f", mIoU {scores.miou:.3f}"
+        return f"Evaluation({count}: IoU {scores.iou:.3f}{miou}; {listed(self.names)})"
+
+    @property
+    def scores(self) -> Scores:
+        """Scores over the whole set, from its one confusion matrix."""
+        return intersection_over_union(self.confusion, self.segmented)
+
+    @property
+    def example_mean(self) -> tuple[float, float]:
+        """Mean IoU and mean mIoU over the examples; NaN where no example has a mIoU."""
+        each = self.examples.values()
+        mious = [s.miou for s in each if not np.isnan(s.miou)]
+        return float(np.mean([s.iou for s in each])), float(np.mean(mious)) if mious else float("nan")
+
+
+def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segments: int) -> Int[np.ndarray, "c c"]:
+    """Confusion matrix of the points that count; where the model knows one segment, all true ones are taken as one."""
+    labels = np.minimum(truth.grid.labels[truth.kept], segments)
+    return confusion_matrix(labels, np.minimum(predicted[truth.kept], segments), segments + 1)
+
+
+def labels_on(surfaces: SegmentedMesh, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
+    """Labels of surfaces on a grid in their axes and unit; segments without faces are nowhere."""
+    present = [number for number, segment in enumerate(surfaces.segments) if len(segment.faces)]
+    if not present:
+        return np.zeros_like(grid.labels)
+    labels = label_grid(SegmentedMesh(tuple(surfaces.segments[number] for number in present)), *grid.axes())
+    return np.array([0, *(number + 1 for number in present)], dtype=np.uint8)[labels]
+
+
+@dataclass
+class Tally:
+    """Running sum of the scores of one of the answers."""
+
+    confusion: Int[np.ndarray, "c c"] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int64))
+    examples: list[Scores] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+    def add(self, confusion: Int[np.ndarray, "c c"], seconds: float, segmented: bool) -> None:
+        """Count one more example."""
+        self.confusion = confusion if len(self.examples) == 0 else self.confusion + confusion
+        self.examples.append(intersection_over_union(confusion, segmented))
+        self.seconds.append(seconds)
+
+    @property
+    def scores(self) -> AnswerScores:
+        """Scores of the set."""
+        return AnswerScores(self.confusion, tuple(self.examples), tuple(self.seconds))
+
+
+# --- test cases -------------------------------------------------------------------------------------------------------
 
 PICTURE_MARGIN = 12
 """Cells drawn around the truth's box: what a model puts there does not count, but belongs into a picture of it."""

@@ -11,10 +11,9 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float
 
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import transform_points
 from mereo.io.readers import read_point_cloud
 from mereo_objects import assets

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
+from mereo.evaluation.cases import AnswerScores, Evaluation
 from mereo.evaluation.metrics import Scores, format_score, intersection_over_union
-from mereo.evaluation.results import AnswerScores, Evaluation
 from mereo.evaluation.scoring import CELLS
 from mereo.geometry.conventions import WorkspaceName
 from mereo.io.errors import first_problem, readable

@@ -1,5 +1,6 @@
 """Radii of 95 % of an object's points, as files and pictures take them: at vertices, at any place, on a grid."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -7,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.spatial import cKDTree
 
-from mereo.geometry.color_stops import between_stops
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
 
@@ -91,3 +91,18 @@ def rounded_to(values: Float[np.ndarray, " n"], digits: int) -> Float[np.ndarray
     unit = 10.0 ** (np.floor(np.log10(np.maximum(values, np.finfo(np.float64).tiny))) - digits + 1)
     result: np.ndarray = np.round(values / unit) * unit
     return result
+
+
+# --- color stops ------------------------------------------------------------------------------------------------------
+
+# Colours between stops: the scales by which surfaces and points are coloured, in files as on pages.
+
+
+def between_stops(shares: Float[np.ndarray, " n"], stops: Sequence[Color]) -> Float[np.ndarray, "n 3"]:
+    """Colours (red, green, blue, 0 to 255) of shares, linear between stops at equal distances.
+
+    What lies below 0 or above 1 has the colour of that end; NaN stays NaN.
+    """
+    places = np.clip(shares, 0.0, 1.0) * (len(stops) - 1)
+    columns = np.asarray(stops, dtype=float).T
+    return np.stack([np.interp(places, np.arange(len(stops)), column) for column in columns], axis=1)

@@ -8,39 +8,50 @@ numbers.
 """
 
 import json
+import shlex
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 from mereo.evaluation.calibrate import LEAST_VIEWS, VIEWS, calibrate
+from mereo.evaluation.metrics import format_score
 from mereo.evaluation.scoring import evaluate
 from mereo.evaluation.tables import read_metrics
 from mereo.io.atomic_files import atomic_file, write_json
 from mereo.io.config import CONFIG
 from mereo.io.output_folders import MARKER, claim_directory
+from mereo.io.progress import progress
 from mereo.io.scratch_folders import scratch_folder
 from mereo.learning.example_frame import FRAME, write_example_frame
-from mereo.learning.object_files import SCENE, SEARCH, check, place_of_scene, scene_for
-from mereo.learning.outcome import (
-    advice_after_training,
-    advice_without_training,
-    comparison,
-    repeated_command,
-    show_outcome,
-)
-from mereo.learning.probe import MADE_AS, measure
+from mereo.learning.object_files import SCENE, SEARCH, check, place_of_scene, scene_for, scene_of_folder
 from mereo.learning.schedule import OFFSET_EXAMPLES, Plan, Rates, epochs_for, holdout, plan_for, views_for
-from mereo.learning.search_stage import SEARCH_SHARE, scores_of_views, search_line, search_scores
-from mereo.learning.training_choice import TrainChoice, is_to_train, shortcomings, training_reason
+from mereo.learning.search_stage import (
+    GOOD_ENOUGH,
+    LOWEST,
+    SEARCH_SHARE,
+    TrainChoice,
+    best_method,
+    is_to_train,
+    scores_of_views,
+    search_line,
+    search_scores,
+    shortcomings,
+    training_reason,
+)
 from mereo.models.weights import load_model, with_calibration
 from mereo.models.weights_place import WEIGHTS, find_weights
 from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES
 from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import generate
 from mereo.training.config import PRESETS, TrainConfig
 from mereo.training.trainer import train as train_network
+from mereo.training.trial import STEPS, nearest, small_dataset, timed, trial_steps
 from mereo.visualization.evaluation_files import evaluate_weights
 
 SETTINGS, PLAN = CONFIG, "plan.json"
@@ -255,3 +266,182 @@ def _calibrated(weights: Path, output: Path, scene: str, left_s: float) -> float
 
 def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"
+
+
+# --- speed of this machine --------------------------------------------------------------------------------------------
+
+# Measurements on a few examples before the work is planned: how long they take, and from which weights to start.
+
+MADE_AS = GenerateConfig(sampling=SamplingConfig(uniform_fraction=0.15))
+"""How examples are made: with the share of uniform queries that the schedule was measured with; the paper's is more."""
+
+EXAMPLES = 48
+"""Examples that are measured; they are of the seed of training, and are made again with the others."""
+
+PARALLEL = 0.8
+"""What another process adds: cores share memory and caches."""
+
+
+def measure(scene: str, folder: Path, recipe: TrainConfig, *, init: str, seed: int, workers: int) -> tuple[Rates, str]:
+    """Seconds that examples take, and the weights to start from.
+
+    Args:
+        scene: name or file of what is learnt.
+        folder: in which a small dataset and short runs are made; the caller removes it.
+        recipe: of the training.
+        init: weights to start from; empty compares the shipped ones.
+        seed: of the examples.
+        workers: processes that will make them.
+
+    Raises ``ValueError`` where an example cannot be made, or the weights do not fit the recipe.
+    """
+    started = time.monotonic()
+    with redirect_stdout(StringIO()):  # nobody waits for these few
+        generate(scene, folder / "data", MADE_AS, examples=EXAMPLES, seed=seed, workers=1)
+    # with the template and 100 states, so a little too long
+    generate_s = (time.monotonic() - started) / EXAMPLES / (1 + PARALLEL * (workers - 1))
+    data = small_dataset(folder / "data")
+    with progress("measure", trial_steps(compared=not init), "steps") as shown:
+        found = {} if init else nearest(data, recipe, folder, shown)
+        init = init or next(iter(found))
+        rates = Rates(generate_s, *timed(data, replace(recipe, init=init), folder, shown))
+    if found:
+        told = ", ".join(f"{name} {loss:.2f}" for name, loss in found.items())
+        print(f"loss after {STEPS} steps from the weights of {told}", flush=True)
+    return rates, init
+
+
+# --- outcome ----------------------------------------------------------------------------------------------------------
+
+# The end of learning in words: scores, what to use, whether that will do, and the command for it.
+
+GOOD = 0.7
+"""mIoU (IoU of an object in one piece) below which an answer is not to be relied upon."""
+
+TITLES = {"search": "search alone", "network": "network alone", "both": "both: network first, search where unexplained"}
+
+
+def comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str, Any]:
+    """Content of ``metrics.json`` of an object that was trained: the answers, each with its scores, and the best.
+
+    Args:
+        search: summary of the search alone, on the views of ``test``.
+        test: metrics of the weights.
+    """
+    slowest = next(test[name] for name in ("full", "modes", "network") if name in test)
+    both = {
+        "iou": test["iou"],
+        "miou": test["miou"],
+        "explained": 1 - test["chosen"]["network"],
+        "seconds": test.get("seconds") or slowest["seconds"],  # files of older versions have no seconds of their own
+    }
+    network = {name: test["network"][name] for name in ("iou", "miou", "seconds")}
+    table = {"search": search, "network": network, "both": both}
+    method, reason = best_method(table)
+    best = table["both" if method == "auto" else method]
+    return {
+        "trained": True,
+        "method": method,
+        "reason": reason,
+        "examples": test["examples"],
+        "iou": best["iou"],
+        "miou": best["miou"],
+        **table,
+    }
+
+
+def show_outcome(
+    metrics: Mapping[str, Any], advice: Sequence[str], output: Path, scene: str, frame: str, took_min: float
+) -> None:
+    """Print the scores, which answer to use, the files, and the command that uses them.
+
+    Args:
+        metrics: content of ``metrics.json``.
+        advice: lines on what the scores mean.
+        output: the folder of what was learnt.
+        scene: its name or file.
+        frame: what the example frame is.
+        took_min: minutes of this run of the command.
+    """
+    print(
+        f"\n{metrics['examples']} test views, which training has not seen  {'IoU':>6} {'mIoU':>6} explained  s a frame"
+    )
+    for name, title in TITLES.items():
+        if name in metrics:
+            print(_row(title, metrics[name]))
+    if metrics["trained"]:
+        print(metrics["reason"])
+    for line in advice:
+        print(line)
+    print()
+    if metrics["trained"]:
+        print(f"report   {output / 'test' / 'report.html'}")
+        print(f"weights  {output / WEIGHTS}")
+    print(f"frame    {output / FRAME}: {frame}")
+    print(f"this run took {took_min:.1f} min; to find the object in a frame:\n")
+    print(f"  {command(output, scene, metrics['trained'], metrics['method'])}")
+
+
+def _row(title: str, scores: Mapping[str, Any]) -> str:
+    explained = f"{scores['explained']:.0%}" if "explained" in scores else "-"
+    return f"{title:<45} {format_score(scores['iou'])}  {format_score(scores['miou']):>5} {explained:>9} " + (
+        f"{scores['seconds']:10.2f}"
+    )
+
+
+def command(output: Path, scene: str, is_trained: bool = True, method: str = "auto") -> str:
+    """Command that reconstructs the example frame.
+
+    It names the scene of weights where that is not built in, and the folder of an object without weights.
+    """
+    words = ["mereo", "reconstruct", output / FRAME]
+    if is_trained:
+        words += ["--weights", output / WEIGHTS, *([] if scene in SCENES else ["--scene", scene])]
+    else:
+        words += ["--object", scene if scene_of_folder(output) is None else output]
+    words += [] if method == "auto" or not is_trained else ["--method", method]
+    return shlex.join(map(str, [*words, "--output", output / "result"]))
+
+
+def repeated_command(files: Sequence[Path], output: Path, minutes: float, init: str, units: str | None) -> str:
+    """Command that goes on in the folder with training."""
+    words = ["mereo", "learn", *files, "--output", output]
+    words += [] if minutes == 10 else ["--minutes", f"{minutes:g}"]
+    words += ["--init", init] if init else []
+    words += ["--units", units] if units else []
+    return shlex.join(map(str, [*words, "--train", "always"]))
+
+
+def advice_without_training(reasons: Sequence[str], training: str) -> list[str]:
+    """Why nothing was trained, and what would train it.
+
+    Args:
+        reasons: shortcomings of the search alone.
+        training: command that trains.
+    """
+    if reasons:
+        return [
+            f"nothing is trained, as --train is never; the search alone is not good enough: {', '.join(reasons)}.",
+            f"A network may help: {training}",
+        ]
+    return [
+        "nothing is trained: the search alone is good enough (every view is explained, mIoU is "
+        f"{GOOD_ENOUGH} or more, and {LOWEST} or more in each view).",
+        f"A network may still be faster: {training}",
+    ]
+
+
+def advice_after_training(
+    metrics: Mapping[str, Any], per_segment: Mapping[str, float | None], minutes: float
+) -> list[str]:
+    """What to do about scores that will not do; nothing about others."""
+    score = metrics["iou"] if metrics["miou"] is None else metrics["miou"]
+    if score >= GOOD:
+        return []
+    weakest = min(per_segment, key=lambda name: per_segment[name] or 0.0)
+    return [
+        f"warning: {score:.2f} is too low to rely on (below {GOOD}). What helps, in this order:",
+        f"  look at the report: is one segment lost ({weakest} is the weakest), or the whole object?",
+        f"  more time: the same command with --minutes {3 * minutes:g} and another --output",
+        "  narrower deformations, or a camera that stands where yours will (aperture), in the scene file",
+    ]

@@ -25,7 +25,7 @@ from mereo.io.progress import duration
 from mereo.io.scratch_folders import check_place
 from mereo.io.volume_files import is_volume
 from mereo.learning.learn import learn
-from mereo.learning.training_choice import TrainChoice
+from mereo.learning.search_stage import TrainChoice
 from mereo.scenes.registry import is_yaml
 from mereo.workers.config import Cluster
 from mereo.workers.spread import spread

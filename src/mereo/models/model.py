@@ -4,30 +4,32 @@
 in them. The code of a cloud is computed once and then queried as often as one likes.
 """
 
+import copy
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.downsampling import random_subset
-from mereo.geometry.farthest_point_sampling import farthest_point_order
+from mereo.geometry.downsampling import farthest_point_order, random_subset
 from mereo.geometry.mesh import Color
 from mereo.geometry.normalizer import Normalizer
-from mereo.models.batch_norm_fusion import fold_batch_norm
 from mereo.models.calibration import Calibration
 from mereo.models.config import Precision, Supervision
-from mereo.models.decoder import Prediction
-from mereo.models.device import pick_precision
+from mereo.models.decoder import ConditionedMLP, Prediction
+from mereo.models.device import MOST, in_threads, pick_precision
+from mereo.models.encoders.encoding import SharedMLP
 from mereo.models.network import Network
 from mereo.models.scaled_logits import scaled_logits
-from mereo.models.threads import MOST, in_threads
 from mereo.models.trained import Answer, EncodedCloud, checked_points
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -241,3 +243,54 @@ class Model:
 
         chunks = in_threads(part, range(0, max(len(normalized), 1), size), most)
         return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
+
+
+# --- batch normalization, fused ---------------------------------------------------------------------------------------
+
+# Batch normalization folded into the layers before it: the same function in fewer passes, for inference.
+#
+# In evaluation mode normalization is a scale and a shift per channel, ``norm(W x) = (s W) x + t``. Every linear layer
+# whose output is normalized therefore takes the scale into its weights and the shift into its bias. Rounding apart,
+# nothing changes.
+
+AnyModule = TypeVar("AnyModule", bound=nn.Module)
+
+
+@torch.inference_mode(False)  # a search for codes needs gradients, which tensors of inference mode cannot give
+@torch.no_grad()
+def fold_batch_norm(network: AnyModule) -> AnyModule:
+    """Copy of a network for inference whose decoders and shared layers have no normalization left.
+
+    Its parameters have other names and meanings: it can be neither trained nor saved. Raises ``ValueError`` for a
+    network in training mode, whose normalization depends on the batch.
+    """
+    if network.training:
+        raise ValueError("the network is in training mode; batch normalization can be folded after network.eval() only")
+    folded = copy.deepcopy(network).requires_grad_(False)
+    for module in folded.modules():
+        if isinstance(module, SharedMLP):
+            _fold_shared(module)
+        elif isinstance(module, ConditionedMLP):
+            _fold_conditioned(module)
+    return folded
+
+
+def _fold_shared(mlp: SharedMLP) -> None:
+    layers = list(mlp.layers)
+    for index, (linear, norm) in enumerate(pairwise(mlp.layers)):
+        if isinstance(linear, nn.Linear) and isinstance(norm, nn.BatchNorm1d):
+            layers[index], layers[index + 1] = fuse_linear_bn_eval(linear, norm), nn.Identity()
+    mlp.layers = nn.Sequential(*(layer for layer in layers if not isinstance(layer, nn.Identity)))
+
+
+def _fold_conditioned(mlp: ConditionedMLP) -> None:
+    """Every summand of a layer's input to the normalization is scaled; one of them takes the shift."""
+    for number, norm in enumerate(mlp.norms):
+        assert isinstance(norm, nn.BatchNorm1d)
+        assert norm.running_mean is not None and norm.running_var is not None
+        scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+        for summand in mlp.summands(number):
+            summand.weight = nn.Parameter(summand.weight * scale[:, None], requires_grad=False)
+        takes_shift = mlp.latent1 if number == 0 else mlp.hidden[number - 1]
+        takes_shift.bias = nn.Parameter(norm.bias - norm.running_mean * scale, requires_grad=False)
+    mlp.norms = nn.ModuleList(nn.Identity() for _ in mlp.norms)

@@ -14,9 +14,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mereo.geometry.camera import DepthImage
+from mereo.geometry.camera import DepthImage, into_camera
 from mereo.geometry.downsampling import STEEPEST
-from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.sight_lines import SightLines
 from mereo.geometry.transforms import transform_points
 from mereo.io.sensor_frame import SensorFrame

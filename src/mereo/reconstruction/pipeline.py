@@ -17,11 +17,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
-from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.models.trained import EncodedCloud, Trained, checked_points
 from mereo.reconstruction.coarse_to_fine import Field

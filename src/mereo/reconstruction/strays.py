@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
-from mereo.geometry.scanner_axes import into_camera
 from mereo.geometry.surface_patches import STRETCH, stretch, surface_patches
 from mereo.geometry.transforms import transform_points
 from mereo.reconstruction.isolation import IsolationStep

@@ -21,9 +21,8 @@ from mereo.io.checked_tensors import Tensors, held_against, pack_tensors, read_c
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place
 from mereo.io.places import write_whole
-from mereo.scenes.pair_distances import PairDistances
 from mereo.scenes.source_frame import SourceFrame
-from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.statistical_model import PairDistances, StatisticalModel
 
 LIBRARY_STEP = 1 / 32
 """Step of a coefficient; bytes reach to 4 standard deviations, which one normal number in 16,000 exceeds."""

@@ -22,8 +22,7 @@ from mereo.geometry.solids import Solids
 from mereo.io.sensor_frame import SensorFrame
 from mereo.synthesis.clutter import OBJECT, Backdrop, Capsule, Screen, Surroundings, farthest, sample_occluder
 from mereo.synthesis.config import GenerateConfig, Occluder
-from mereo.synthesis.depth_rendering import render_depth
-from mereo.synthesis.depth_sensor import observe
+from mereo.synthesis.depth_sensor import observe, render_depth
 from mereo.synthesis.examples import View
 
 Cut = Literal["none", "screen", "picture", "tool", "hand"]

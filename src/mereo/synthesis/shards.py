@@ -7,7 +7,7 @@ examples, p stored points, q queries):
     cloud f32 [e, p, 3], cloud_count i32 [e], center f64 [e, 3], scale f64 [e],
     positions f32 [e, q, 3], labels u8 [e, q], distances f32 [e, q], directions f16 [e, q, 3], rest f16 [e, q, 3]
 
-with further observations (``synthesis.observations``), of which each has k,
+with further observations (``synthesis.examples``), of which each has k,
 
     seen f16 [e, k, p, 3], seen_count i32 [e, k]
 
@@ -48,8 +48,7 @@ from mereo.scenes.statistical_model_file import statistical_model_bytes
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
 from mereo.synthesis.dataset_contents import FILES, DatasetContents, shard_name
 from mereo.synthesis.dataset_files import MANIFEST, check_space, dataset_key
-from mereo.synthesis.examples import Example, synthesize
-from mereo.synthesis.observations import Clouds
+from mereo.synthesis.examples import Clouds, Example, synthesize
 from mereo.workers.config import Cluster
 from mereo.workers.spread import spread
 

@@ -5,9 +5,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mereo.evaluation.results import Evaluation
-from mereo.evaluation.scan_scoring import evaluate_scans
-from mereo.evaluation.scoring import CELLS, evaluate, trained_scene
+from mereo.evaluation.cases import Evaluation
+from mereo.evaluation.scoring import CELLS, evaluate, evaluate_scans, trained_scene
 from mereo.evaluation.tables import markdown_table, metrics
 from mereo.fitting.config import AnswerMethod
 from mereo.io.atomic_files import write_json

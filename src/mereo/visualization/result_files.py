@@ -11,11 +11,10 @@ from mereo.fitting.registration.carry import Carried
 from mereo.fitting.registration.register import describe
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.registration.state import write_state
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import PointCloud, camera_axes
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
-from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.transforms import transform_points
 from mereo.io.attachments import write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig

@@ -4,10 +4,9 @@ import numpy as np
 
 from mereo.evaluation.registration.placement import Placement
 from mereo.evaluation.registration.truth_file import ScanFile
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import PointCloud, camera_axes
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.scanner_axes import camera_axes
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
 from mereo.visualization.contact_sheets import Picture, contact_sheet, legend

@@ -13,9 +13,8 @@ from scipy.spatial import cKDTree
 
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty.uncertainty import Explanation
-from mereo.geometry.color_stops import between_stops
 from mereo.geometry.mesh import Color, Segment
-from mereo.geometry.radii import STOPS, Radii, level_told
+from mereo.geometry.radii import STOPS, Radii, between_stops, level_told
 from mereo.visualization.units import Unit, rounded
 
 UNEXPLAINED = 255

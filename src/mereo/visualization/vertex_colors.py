@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
-from mereo.geometry.color_stops import between_stops
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
-from mereo.geometry.radii import STOPS, Radii, level_told
+from mereo.geometry.radii import STOPS, Radii, between_stops, level_told
 from mereo.geometry.solids import Solids
 from mereo.models.trained import Answer
 from mereo.visualization.error_maps import OVER, UNDER

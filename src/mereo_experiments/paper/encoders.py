@@ -1,6 +1,6 @@
 """Lizard and Human by each encoder, in a picture (paper, section 4.4, figure of encoders)."""
 
-from mereo.evaluation.results import EvaluatedView
+from mereo.evaluation.cases import EvaluatedView
 from mereo.models.config import Loss
 from mereo.synthesis.config import GenerateConfig
 from mereo_experiments.paper.encoders_losses import ENCODERS, OWN_RECIPE, lacks, recipe

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mereo.evaluation.results import EvaluatedView
+from mereo.evaluation.cases import EvaluatedView
 from mereo.geometry.camera import PointCloud
 from mereo.synthesis.config import GenerateConfig
 from mereo.training.config import TrainConfig

@@ -1,6 +1,6 @@
 """Reconstruction and segmentation of every object (paper, section 4.2 and appendix A)."""
 
-from mereo.evaluation.results import EvaluatedView
+from mereo.evaluation.cases import EvaluatedView
 from mereo.synthesis.config import GenerateConfig
 from mereo_experiments.paper.result import Claim, Result, Row, published
 from mereo_experiments.paper.scales import ExperimentScale

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from mereo.evaluation.cases import EvaluatedView
 from mereo.evaluation.metrics import format_score
-from mereo.evaluation.results import EvaluatedView
 from mereo.io.atomic_files import atomic_file, write_json
 from mereo.io.output_folders import new_directory
 from mereo.io.plots import pyplot

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mereo.evaluation.results import EvaluatedView
+from mereo.evaluation.cases import EvaluatedView
 from mereo.synthesis.config import GenerateConfig, Sampler, SamplingConfig
 from mereo_experiments.paper.result import Claim, Result, Row, better, compare, published
 from mereo_experiments.paper.sampling_figure import draw_figure

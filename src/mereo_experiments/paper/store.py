@@ -11,9 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mereo.evaluation.results import EvaluatedView
-from mereo.evaluation.scan_scoring import evaluate_scans
-from mereo.evaluation.scoring import evaluate
+from mereo.evaluation.cases import EvaluatedView
+from mereo.evaluation.scoring import evaluate, evaluate_scans
 from mereo.evaluation.tables import read_metrics
 from mereo.fitting.config import AnswerMethod
 from mereo.io.atomic_files import write_json

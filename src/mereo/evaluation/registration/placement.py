@@ -5,20 +5,39 @@ shows is not moved by what little there is: it keeps its own start where it was 
 relative to the nearest segment that is seen.
 """
 
+import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from mereo.evaluation.registration.icp import SEGMENT_LIMITS, WHOLE_LIMITS, Registration, Scan, match, register
-from mereo.evaluation.registration.visible_surface import CONTACT, Poses, diagonal, exposed, facing, moved
-from mereo.geometry.conventions import CloudAxes
+from mereo.evaluation.registration.icp import (
+    CONTACT,
+    SEGMENT_LIMITS,
+    WHOLE_LIMITS,
+    Poses,
+    Registration,
+    Scan,
+    diagonal,
+    exposed,
+    facing,
+    match,
+    moved,
+    register,
+)
+from mereo.geometry.camera import into_camera
+from mereo.geometry.conventions import LARGEST, CloudAxes
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import fit_rigid, inverse_rigid, rigid, transform_points
+from mereo.io.errors import readable
+from mereo.models.model import Model
+from mereo.scenes.rest_pose import rest_frame
 
 FAR = 1000.0
 """Distance of a scanner where the scan does not say it, in diagonals of the object."""
@@ -236,3 +255,231 @@ def _measured(
         )
     explained = float((matches.owner >= 0).mean())
     return Placement(tuple(segments), moved(rest, found.poses), matches.limit, explained)
+
+
+# --- initial poses ----------------------------------------------------------------------------------------------------
+
+# Rough starts for ``mereo align``, from a JSON file with poses or picked point pairs, or from trained weights.
+#
+#     {"object": {"model": [[x, y, z], ...], "scan": [[x, y, z], ...]},
+#      "segments": {"tail": [[r, r, r, t], [r, r, r, t], [r, r, r, t], [0, 0, 0, 1]]}}
+#
+# ``object`` and each of ``segments`` is either a 4 x 4 matrix from model to scan coordinates, or pairs: at least three
+# points of the model and the same points in the scan. Model coordinates are those of the scene at rest, as
+# ``mereo scene export`` writes it; scan coordinates those of the scan's file.
+
+LEAST_PAIRS = 3
+"""Pairs of points at least; two leave a turn about their line."""
+
+LEAST_GUESSES = 30
+"""Least number of points that a network must give to a segment for a start of its own."""
+
+SCALE_ERROR = 0.25
+"""Share by which a start's scale may differ from the known one; beyond, the unit is another, not picking inaccurate."""
+
+MIRROR_ERROR = 0.2
+"""Share of the largest residual below which pairs may be mirrored or not: nearly flat, they do not tell."""
+
+PAIR_ERROR = 0.1
+"""Largest RMS distance of pairs after the best fit, in diagonals of the object."""
+
+
+def read_start(path: str | Path, rest: SegmentedMesh, scale: float | None = None) -> Start:
+    """Rough poses from a start file; segments that it does not name share the object's.
+
+    Args:
+        path: the JSON file.
+        rest: the object at rest, scene units.
+        scale: scan units per scene unit, where known; otherwise the file's matrices must say it.
+
+    Raises ``FileNotFoundError`` or ``ValueError`` naming the entry and what is wrong with it.
+    """
+    path = Path(path)
+    with readable(path, "start file"):
+        stated = json.loads(path.read_text(encoding="utf-8-sig"))
+        if not isinstance(stated, dict) or not {"object", "segments"} & set(stated):
+            raise ValueError('it has neither "object" nor "segments"')
+    if odd := sorted(set(stated) - {"object", "segments"}):
+        raise ValueError(f'{path} has the key {odd[0]!r}; it may have "object" and "segments": correct it')
+    segments = stated.get("segments", {})
+    if not isinstance(segments, dict):
+        raise ValueError(f'"segments" of {path} is not an object; it maps names to poses: see docs/own-object.md')
+    if unknown := sorted(set(segments) - set(rest.names)):
+        raise ValueError(
+            f"{path} gives a start of the segment {unknown[0]!r}; the segments are {', '.join(rest.names)}: correct "
+            "the name"
+        )
+    poses = {name: _stated(path, entry, f"segment {name!r}", rest, scale) for name, entry in segments.items()}
+    if "object" in stated:
+        common = _stated(path, stated["object"], "the object", rest, scale)
+    elif missing := [name for name in rest.names if name not in poses]:
+        raise ValueError(
+            f'{path} has no start for the segment {missing[0]!r} and none of the object; add it, or add "object", '
+            "from which segments without a start of their own begin"
+        )
+    else:
+        common = next(iter(poses.values()))
+    return Start(
+        np.stack([poses.get(name, common) for name in rest.names]),
+        np.array([name in poses for name in rest.names]),
+        "; ".join([*(["object"] if "object" in stated else []), *poses]) + f" from {path.name}",
+    )
+
+
+def _stated(path: Path, *entry: Any) -> Float[np.ndarray, "4 4"]:
+    """Pose of an entry; ``ValueError`` names the file before what is wrong with it."""
+    try:
+        with np.errstate(all="ignore"):
+            return _pose(*entry)
+    except ValueError as error:  # numpy's LinAlgError too
+        raise ValueError(f"{path} cannot be used: {error}") from None
+
+
+def _pose(entry: Any, of: str, rest: SegmentedMesh, scale: float | None) -> Float[np.ndarray, "4 4"]:
+    if isinstance(entry, dict):
+        if set(entry) != {"model", "scan"}:
+            raise ValueError(
+                f'the start of {of} has the keys {", ".join(map(repr, entry)) or "none"}; pairs are "model" and '
+                '"scan", two lists of points: correct them'
+            )
+        model, scan = (_numbers(entry[key], (-1, 3), f"{key} of the start of {of}") for key in ("model", "scan"))
+        return pose_of_pairs(model, scan, of, scale, PAIR_ERROR * diagonal(rest))
+    return _checked(_numbers(entry, (4, 4), f"the start of {of}"), of, scale, rest)
+
+
+def _numbers(value: Any, shape: tuple[int, int], what: str) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (ValueError, TypeError):
+        array = np.zeros(0)
+    fits = array.ndim == 2 and array.shape[1] == shape[1] and shape[0] in (-1, len(array))
+    if not (fits and (np.abs(array) <= LARGEST).all()):
+        rows = "4 rows of 4" if shape == (4, 4) else "rows of 3"
+        raise ValueError(f"{what} must be {rows} finite numbers up to {LARGEST:g}: correct the start file")
+    return array
+
+
+def _checked(
+    pose: Float[np.ndarray, "4 4"], of: str, scale: float | None, rest: SegmentedMesh
+) -> Float[np.ndarray, "4 4"]:
+    """A similarity without reflection, of the known scale."""
+    found = scale_of(pose)
+    if not np.allclose(pose[3], [0, 0, 0, 1]):
+        raise ValueError(
+            f"the start of {of} has the last row {pose[3].tolist()}; it must be 0 0 0 1: is it transposed?"
+        )
+    if found < 0:
+        raise ValueError(
+            f"the start of {of} is a reflection (its determinant is negative); it must turn, scale and shift only: "
+            "align again without mirroring"
+        )
+    if found == 0 or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, found**2 * np.eye(3), atol=0.01 * found**2):
+        raise ValueError(
+            f"the start of {of} shears or stretches; it must be a rotation times one scale: align again without"
+        )
+    rotation = Rotation.from_matrix(pose[:3, :3] / found).as_matrix()
+    if scale is None:
+        return rigid(found * rotation, pose[:3, 3])
+    check_scale(found, scale, of)
+    middle = rest.bounds.mean(axis=0)  # stays where the start puts it
+    return rigid(scale * rotation, pose[:3, :3] @ middle + pose[:3, 3] - scale * rotation @ middle)
+
+
+def pose_of_pairs(
+    model: Float[np.ndarray, "n 3"],
+    scan: Float[np.ndarray, "m 3"],
+    of: str,
+    scale: float | None,
+    tolerance: float,
+) -> Float[np.ndarray, "4 4"]:
+    """Similarity of known scale that takes points of the model to those of the scan best (Kabsch, 1976).
+
+    Args:
+        model: points of the object at rest, scene units.
+        scan: the same points in the scan.
+        of: what the pairs are of, for messages.
+        scale: scan units per scene unit; None where it is not known, which is an error.
+        tolerance: largest RMS distance after the fit, scene units.
+
+    Raises ``ValueError`` for fewer than three pairs, points on a line, an unknown or another scale, mirrored pairs, or
+    a residual above ``tolerance``.
+    """
+    if len(model) != len(scan) or len(model) < LEAST_PAIRS:
+        raise ValueError(
+            f"the start of {of} has {len(model)} points of the model and {len(scan)} of the scan; at least "
+            f"{LEAST_PAIRS} pairs are needed: pick more"
+        )
+    source, target = model - model.mean(axis=0), scan - scan.mean(axis=0)
+    spread = np.linalg.svd(source, compute_uv=False)
+    if not spread[1] > 0.05 * spread[0]:
+        raise ValueError(f"the points of the start of {of} lie on a line; they must span a triangle: pick another")
+    rotation = fit_rigid(source, target)[:3, :3]
+    found = float(np.sum(target * (source @ rotation.T)) / np.sum(source**2))
+    if scale is None:
+        raise ValueError(
+            f"the size of the object is not known, and pairs are too rough to measure it (those of {of} say about "
+            f"{found:.4g} scan units per scene unit): give the scene's unit with --scene-unit-mm"
+        )
+    check_scale(found, scale, of)
+    error, mirrored = (misfit(scale * source * hand, target) for hand in ([1, 1, 1], [-1, 1, 1]))
+    if error > MIRROR_ERROR * tolerance * scale and mirrored < error / 2:
+        raise ValueError(
+            f"the pairs of {of} fit a mirror image better ({mirrored:.3g} apart instead of {error:.3g}); poses do not "
+            "mirror: check that left and right are not exchanged, and the axes of both files"
+        )
+    if error > tolerance * scale:
+        raise ValueError(
+            f"the pairs of {of} are {error:.3g} apart (RMS) after the best fit; at most {tolerance * scale:.3g} makes "
+            "a start: check that both lists are in the same order"
+        )
+    return rigid(scale * rotation, scan.mean(axis=0) - scale * rotation @ model.mean(axis=0))
+
+
+def misfit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> float:
+    """RMS distance of pairs of points after the best rigid motion."""
+    moved = transform_points(fit_rigid(source, target), source)
+    return float(np.sqrt(np.mean(np.sum((target - moved) ** 2, axis=1))))
+
+
+def start_from_model(
+    model: Model, points: Float[np.ndarray, "n 3"], frame: CloudAxes, rest: SegmentedMesh, scale: float | None
+) -> Start:
+    """Rough poses from a trained network: where it believes the seen points were at rest, fitted segment by segment.
+
+    A segment with fewer than ``LEAST_GUESSES`` points shares the object's pose. Raises ``ValueError`` for another
+    object's model, one without rest coordinates, and an unknown scale.
+    """
+    if model.names != rest.names:
+        raise ValueError(
+            f"the weights know the segments {', '.join(model.names)}, the scene has {', '.join(rest.names)}; they must "
+            "be the same in the same order: use the weights of this object"
+        )
+    T_camera_scan = into_camera(points, frame)
+    code = model.encode(transform_points(T_camera_scan, points))
+    guessed = model.rest(code, code.cloud)
+    if guessed is None or not model.segmented:
+        raise ValueError(
+            "the weights do not predict rest coordinates of segments, from which a start is made; train with the "
+            "preset base, or give --start FILE"
+        )
+    center, half = rest_frame(rest)
+    source, seen = guessed * half + center, transform_points(inverse_rigid(T_camera_scan), code.cloud)
+    tolerance = 2 * PAIR_ERROR * diagonal(rest)
+    common = pose_of_pairs(source, seen, "the object by its weights", scale, tolerance)
+    label = model.logits(code, code.cloud)[:, 1:].argmax(axis=1)
+    poses, own = [], []
+    for index, name in enumerate(rest.names):
+        mine = label == index
+        own.append(bool(mine.sum() >= LEAST_GUESSES))
+        pairs = (source[mine], seen[mine]) if own[-1] else None
+        poses.append(common if pairs is None else pose_of_pairs(*pairs, f"segment {name!r}", scale, tolerance))
+    return Start(np.stack(poses), np.array(own), "weights: not independent of the network")
+
+
+def check_scale(found: float, scale: float, of: str) -> None:
+    """Raise ``ValueError`` unless the start's scale is about the known one."""
+    if not 1 - SCALE_ERROR < found / scale < 1 + SCALE_ERROR:
+        raise ValueError(
+            f"the start of {of} has {found:.4g} scan units per scene unit, but the units of scene and scan give "
+            f"{scale:.4g}; they must agree: check --unit, --scene-unit-mm and the coordinates"
+        )

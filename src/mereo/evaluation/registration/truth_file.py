@@ -9,8 +9,8 @@ from typing import Any, get_args
 
 import numpy as np
 
+from mereo.evaluation.registration.icp import diagonal, moved
 from mereo.evaluation.registration.placement import Placement
-from mereo.evaluation.registration.visible_surface import diagonal, moved
 from mereo.evaluation.scans import PosedScan
 from mereo.geometry.conventions import LARGEST, UNITS_M, CloudAxes
 from mereo.geometry.mesh import SegmentedMesh

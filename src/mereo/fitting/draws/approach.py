@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
-from mereo.geometry.procrustes import best_rotations
+from mereo.geometry.transforms import best_rotations
 
 ROBUST = 2.5
 """Points farther off than this many standard deviations count for little."""

@@ -26,8 +26,7 @@ from mereo.fitting.problem.own_turns import OwnTurn, own_turns
 from mereo.fitting.problem.residuals import robust_square
 from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder
-from mereo.scenes.given_draws import played_back
-from mereo.scenes.parameters import play
+from mereo.scenes.parameters import play, played_back
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 

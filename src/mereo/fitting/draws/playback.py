@@ -15,7 +15,7 @@ from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
 from mereo.deformation.moving_least_squares import Anchors, PointWeights, spread
-from mereo.geometry.procrustes import best_rotations
+from mereo.geometry.transforms import best_rotations
 from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder, Shares
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import state_points

@@ -23,9 +23,8 @@ from mereo.fitting.problem.priors import Prior
 from mereo.fitting.problem.problem import UNEXPLAINED, Misfit, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Surface
 from mereo.geometry.downsampling import means_along_sight
-from mereo.geometry.procrustes import best_rotations, robust_rigid
-from mereo.geometry.smoothing import smoothed
-from mereo.geometry.transforms import fit_rigid, rotation_along
+from mereo.geometry.surface_patches import smoothed
+from mereo.geometry.transforms import best_rotations, fit_rigid, robust_rigid, rotation_along
 
 
 def fit_modes(problem: Problem) -> "Judged":

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.geometry.procrustes import best_rotations
+from mereo.geometry.transforms import best_rotations
 from mereo.scenes.statistical_model import StatisticalModel
 
 CORNERS = 12

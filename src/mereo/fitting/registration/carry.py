@@ -16,10 +16,9 @@ from scipy.ndimage import map_coordinates
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.procrustes import best_rotations
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.subdivision import split_long_edges
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import best_rotations, transform_points
 from mereo.io.attachments import Attachment, Content, Placeable, Surfaces
 from mereo.io.config import CarryFrame
 from mereo.io.volume_files import Volume, is_labels

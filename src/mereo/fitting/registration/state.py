@@ -26,8 +26,7 @@ from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import fit_rigid, inverse_rigid, transform_points
 from mereo.io.atomic_files import write_json
 from mereo.scenes.draw_recorder import SMOOTH
-from mereo.scenes.given_draws import draw_names, played_back
-from mereo.scenes.parameters import Played
+from mereo.scenes.parameters import Played, draw_names, played_back
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.statistical_model import StatisticalModel

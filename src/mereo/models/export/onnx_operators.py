@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mereo.models.ops.svd import svd3
+from mereo.models.rigid_alignment import svd3
 
 
 def trilinear(volume: Tensor, grid: Tensor, interpolation_mode: int, padding_mode: int, align_corners: bool) -> Tensor:

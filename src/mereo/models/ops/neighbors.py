@@ -1,6 +1,6 @@
 """Ball query and nearest neighbours on batched point sets, in plain PyTorch: no compiled extension.
 
-Points arrive in farthest-point order (``mereo.geometry.farthest_point_sampling``). The greedy order makes the first m
+Points arrive in farthest-point order (``mereo.geometry.downsampling``). The greedy order makes the first m
 points exactly the farthest-point sample of size m, so the centres of every set-abstraction level are a prefix and cost
 nothing, and "the first K neighbours in order" are a well-spread subset of a crowded ball.
 """

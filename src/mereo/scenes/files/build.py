@@ -5,27 +5,31 @@ Document -validated-> SceneFile -read_segments-> SegmentedMesh in the file's uni
 
 import hashlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from manifold3d import Manifold, OpType
 
+from mereo.deformation.maps import Deformation
 from mereo.deformation.samplers import RandomMotion
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.manifold import mesh_of, solid_of
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.mesh_check import examine
 from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.subdivision import TooManyFaces, split_edges
+from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.defaults import default_deformations
 from mereo.scenes.files.deformation_blocks import AnyDeformation, Misfit, Target
-from mereo.scenes.files.refinement import refined
-from mereo.scenes.files.schema import CameraBlock, SceneFile
-from mereo.scenes.files.segments import read_segments
+from mereo.scenes.files.schema import CameraBlock, FilePart, ModelPart, PartLook, SceneFile
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import SCENES, Scene, Workspace
+from mereo.scenes.seeds import example_rng
 
 ELSEWHERE = {"source", "segments", "model", "parts", "labels", "names", "cells"}
 """Keys that decide the meshes, which identify themselves, or nothing."""
@@ -197,3 +201,170 @@ def _members(document: Document, rest: SegmentedMesh, index: int, block: AnyDefo
             place = ("deformations", index, "segments")
             raise document.error(place, f"no segment is called {name!r}: {similar(name, names)}")
     return tuple(i for i, name in enumerate(names) if block.segments is None or name in block.segments)
+
+
+# --- segments ---------------------------------------------------------------------------------------------------------
+
+# The segments that a scene file names, in its own unit and frame: mesh files, parts of a model, or a label volume.
+
+
+def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
+    """Segments of a scene file as they are in its meshes, unchecked and unscaled.
+
+    Raises ``ValueError`` and ``FileNotFoundError`` with the line that names what cannot be had, ``ImportError`` naming
+    the extra that a format needs.
+    """
+    folder = document.path.parent
+    if file.segments is not None:
+        return _assembled(document, "segments", file.segments, _from_files(document, file.segments))
+    if file.model is not None:
+        model = _read(document, ("model",), folder / file.model)
+        if file.parts is None:
+            return model
+        return _assembled(document, "parts", file.parts, _from_model(document, file.parts, model))
+    from mereo.io.label_volumes import read_label_volume, segment_surfaces
+
+    assert file.labels is not None and file.names is not None, "the schema asks for both"
+    with document.named_at(("labels",)):
+        return segment_surfaces(read_label_volume(folder / file.labels), file.names, file.cells)
+
+
+def _read(document: Document, place: Sequence[int | str], path: Path) -> SegmentedMesh:
+    """A mesh file; errors say which line names it."""
+    with document.named_at(place):
+        return read_segmented_mesh(path)
+
+
+def _from_files(document: Document, parts: Sequence[FilePart]) -> list[Segment]:
+    folder = document.path.parent
+    return [
+        _joined(part, _read(document, ("segments", index, "file"), folder / part.file).segments)
+        for index, part in enumerate(parts)
+    ]
+
+
+def _from_model(document: Document, parts: Sequence[ModelPart], model: SegmentedMesh) -> list[Segment]:
+    segments = []
+    for index, part in enumerate(parts):
+        wanted = part.parts or [part.name]
+        if missing := [name for name in wanted if name not in model.names]:
+            raise document.error(
+                ("parts", index), f"the model has no part {missing[0]!r}: {similar(missing[0], list(model.names))}"
+            )
+        segments.append(_joined(part, [model.segments[model.names.index(name)] for name in wanted]))
+    return segments
+
+
+def _joined(part: PartLook, pieces: Sequence[Segment]) -> Segment:
+    """One segment of all pieces: their union where each is a solid, else all of their faces."""
+    if len(pieces) == 1:
+        return Segment(part.name, pieces[0].color, pieces[0].vertices, pieces[0].faces)
+    try:
+        solids = [solid_of(piece.vertices, piece.faces) for piece in pieces]
+        vertices, faces = mesh_of(Manifold.batch_boolean(solids, OpType.Add))
+    except ValueError:
+        vertices, faces, _ = SegmentedMesh(tuple(pieces)).merged()
+    return Segment(part.name, pieces[0].color, vertices, faces)
+
+
+def _assembled(document: Document, key: str, parts: Sequence[PartLook], segments: Sequence[Segment]) -> SegmentedMesh:
+    """The segments with the file's colours and nesting."""
+    names = [part.name for part in parts]
+    for index, part in enumerate(parts):
+        if part.nested_in is not None and part.nested_in not in names:
+            raise document.error(
+                (key, index, "nested_in"), f"no segment is called {part.nested_in!r}: {similar(part.nested_in, names)}"
+            )
+    nested = tuple((part.name, part.nested_in) for part in parts if part.nested_in is not None)
+    try:
+        return SegmentedMesh(tuple(_colored(segments, parts)), nested)
+    except ValueError as error:
+        raise document.error((key,), str(error)) from None
+
+
+def _colored(segments: Sequence[Segment], parts: Sequence[PartLook]) -> list[Segment]:
+    """The file's colours; without one the mesh's own, where they tell the segments apart, or the palette's."""
+    own = [segment.color for segment in segments]
+    fallback = own if len(set(own)) == len(own) else [PALETTE[i % len(PALETTE)] for i in range(len(own))]
+    return [
+        Segment(segment.name, part.color or color, segment.vertices, segment.faces)
+        for segment, part, color in zip(segments, parts, fallback, strict=True)
+    ]
+
+
+# --- refinement -------------------------------------------------------------------------------------------------------
+
+# Faces small enough to bend: CAD programs write one long triangle where a surface is flat, and maps bend it.
+
+TOLERANCE = 0.05
+"""How far, in scene units, a straight edge may leave the curve that the map makes of it: half of the noise."""
+
+SHORTEST = 1.0
+"""Edges up to this long, in scene units, are not halved: they follow any bend down to a radius of 2.5."""
+
+STATES = 8
+"""Random states in which every edge is compared with its curve."""
+
+MOST_FACES = 20_000
+"""Faces of all segments that refinement may lead to; beyond it the tolerance doubles."""
+
+PLACES = ((0.5, 0.5), (0.25, 0.75), (0.75, 0.25))
+"""Shares of an edge's two ends at which it is compared, symmetric, so that neighbours split a shared edge alike."""
+
+Ends = Float[np.ndarray, "e 2 3"]
+
+
+def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Deformation, ...]]) -> SegmentedMesh:
+    """Mesh with all edges halved that ``draw``'s maps bend away from a straight line; itself where none is.
+
+    An edge is halved where in one of ``STATES`` random states the map of a place on it is farther than ``TOLERANCE``
+    from the straight line between the maps of its ends. Affine maps, as those of joints, split nothing. Segments that
+    share a map and an edge split it alike; where they touch without sharing edges they part or meet by at most twice
+    the tolerance.
+
+    Args:
+        rest: segments in scene units.
+        draw: one map for each segment.
+    """
+    states = [draw(example_rng(0, index)) for index in range(STATES)]
+    tolerance = TOLERANCE
+    most = max(MOST_FACES, 2 * sum(len(segment.faces) for segment in rest.segments))
+    while True:
+        try:
+            return _refined_surface(rest, states, tolerance, most)
+        except TooManyFaces:
+            tolerance *= 2
+
+
+def _refined_surface(
+    rest: SegmentedMesh, states: list[tuple[Deformation, ...]], tolerance: float, most: int
+) -> SegmentedMesh:
+    segments = []
+    for index, segment in enumerate(rest.segments):
+        maps = [state[index] for state in states]
+
+        def bent(ends: Ends, maps: list[Deformation] = maps) -> Bool[np.ndarray, " e"]:
+            return _bent(ends, maps, tolerance)
+
+        vertices, faces = split_edges(segment.vertices, segment.faces, bent, most)
+        most -= len(faces)
+        segments.append(
+            segment if len(faces) == len(segment.faces) else replace(segment, vertices=vertices, faces=faces)
+        )
+    return replace(rest, segments=tuple(segments))
+
+
+def _bent(ends: Ends, maps: list[Deformation], tolerance: float) -> Bool[np.ndarray, " e"]:
+    """Which edges some map makes a curve of that is farther than ``tolerance`` from its chord."""
+    result = np.zeros(len(ends), dtype=bool)
+    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > SHORTEST
+    for deform in maps:
+        rows = np.flatnonzero(long & ~result)
+        if len(rows) == 0:
+            break
+        a, b = ends[rows, 0], ends[rows, 1]
+        moved = deform(np.concatenate([a, b, *(s * a + t * b for s, t in PLACES)])).reshape(2 + len(PLACES), -1, 3)
+        for (s, t), place in zip(PLACES, moved[2:], strict=True):
+            away = np.linalg.norm(place - (s * moved[0] + t * moved[1]), axis=1)
+            result[rows] |= away > tolerance
+    return result

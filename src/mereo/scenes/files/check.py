@@ -1,25 +1,32 @@
 """``mereo scene check``: what a user should know of a scene's meshes before spending hours of training, and repairs."""
 
+import re
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
+import yaml
 
+from mereo.deformation.samplers import JointSampler, RandomMotion
+from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, examine, likely_unit
 from mereo.geometry.mesh_repair import repaired, without_overlaps
-from mereo.geometry.overlap import grid_volume, overlaps
+from mereo.geometry.overlap import Overlap, grid_volume, overlaps
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.scratch_folders import remove_abandoned
 from mereo.io.yaml_document import Document
-from mereo.scenes.files.build import build, read
-from mereo.scenes.files.check_states import report_states
-from mereo.scenes.files.rewrite import with_segment_files
-from mereo.scenes.files.segments import read_segments
+from mereo.scenes.files.build import build, read, read_segments
+from mereo.scenes.files.defaults import motion
 from mereo.scenes.registry import is_yaml, load_scene
-from mereo.scenes.scene import SCENES
+from mereo.scenes.scene import SCENES, Scene, Workspace
+from mereo.scenes.seeds import example_rng
 
 
 def check_scene(name: str, repair: bool = False) -> None:
@@ -171,3 +178,170 @@ def _ply(mesh: SegmentedMesh, name: str) -> bytes:
 def _holds(place: Path, content: bytes) -> bool:
     remove_abandoned(place)
     return place.is_file() and not place.is_symlink() and place.read_bytes() == content
+
+
+# --- repaired files ---------------------------------------------------------------------------------------------------
+
+# A scene file written anew with other meshes; its comments stay in the user's own file, which nobody changes.
+
+SOURCES = ("segments", "model", "parts", "labels", "names", "cells")
+"""Keys that say where the segments come from."""
+
+HEADER = """\
+# {name} with repaired meshes, written by `mereo scene check {name} --repair`.
+# Everything else says the same as there; the comments are there too.
+"""
+
+
+def with_segment_files(document: Document, mesh: SegmentedMesh, changed: Collection[str]) -> tuple[str, dict[str, str]]:
+    """Text of a scene file that says what ``document`` says with new files for changed segments, and their names.
+
+    Where the segments were parts of a model or labels of a volume, all get a file of their own: one scene file takes
+    its segments from one kind of source.
+
+    Args:
+        document: a valid scene file.
+        mesh: its segments, in the order of the file.
+        changed: names of the segments that need a new file.
+
+    Returns:
+        The text, and for each segment with a new file that file's name.
+    """
+    if "segments" in document.data:
+        files = {name: repaired_name(name) for name in changed}
+        segments = [{**block, "file": files.get(block["name"], block["file"])} for block in document.data["segments"]]
+    else:
+        files = {name: repaired_name(name) for name in mesh.names}
+        segments = _segment_blocks(mesh, files)
+    first = next(key for key in document.data if key in SOURCES)
+    data: dict[str, Any] = {}
+    for key, value in document.data.items():
+        if key == first:
+            data["segments"] = segments
+        elif key not in SOURCES:
+            data[key] = value
+    body = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    return HEADER.format(name=document.path.name) + body, files
+
+
+def repaired_name(segment: str) -> str:
+    """Name of the file of a repaired segment."""
+    return re.sub(r"[^\w.-]+", "_", segment) + "-repaired.ply"
+
+
+def _segment_blocks(mesh: SegmentedMesh, files: dict[str, str]) -> list[dict[str, Any]]:
+    outer = dict(mesh.nested)
+    return [
+        {"name": segment.name, "file": files[segment.name], "color": list(segment.color)}
+        | ({"nested_in": outer[segment.name]} if segment.name in outer else {})
+        for segment in mesh.segments
+    ]
+
+
+# --- states -----------------------------------------------------------------------------------------------------------
+
+# What ``mereo scene check`` says of random states: how far they move, how they are seen, and what runs into what.
+
+STATES = 12
+"""Random states in which segments are tested for overlap, and for being in view."""
+
+STATE_TOLERANCE = 0.02
+"""Share of a segment that another one may overlap in a random state."""
+
+WIDTH = 96
+"""Of the depth image in pixels, the default of ``synthesis.config.GenerateConfig``."""
+
+NARROWED = (0.75, 0.5, 0.25, 0.1)
+"""Shares of a joint's ranges that are tried where it turns segments into each other."""
+
+
+def report_states(scene: Scene) -> int:
+    """Print how far random states move, how they are seen, and each overlap with its cause; returns their number."""
+    moved = motion(scene.rest, scene.sample_deformations)
+    print(f"motion: {moved.mean:.1%} of the longest side in a typical state, {moved.largest:.1%} where it moves most")
+    print(f"up: {_direction(scene.workspace)}")
+    worst: dict[frozenset[str], Overlap] = {}
+    seen = 1.0
+    pixels: list[int] = []
+    for index in range(STATES):
+        rng = example_rng(0, index)
+        mesh = scene.sample_state(rng).mesh
+        for found in overlaps(mesh, STATE_TOLERANCE):
+            pair = frozenset((found.small, found.large))
+            worst[pair] = max(worst.get(pair, found), found, key=lambda overlap: overlap.share)
+        share, count = _view(scene.workspace, mesh, rng)
+        seen = min(seen, share)
+        pixels.append(count)
+    middle = np.median(pixels)
+    print(f"picture: a typical view shows it in {middle:.0f} of {WIDTH**2:,} pixels ({middle / WIDTH**2:.1%})")
+    for overlap in worst.values():
+        print(f"  fault: in random states {overlap}: {_cure(scene, overlap)}")
+    if seen < 0.98:
+        print(f"  note: in a random view only {seen:.0%} of the object is in the picture: widen `field_of_view`")
+    return len(worst)
+
+
+def _direction(workspace: Workspace) -> str:
+    """Which way the camera takes for up."""
+    if workspace.all_around:
+        return "no side: the camera looks from all around"
+    axis = np.array(workspace.axis, dtype=float)
+    index = int(np.abs(axis).argmax())
+    if np.count_nonzero(axis) == 1:
+        name = f"{'' if axis[index] > 0 else '-'}{'xyz'[index]}"
+        return f"{name}, the camera's `axis`; where another side of the files is up, correct it"
+    return f"[{', '.join(f'{value:.3g}' for value in axis)}], the camera's `axis`"
+
+
+def _view(workspace: Workspace, mesh: SegmentedMesh, rng: np.random.Generator) -> tuple[float, int]:
+    """Share of the vertices in a random picture, and the number of pixels that show the object."""
+    local = mesh.transformed(inverse_rigid(workspace.sample(rng, mesh.bounds.mean(axis=0))))
+    camera = Camera.from_fov(WIDTH, WIDTH, workspace.fov_rad)
+    places = camera.project(local.merged()[0])
+    hits = Solids(local).first_hit(camera.directions().reshape(-1, 3))
+    within = ((places > 0) & (places < WIDTH)).all(axis=1)
+    return float(within.mean()), int(np.isfinite(hits.distance).sum())
+
+
+# --- causes of overlaps -----------------------------------------------------------------------------------------------
+
+
+def _cure(scene: Scene, overlap: Overlap) -> str:
+    """Why two segments run into each other in some states, and what helps."""
+    draw = scene.sample_deformations
+    if not isinstance(draw, RandomMotion):
+        return "narrow the deformations, or let both move by the same ones"
+    pair = {scene.rest.names.index(overlap.small), scene.rest.names.index(overlap.large)}
+    apart = [index for index, (_, members) in enumerate(draw.steps) if len(pair & set(members)) == 1]
+    if not apart:
+        return "both move by the same maps, but their faces are too large to follow them: deform less, or mesh finer"
+    titles = [f"{draw.title(index + 1, *draw.steps[index])!r}" for index in apart]
+    moves = f"{' and '.join(titles)} {'moves' if len(apart) == 1 else 'move'} one of the two alone"
+    if not all(isinstance(draw.steps[index][0], JointSampler) for index in apart):
+        return f"{moves}: leave out its `segments`, so that both move by it, or deform less"
+    for share in NARROWED:
+        if _free(scene, _narrowed(draw, apart, share), overlap):
+            return f"{moves}: {share:.0%} of the range keeps them apart; or correct the pivot and the axis"
+    return f"{moves}, and they meet at a tenth of the range already: correct its pivot and axis, or move both"
+
+
+def _narrowed(draw: RandomMotion, which: list[int], share: float) -> RandomMotion:
+    """The same motion with some of its joints narrowed."""
+    steps = list(draw.steps)
+    for index in which:
+        joint, members = steps[index]
+        assert isinstance(joint, JointSampler)
+        steps[index] = (joint.narrowed(share), members)
+    return replace(draw, steps=tuple(steps))
+
+
+def _free(scene: Scene, draw: RandomMotion, overlap: Overlap) -> bool:
+    """Whether the two segments of an overlap keep apart in all of the states."""
+    names = (overlap.small, overlap.large)
+    parts = [scene.rest.names.index(name) for name in sorted(names, key=scene.rest.names.index)]
+    nested = tuple(pair for pair in scene.rest.nested if set(pair) == set(names))
+    for index in range(STATES):
+        mesh = scene.deform(draw(example_rng(0, index))).mesh
+        if overlaps(SegmentedMesh(tuple(mesh.segments[part] for part in parts), nested), STATE_TOLERANCE):
+            return False
+    return True

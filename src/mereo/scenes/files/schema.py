@@ -10,9 +10,10 @@ import numpy as np
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from mereo.geometry.conventions import UNITS_M
-from mereo.scenes.files.deformation_blocks import Deformations
-from mereo.scenes.files.fields import Block, Byte, Direction, Name, Positive, PositiveRange
+from mereo.scenes.files.deformation_blocks import Block, Byte, Deformations, Direction, Name, Positive, PositiveRange
 from mereo.scenes.scene import Workspace
+
+# --- schema -----------------------------------------------------------------------------------------------------------
 
 
 def _unit_m(value: object) -> object:

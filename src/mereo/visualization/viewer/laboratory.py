@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mereo.evaluation.cases import grid_confusion
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.results import grid_confusion
 from mereo.evaluation.scoring import check_names, predict_grid
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from mereo.reconstruction.latest_slot import LatestSlot
+from mereo.reconstruction.stream import LatestSlot
 
 Request = TypeVar("Request")
 

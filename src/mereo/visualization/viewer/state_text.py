@@ -25,8 +25,7 @@ from mereo.fitting.registration.state import (
     played_state,
     said,
 )
-from mereo.scenes.given_draws import played_back
-from mereo.scenes.parameters import Played
+from mereo.scenes.parameters import Played, played_back
 from mereo.scenes.rest_pose import at_rest, is_at_rest
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
