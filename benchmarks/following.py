@@ -3,7 +3,7 @@
     python benchmarks/following.py [OBJECT ...] [--seed S] [--seconds 2] [--occluder tool|hand|none] [--every K] \
         [--sensor structured-light|time-of-flight] [--image-size 192] [--noise 0.1] [--noise-end 0.5] [--no-jump]
 
-For each object, with its shipped weights, a sequence at 30 Hz (``synthesis.sequences``) from a training seed, seen by a
+For each object, with its shipped weights, a sequence at 30 Hz (``synthesis.recording``) from a training seed, seen by a
 simulated camera whose Gaussian noise may grow up to ``--noise-end``:
 
 - milliseconds of a tracked frame, median and 90 %, by the clock and of processor time (on a busy machine the first
@@ -40,8 +40,8 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.synthesis.config import SENSORS, Occluder
 from mereo.synthesis.depth_sensor import add_depth_noise
+from mereo.synthesis.recording import Moment, sequence
 from mereo.synthesis.sequence_config import SequenceConfig
-from mereo.synthesis.sequences import Moment, sequence
 
 STILL, SETTLED, BEFORE_JUMP, AFTER_JUMP, CELLS = 60, 30, 10, 12, 50
 CLOSE = 0.02

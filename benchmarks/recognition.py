@@ -39,8 +39,8 @@ from mereo.evaluation.calibrate import (
     own_views,
     strange_frames,
 )
+from mereo.evaluation.cases import AskedCells
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.reliability import AskedCells
 from mereo.evaluation.scoring import trained_scene
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
@@ -52,9 +52,8 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import TEST_SEED_START
-from mereo.scenes.source_frame import SourceFrame
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.shards import generate
 from mereo.training.config import PRESETS

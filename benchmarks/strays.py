@@ -18,7 +18,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.solids import Solids
 from mereo.geometry.surface_patches import longest_side, surface_points
 from mereo.models.weights_place import shipped_names
-from mereo.reconstruction.strays import readings
+from mereo.reconstruction.isolation import readings
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng

@@ -27,8 +27,7 @@ from mereo.io.checked_tensors import pack_tensors
 from mereo.models.device import keep_freed_memory
 from mereo.scenes.rest_pose import TEMPLATE_NODES
 from mereo.synthesis.config import TEMPLATE
-from mereo.synthesis.dataset_contents import shard_name
-from mereo.synthesis.dataset_files import dataset_key
+from mereo.synthesis.dataset_contents import dataset_key, shard_name
 from mereo.training.config import PRESETS
 from mereo.training.data_source import open_data
 from mereo.training.orders import ShuffledOrder, StreamedOrder

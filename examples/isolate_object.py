@@ -25,9 +25,8 @@ from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.isolation import isolate
+from mereo.reconstruction.isolation import isolate, readings
 from mereo.reconstruction.observation import find_object
-from mereo.reconstruction.strays import readings
 from mereo.visualization.contact_sheets import cloud_picture, contact_sheet, save_png
 from mereo.visualization.renderer import Viewpoint
 

@@ -22,8 +22,8 @@ from scipy.spatial import cKDTree
 from mereo.api.reconstruct import reconstruct
 from mereo.deformation.maps import turn
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh_check import mesh_of, solid_of
 from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model

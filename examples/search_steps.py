@@ -19,7 +19,7 @@ from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.search.search import ROUNDS, candidates, screened, search
 from mereo.reconstruction.observation import find_object
-from mereo.scenes.kept_model import kept_model
+from mereo.scenes.random_states import kept_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig

@@ -53,7 +53,7 @@ SATELLITES = {
 }
 """Packages beside mereo, in the same wheel, and the modules of mereo that may import each."""
 
-BUDGET = {"src/mereo": (52_300, 413), "tests": (37_500, 255)}
+BUDGET = {"src/mereo": (51_700, 322), "tests": (37_500, 255)}
 """Lines and files that a folder may have at most; they fall to 35,000 and 200, and to 25,000 lines of tests."""
 
 ROOM_ROW = re.compile(r"^\| *\[?`(\w+)/`", re.MULTILINE)

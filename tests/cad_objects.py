@@ -5,7 +5,7 @@ from pathlib import Path
 import trimesh
 from manifold3d import CrossSection, Manifold
 
-from mereo.geometry.manifold import mesh_of
+from mereo.geometry.mesh_check import mesh_of
 
 LEVER = (
     *((-130, -22), (-128, -30), (-20, -12), (0, -13), (13, -8), (25, 0.5)),

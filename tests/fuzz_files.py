@@ -31,7 +31,7 @@ from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.statistical_model_file import save_statistical_model
+from mereo.scenes.statistical_model import save_statistical_model
 from mereo.training.checkpoint import Checkpoint
 from mereo.training.config import PRESETS
 

@@ -67,7 +67,7 @@ from mereo.io.writers.obj import write_segments_obj
 from mereo.io.writers.ply import write_points_ply, write_segments_ply
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.statistical_model_file import load_statistical_model, save_statistical_model
+from mereo.scenes.statistical_model import load_statistical_model, save_statistical_model
 from mereo.training.checkpoint import load_checkpoint, save_checkpoint
 from mereo.training.dataset import Dataset
 

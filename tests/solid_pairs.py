@@ -6,8 +6,8 @@ import igl
 import numpy as np
 from manifold3d import Manifold
 
-from mereo.geometry.manifold import solid_of
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh_check import solid_of
 
 
 def solid(segment: Segment) -> Manifold:

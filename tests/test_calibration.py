@@ -12,8 +12,8 @@ from safetensors import safe_open
 
 from mereo import __main__ as command_line
 from mereo.evaluation.calibrate import GOOD_ENOUGH, calibrate, ece_of, fit_scaling
+from mereo.evaluation.cases import BINS, AskedCells, Reliability
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.reliability import BINS, AskedCells, Reliability
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model
 from mereo.models.scaled_logits import scaled_logits

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.evaluation.cases import Evaluation, RegistrationErrors, find_candidates
-from mereo.evaluation.coverage import seen_points
+from mereo.evaluation.cases import Evaluation, RegistrationErrors, find_candidates, seen_points
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores
 from mereo.evaluation.scoring import evaluate

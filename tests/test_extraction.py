@@ -8,8 +8,16 @@ from mereo.evaluation.scoring import trained_scene
 from mereo.geometry.mesh import PALETTE, Segment
 from mereo.models.weights import load_model
 from mereo.models.weights_place import shipped_names
-from mereo.reconstruction.coarse_to_fine import Field, sample_coarse_to_fine, sample_dense
-from mereo.reconstruction.isosurfaces import Extraction, _grid, extract, extract_whole, locate
+from mereo.reconstruction.isosurfaces import (
+    Extraction,
+    Field,
+    _grid,
+    extract,
+    extract_whole,
+    locate,
+    sample_coarse_to_fine,
+    sample_dense,
+)
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng

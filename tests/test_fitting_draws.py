@@ -7,10 +7,9 @@ import pytest
 from test_fitting_theorems import said, shown
 from toy_scene import toy_scene
 
-from mereo.fitting.draws.approach import Shape, approach, derivatives, near, secant
 from mereo.fitting.draws.fit import fit_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.draws.problem import DrawsProblem
+from mereo.fitting.draws.problem import DrawsProblem, Shape, approach, derivatives, near, secant
 from mereo.fitting.draws.problem import narrowing as draws_narrowing
 from mereo.fitting.modes.fit import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import nothing

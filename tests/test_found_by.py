@@ -10,8 +10,14 @@ from answers import answer_to
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem import correspondences
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.answer_frame import ASTRAY, answer_frame, is_astray, misfit_in, more_evident
-from mereo.fitting.registration.hypotheses import search_modes
+from mereo.fitting.registration.answer_frame import (
+    ASTRAY,
+    answer_frame,
+    is_astray,
+    misfit_in,
+    more_evident,
+    search_modes,
+)
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.sight_lines import SightLines
@@ -19,7 +25,7 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
 
-HYPOTHESES = "mereo.fitting.registration.hypotheses"
+HYPOTHESES = "mereo.fitting.registration.answer_frame"
 
 
 @pytest.fixture(scope="module")

@@ -18,16 +18,14 @@ from mereo.fitting.draws.playback import DrawnStates
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.learning import learn as learning
-from mereo.learning import schedule, search_stage
-from mereo.learning.example_frame import write_example_frame
-from mereo.learning.learn import learn
-from mereo.learning.object_files import check, deformation, scene_for
-from mereo.learning.schedule import Plan, Rates, epochs_for, holdout, plan_for, views_for
+from mereo.learning import search_stage
+from mereo.learning.learn import Plan, Rates, epochs_for, holdout, learn, plan_for, views_for
+from mereo.learning.object_files import check, deformation, scene_for, write_example_frame
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object, size_warning
 from mereo.scenes.files import check as checks
-from mereo.scenes.kept_model import CACHE_VARIABLE
+from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
 from mereo.synthesis import shards
 from mereo.training import trial
@@ -53,24 +51,24 @@ def test_stages_fill_the_time_that_is_left(left_s: float, generate_s: float) -> 
     rates = Rates(generate_s, RATES.train_s, RATES.score_s)
     plan = plan_for(left_s, rates, "rope", 6)
     assert plan.generation_s + plan.training_s + plan.evaluation_s == pytest.approx(left_s, rel=0.02)
-    assert plan.evaluation_s == pytest.approx(schedule.EVALUATION_SHARE * left_s)
+    assert plan.evaluation_s == pytest.approx(learning.EVALUATION_SHARE * left_s)
     steps = plan.epochs * (plan.examples - holdout(plan.examples)) / 6
     assert steps == pytest.approx(round(steps))
     # the tail is in it: what is expected of training is its steps and its scores, and some more
-    scores_s = (20 * holdout(plan.examples) + min(schedule.OFFSET_EXAMPLES, plan.examples)) * rates.score_s
-    assert schedule.MARGIN * plan.training_s == pytest.approx(6 * steps * rates.train_s + scores_s)
+    scores_s = (20 * holdout(plan.examples) + min(learning.OFFSET_EXAMPLES, plan.examples)) * rates.score_s
+    assert learning.MARGIN * plan.training_s == pytest.approx(6 * steps * rates.train_s + scores_s)
 
 
 def test_faster_machines_make_more_of_the_same_time() -> None:
     slow, fast = (plan_for(600, Rates(0.05 / f, 0.04 / f, 0.02 / f), "rope", 6) for f in (1, 2))
     assert fast.examples > 1.9 * slow.examples
-    assert fast.epochs == pytest.approx(slow.epochs, rel=0.1) == pytest.approx(schedule.PASSES, rel=0.1)
+    assert fast.epochs == pytest.approx(slow.epochs, rel=0.1) == pytest.approx(learning.PASSES, rel=0.1)
 
 
 def test_no_time_gives_the_least_and_late_examples_leave_less_training() -> None:
     plan = plan_for(-5.0, RATES, "rope", 6)
     assert plan.evaluation_s == 0
-    assert plan.examples == schedule.LEAST_EXAMPLES and plan.epochs * (plan.examples - 6) >= plan.examples - 6
+    assert plan.examples == learning.LEAST_EXAMPLES and plan.epochs * (plan.examples - 6) >= plan.examples - 6
     on_time, late = (epochs_for(left_s, RATES, "rope", 1000, 6) for left_s in (300, 150))
     assert 1 <= late.epochs < on_time.epochs
     assert [views_for(100, 2.0), views_for(0, 2.0), views_for(1e9, 2.0)] == [50, 4, 64]
@@ -197,10 +195,10 @@ def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, cache: Path) -> 
         (trial, "STEPS", 2),
         (trial, "SCORED", 4),
         (trial, "shipped_names", lambda: ("rope",)),
-        (schedule, "LEAST_EXAMPLES", 30),
-        (schedule, "MOST_EXAMPLES", 30),
-        (schedule, "LEAST_TESTS", 1),
-        (schedule, "MOST_TESTS", 1),
+        (learning, "LEAST_EXAMPLES", 30),
+        (learning, "MOST_EXAMPLES", 30),
+        (learning, "LEAST_TESTS", 1),
+        (learning, "MOST_TESTS", 1),
         (learning, "TIMED", 1),
         (calibration, "LEAST_VIEWS", 4),
         (learning, "LEAST_VIEWS", 4),

@@ -15,10 +15,16 @@ from mereo.geometry.transforms import rigid
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.reconstruction.config import Extent, IsolationConfig
-from mereo.reconstruction.isolation import select_object
-from mereo.reconstruction.lines_of_sight import DENSE, MOST_LINES, lines_of_frame, lines_of_image, lines_of_points
-from mereo.reconstruction.observation import find_object, observe
-from mereo.reconstruction.strays import Reading
+from mereo.reconstruction.isolation import Reading, select_object
+from mereo.reconstruction.observation import (
+    DENSE,
+    MOST_LINES,
+    find_object,
+    lines_of_frame,
+    lines_of_image,
+    lines_of_points,
+    observe,
+)
 from mereo.visualization.sight_picture import OBJECT_COLOR, PAST_COLOR, UNKNOWN_COLOR, sight_picture
 from mereo_serving.options import FrameOptions
 

@@ -15,7 +15,7 @@ from mereo.api.result import Result
 from mereo.cli.stream import SurfaceFolder, line
 from mereo.cli.stream_answers import Answering, Seen
 from mereo.fitting.registration.answer import Candidate
-from mereo.fitting.registration.hypotheses import search_hypotheses
+from mereo.fitting.registration.answer_frame import search_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import tracker as tracking
 from mereo.fitting.tracking.tracker import BackgroundSearch, SynchronousExecutor, TrackedFrame, Tracker

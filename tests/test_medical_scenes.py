@@ -10,8 +10,8 @@ import pytest
 from overlapping import check_overlap
 
 from mereo.deformation.maps import jacobian_determinant
-from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh_check import mesh_of, solid_of
 from mereo.geometry.mesh_repair import close_holes, largest_piece
 from mereo.geometry.solids import Solids
 from mereo.scenes.registry import load_scene

@@ -13,8 +13,7 @@ from mereo.cli.modes import show_modes
 from mereo.models.weights import save_model
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.statistical_model import StatisticalModel
-from mereo.scenes.statistical_model_file import with_fewer_modes
+from mereo.scenes.statistical_model import StatisticalModel, with_fewer_modes
 
 
 @pytest.fixture(scope="module")

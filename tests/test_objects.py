@@ -19,7 +19,7 @@ from mereo.evaluation.metrics import intersection_over_union
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import ClustersWarning
-from mereo.scenes.kept_model import CACHE_VARIABLE, kept_model
+from mereo.scenes.random_states import CACHE_VARIABLE, kept_model
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -103,7 +103,7 @@ def test_what_is_written_leaves_out_what_nobody_knows(found: mereo.Result, tmp_p
 def test_the_model_is_made_once_and_read_again(folder: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     (path,) = (folder / "cache/models").iterdir()
     first = kept_model(scene)
-    monkeypatch.setattr("mereo.scenes.kept_model.scene_model", None)
+    monkeypatch.setattr("mereo.scenes.random_states.scene_model", None)
     again = kept_model(scene)
     np.testing.assert_array_equal(first.modes, again.modes)
     monkeypatch.undo()

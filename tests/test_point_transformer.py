@@ -20,7 +20,7 @@ from mereo.evaluation.scoring import score_cases
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.models.config import NetworkConfig
-from mereo.models.encoders.point_transformer import PointTransformer, TransitionDown, VectorAttention
+from mereo.models.encoders.encoding import PointTransformer, TransitionDown, VectorAttention
 from mereo.models.network import Network
 from mereo.models.ops.neighbors import distinct_distances, nearest
 from mereo.models.weights import load_model

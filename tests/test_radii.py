@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mereo.evaluation.calibrate import LEAST, Measured, RadiusGauge, factors_of
-from mereo.evaluation.coverage import RadiusRatios
+from mereo.evaluation.cases import RadiusRatios
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.radii import Radii, rounded_to
 from mereo.models.calibration import RadiusFactors

@@ -11,7 +11,7 @@ from mereo.evaluation.sample_views import load_view
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.noise import (
+from mereo.fitting.problem.problem import (
     ACCEPTED,
     CLEAN,
     LARGEST,
@@ -24,14 +24,14 @@ from mereo.fitting.problem.noise import (
 )
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Candidate
-from mereo.fitting.registration.hypotheses import fit_hypotheses
+from mereo.fitting.registration.answer_frame import fit_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.weights import load_model
+from mereo.reconstruction.isolation import Reading, readings
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import EncodedFrame
-from mereo.reconstruction.strays import Reading, readings
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng
@@ -101,7 +101,7 @@ def test_a_part_that_looks_like_strays_is_given_back(
         keep = cloud.points[:, 0] < np.quantile(cloud.points[:, 0], 0.9)
         return Reading(cloud, keep), Reading.of_all(cloud)
 
-    monkeypatch.setattr("mereo.fitting.registration.hypotheses.readings", wrong)
+    monkeypatch.setattr("mereo.fitting.registration.answer_frame.readings", wrong)
     found, likelier = candidates(model, registrar, points)
     assert found.hypothesis.dropped == 0 and likelier.reading.dropped > 0
 
@@ -117,7 +117,7 @@ def test_points_that_a_fit_explains_are_given_back_beside_strays(
         keep[lost] = False
         return Reading(cloud, keep), Reading.of_all(cloud)
 
-    monkeypatch.setattr("mereo.fitting.registration.hypotheses.readings", hasty)
+    monkeypatch.setattr("mereo.fitting.registration.answer_frame.readings", hasty)
     keep = fitted(model, registrar, contaminated).hypothesis.keep
     assert keep[lost].all() and not keep[len(points) :].any()
 

@@ -22,8 +22,8 @@ from mereo.io.intrinsics import read_camera
 from mereo.io.readers import read_depth_image
 from mereo.io.sensor_frame import read_frame
 from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.isolation import readings
 from mereo.reconstruction.observation import Observation, find_object
-from mereo.reconstruction.strays import readings
 
 FOLDER = Path(os.environ.get("MEREO_ASSETS", "")) / "depth"
 pytestmark = pytest.mark.skipif(

@@ -19,7 +19,7 @@ from mereo.evaluation.calibrate import (
 )
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem.correspondences import CLIPPED
-from mereo.fitting.problem.noise import ACCEPTED
+from mereo.fitting.problem.problem import ACCEPTED
 from mereo.fitting.registration.recognition import (
     CONSERVATIVE,
     MOST,
@@ -37,9 +37,8 @@ from mereo.models.weights import load_model
 from mereo.scenes.draw_recorder import FartherDraws, with_farther_states
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import example_rng
-from mereo.scenes.source_frame import SourceFrame
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 

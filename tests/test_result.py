@@ -16,7 +16,7 @@ from mereo.geometry.camera import SCANNER_TO_CAMERA
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
-from mereo.scenes.source_frame import SourceFrame
+from mereo.scenes.scene import SourceFrame
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 

@@ -10,7 +10,7 @@ from test_fitting_theorems import seen
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.registration.hypotheses import search_modes, size_of
+from mereo.fitting.registration.answer_frame import search_modes, size_of
 from mereo.fitting.search.screening import CELLS, Poses, Screen, SightTable, medoids, tables_of
 from mereo.fitting.search.search import rotations
 from mereo.geometry.sight_lines import SightLines

@@ -19,9 +19,8 @@ from mereo.scenes.scene import Scene
 from mereo.scenes.walks import process_weights, switches, walk
 from mereo.synthesis.clutter import OCCLUDER
 from mereo.synthesis.config import SENSORS
-from mereo.synthesis.recording import Recording, is_recording_folder, read_recording, write_recording
+from mereo.synthesis.recording import Moment, Recording, is_recording_folder, read_recording, sequence, write_recording
 from mereo.synthesis.sequence_config import SequenceConfig
-from mereo.synthesis.sequences import Moment, sequence
 from mereo.visualization.viewer import display
 from mereo.visualization.viewer.sequence_page import SequencePage
 

@@ -6,7 +6,7 @@ from manifold3d import Manifold, OpType
 from solid_pairs import crowded
 
 from mereo.deformation.maps import Deformation, jacobian
-from mereo.geometry.manifold import solid_of
+from mereo.geometry.mesh_check import solid_of
 from mereo.scenes.registry import load_scene
 from mereo_objects import sheet
 from mereo_objects._sheet_parts import THICKNESS, middle_points

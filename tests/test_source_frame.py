@@ -18,7 +18,7 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.models.weights import load_model, save_model
 from mereo.scenes.random_states import scene_model, with_frame
 from mereo.scenes.registry import load_scene
-from mereo.scenes.statistical_model_file import pack_model, unpack_model
+from mereo.scenes.statistical_model import pack_model, unpack_model
 
 
 def test_files_in_millimetres_come_to_the_scene(tmp_path: Path) -> None:

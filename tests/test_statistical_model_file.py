@@ -13,9 +13,9 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.weights import load_model, save_model, weights_bytes
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.statistical_model import StatisticalModel
-from mereo.scenes.statistical_model_file import (
+from mereo.scenes.statistical_model import (
     WIDE_MODES,
+    StatisticalModel,
     load_statistical_model,
     modes_within,
     pack_model,

@@ -11,7 +11,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.solids import Solids
 from mereo.geometry.surface_patches import longest_side, surface_points
-from mereo.reconstruction.strays import Reading, readings
+from mereo.reconstruction.isolation import Reading, readings
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor

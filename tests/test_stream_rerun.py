@@ -18,8 +18,8 @@ from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import SensorFrame, read_frame
+from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.strays import Reading
 from mereo.reconstruction.stream import Outcome
 from mereo.scenes.registry import load_scene
 from mereo.synthesis.config import SENSORS

@@ -21,7 +21,7 @@ from mereo.learning.learn import learn
 from mereo.learning.object_files import scene_of_folder
 from mereo.learning.search_stage import SearchScores, best_method, is_to_train, shortcomings
 from mereo.scenes.files import check
-from mereo.scenes.kept_model import CACHE_VARIABLE
+from mereo.scenes.random_states import CACHE_VARIABLE
 
 GOOD = {"examples": 16, "iou": 0.96, "miou": 0.92, "lowest_miou": 0.8, "explained": 1.0, "seconds": 1.5}
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from toy_scene import Lift, Shear, toy_scene
 
-from mereo.evaluation.coverage import RadiusRatios, seen_points
+from mereo.evaluation.cases import RadiusRatios, seen_points
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.problem.posterior import Posterior, covariance_factor, radius95
@@ -16,7 +16,7 @@ from mereo.fitting.registration.fit import fit_correspondences
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.moments import owned_centroids, owned_gradients
+from mereo.geometry.solids import owned_centroids, owned_gradients
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.statistical_model import StatisticalModel

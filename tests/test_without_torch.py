@@ -9,7 +9,7 @@ import pytest
 from angle import write_angle
 
 from mereo.learning.object_files import scene_of_meshes
-from mereo.scenes.kept_model import CACHE_VARIABLE
+from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view

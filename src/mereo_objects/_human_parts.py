@@ -14,8 +14,8 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
 
-from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.mesh_check import mesh_of, solid_of
 from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.read_only import read_only
 from mereo_objects import assets

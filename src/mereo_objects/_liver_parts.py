@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid
 from mereo.deformation.warps import Bend, FreeFormLattice, Squash, Twist
-from mereo.geometry.manifold import Faces, Vertices, solid_of
 from mereo.geometry.mesh import PALETTE, Segment, vertex_normals
+from mereo.geometry.mesh_check import Faces, Vertices, solid_of
 from mereo.geometry.mesh_repair import close_holes, largest_piece
 from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.read_only import read_only

@@ -4,7 +4,7 @@ import igl
 import manifold3d
 import numpy as np
 
-from mereo.geometry.manifold import mesh_of, solid_of
+from mereo.geometry.mesh_check import mesh_of, solid_of
 
 
 def main_part(solid: manifold3d.Manifold) -> manifold3d.Manifold:

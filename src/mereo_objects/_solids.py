@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from manifold3d import CrossSection, Manifold, OpType
 
-from mereo.geometry.manifold import mesh_of
 from mereo.geometry.mesh import Color, Segment
+from mereo.geometry.mesh_check import mesh_of
 
 Vector = tuple[float, float, float]
 

@@ -28,8 +28,8 @@ from jaxtyping import Float
 
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
-from mereo.geometry.manifold import solid_of
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh_check import solid_of
 from mereo.geometry.mesh_repair import close_holes, largest_piece
 from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import rigid

@@ -21,7 +21,7 @@ from mereo.learning.object_files import SCENE, names_scene, scene_of_folder, sce
 from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.models.trained import Trained
 from mereo.models.weights_place import is_weights, load_weights, shipped_names
-from mereo.scenes.kept_model import kept_model
+from mereo.scenes.random_states import kept_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.statistical_model import StatisticalModel

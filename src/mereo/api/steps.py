@@ -21,8 +21,7 @@ from mereo.evaluation.scoring import evaluate_scans
 from mereo.fitting.config import AnswerMethod
 from mereo.io.object_storage import ObjectPath, place_of
 from mereo.learning import learn as learning
-from mereo.learning.example_frame import FRAME
-from mereo.learning.object_files import scene_for
+from mereo.learning.object_files import FRAME, scene_for
 from mereo.learning.search_stage import TrainChoice
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.models.elsewhere import for_tasks

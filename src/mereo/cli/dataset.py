@@ -5,8 +5,7 @@ from typing import Any
 
 from mereo.io.object_storage import Place
 from mereo.scenes.seeds import TEST_SEED_START
-from mereo.synthesis.dataset_contents import DatasetContents
-from mereo.synthesis.dataset_files import recorded_files
+from mereo.synthesis.dataset_contents import DatasetContents, recorded_files
 
 
 def show_dataset(folder: Place) -> None:

@@ -11,10 +11,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from mereo.api.carry import registration_of
 from mereo.api.objects import Object
 from mereo.api.reconstruct import reconstruct_observation
-from mereo.api.result import Result
+from mereo.api.result import Result, registration_of
 from mereo.cli.explain import explain, print_sure, wish_of
 from mereo.cli.object_option import MeshUnits, check_named, files_read, loaded_object
 from mereo.cli.outcome import NOT_RECOGNIZED, Outcome

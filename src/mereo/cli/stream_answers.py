@@ -14,11 +14,11 @@ from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking.tracker import SynchronousExecutor, Tracker
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.moments import owned_centroids
+from mereo.geometry.solids import owned_centroids
 from mereo.models.trained import Trained
+from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import Reconstruction
-from mereo.reconstruction.strays import Reading
 
 DIGITS = 6
 """Digits of a printed coordinate."""

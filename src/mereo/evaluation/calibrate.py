@@ -19,9 +19,8 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.special import log_softmax, softmax
 
-from mereo.evaluation.coverage import RadiusRatios, seen_points
+from mereo.evaluation.cases import AskedCells, RadiusRatios, Reliability, seen_points
 from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.reliability import AskedCells, Reliability
 from mereo.evaluation.scoring import check_names, trained_scene, true_material
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_frame

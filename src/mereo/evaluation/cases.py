@@ -10,15 +10,15 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial import cKDTree
 
-from mereo.evaluation.coverage import RadiusRatios, seen_points
 from mereo.evaluation.ground_truth import TruthGrid
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
-from mereo.evaluation.reliability import Reliability
+from mereo.fitting.problem.posterior import LEVEL
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
@@ -28,13 +28,200 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.solids import label_grid
-from mereo.models.elsewhere import arrived
-from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud, Trained
-from mereo.reconstruction.coarse_to_fine import sample_coarse_to_fine
+from mereo.reconstruction.isosurfaces import sample_coarse_to_fine
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.statistical_model import StatisticalModel
+
+# --- coverage of radii ------------------------------------------------------------------------------------------------
+
+# Coverage: how often true places lie within the radii of a registration, and the factor with which 95 % of them do.
+#
+# Registration, truth -RadiusRatios.of-> ratios of each view -together, scale-> Calibration.radius_scale
+
+SEEN_WITHIN = 1.5
+"""Distance in scene units up to which a material point counts as seen: that of the nearest observed point."""
+
+
+def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:
+    """Which material points a cloud shows, by their true places in its frame and unit."""
+    near: Bool[np.ndarray, " m"] = cKDTree(cloud.points).query(truth)[0] <= SEEN_WITHIN * scene_unit
+    return near
+
+
+@dataclass(frozen=True, eq=False)
+class RadiusRatios:
+    """Distances of registered material points from their true places, in the radii that they have.
+
+    Attributes:
+        ratios: factor of the posterior's Gaussian radius with which the true place lies on the rim of the whole one; 0
+            where it lies within in any case.
+        gaussian: these radii, scene units.
+        beside: radii of the other parts, whose squares add to theirs (``RadiusParts.open`` and ``Uncertainty.beside``).
+        seen: which of the points the cloud shows.
+    """
+
+    ratios: Float[np.ndarray, " n"]
+    gaussian: Float[np.ndarray, " n"]
+    beside: Float[np.ndarray, " n"]
+    seen: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of(
+        cls, registration: Registration, truth: Float[np.ndarray, "m 3"], seen: Bool[np.ndarray, " m"]
+    ) -> "RadiusRatios":
+        """Ratios of one view, to the radii that its registration has, with the weights' calibration if there is one.
+
+        Args:
+            registration: fitted, not read from a file.
+            truth: true places of its material points, vertices and interior ones, or of the first of them, in its frame
+                and unit.
+            seen: which of these the cloud shows (``seen_points``).
+
+        Raises ``ValueError`` for a registration without an optimum.
+        """
+        found = registration.uncertainty
+        if found is None:
+            raise ValueError("the registration was read from a file, which has no posterior: fit its frame again")
+        count, own = len(truth), found.optimum.unit / registration.scene_unit
+        off = np.linalg.norm(registration.material[:count] - truth, axis=1) / registration.scene_unit
+        gaussian, beside = own * found.parts.gaussian[:count], own * np.hypot(found.parts.open[:count], found.beside)
+        ratios = np.sqrt(np.maximum(off**2 - beside**2, 0.0)) / gaussian
+        return cls(ratios, gaussian, beside, seen).by(found.scale)
+
+    @classmethod
+    def together(cls, each: Sequence["RadiusRatios"]) -> "RadiusRatios":
+        """Ratios of several views, every point counted once."""
+        columns = zip(*((one.ratios, one.gaussian, one.beside, one.seen) for one in each), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
+
+    @property
+    def radii(self) -> Float[np.ndarray, " n"]:
+        """Radii of all points, scene units."""
+        return np.hypot(self.gaussian, self.beside)
+
+    def scale(self) -> float:
+        """Factor of the Gaussian's radii that holds 95 % of the true places: ``Calibration.radius_scale``."""
+        return float(np.quantile(self.ratios, LEVEL))
+
+    def by(self, scale: float | None) -> "RadiusRatios":
+        """The same with the Gaussian's radii times a scale, where there is one."""
+        if scale is None:
+            return self
+        return RadiusRatios(self.ratios / scale, self.gaussian * scale, self.beside, self.seen)
+
+    def with_beside(self, radius: float) -> "RadiusRatios":
+        """The same with a radius, in scene units, that every point has beside the others."""
+        off = np.maximum((self.ratios * self.gaussian) ** 2 - radius**2, 0.0)
+        return RadiusRatios(np.sqrt(off) / self.gaussian, self.gaussian, np.hypot(self.beside, radius), self.seen)
+
+    def summary(self, unit_mm: float | None = None) -> dict[str, float | None]:
+        """Share of the true places within the radii, and how large these are.
+
+        Of ``all``, ``seen`` and ``hidden`` points (None where there are none), with the medians of the radii in scene
+        units, and in mm where ``unit_mm``, millimetres per scene unit, is known.
+        """
+        named = {"all": np.ones(len(self.seen), dtype=bool), "seen": self.seen, "hidden": ~self.seen}
+        result = {
+            name: float((self.ratios[rows] <= 1.0).mean()) if rows.any() else None for name, rows in named.items()
+        }
+        for name in ("seen", "hidden"):
+            median = float(np.median(self.radii[named[name]])) if named[name].any() else None
+            result[f"radius_{name}"] = median
+            result[f"radius_{name}_mm"] = None if median is None or unit_mm is None else median * unit_mm
+        return result
+
+
+# --- reliability of probabilities -------------------------------------------------------------------------------------
+
+# Reliability of probabilities: how often answers that are given with so much confidence are right.
+#
+# The expected calibration error (Naeini et al., AAAI 2015; Guo et al., ICML 2017) is the mean distance of the share of
+# right answers from their confidence, over bins of equal width, weighed by how many answers fall into each. Confidence
+# is the probability of the answered label, over the cells of the paper's metric (``evaluation.ground_truth``).
+
+BINS = 15
+"""Bins of equal width, as in the papers."""
+
+ASKED = 20_000
+"""Cells of a view that are asked for, at most, evenly drawn: all of them would take longer than the evaluation."""
+
+
+@dataclass(frozen=True, eq=False)
+class AskedCells:
+    """What a network says at some of the cells that count, and what is true there.
+
+    Attributes:
+        points: the cells' centres, in the cloud's frame and unit.
+        truth: their labels.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    truth: UInt8[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, truth: TruthGrid, count: int = ASKED) -> "AskedCells":
+        """Cells that count, the same ones every time."""
+        kept = np.argwhere(truth.kept)
+        if len(kept) > count:
+            kept = kept[np.sort(np.random.default_rng(0).choice(len(kept), count, replace=False))]
+        return cls(truth.grid.positions(kept), truth.grid.labels[tuple(kept.T)])
+
+
+@dataclass
+class Reliability:
+    """Answers counted by their confidence.
+
+    Attributes:
+        count: of answers in each bin.
+        confidence: sum of theirs.
+        right: how many are right.
+    """
+
+    count: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
+    confidence: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
+    right: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
+
+    def add(self, confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> None:
+        """Count further answers, by the probability of what was answered and whether that is right."""
+        index = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
+        self.count += np.bincount(index, minlength=BINS)
+        self.confidence += np.bincount(index, weights=confidence, minlength=BINS)
+        self.right += np.bincount(index, weights=right, minlength=BINS)
+
+    def add_view(self, model: Trained, code: EncodedCloud, truth: TruthGrid) -> None:
+        """Count what a network answers about a view; one that tells no segments apart is asked for the whole."""
+        cells = AskedCells.of(truth)
+        found = model.query(code, cells.points)
+        true = np.minimum(cells.truth, found.probability.shape[1] - 1)
+        rows = np.arange(len(true))
+        self.add(found.probability[rows, found.label].astype(np.float64), found.label == true)
+
+    def add_all(self, other: "Reliability") -> None:
+        """Count what another one has counted."""
+        self.count += other.count
+        self.confidence += other.confidence
+        self.right += other.right
+
+    @property
+    def ece(self) -> float:
+        """Expected calibration error, 0 to 1; NaN without answers."""
+        total = self.count.sum()
+        return float(np.abs(self.right - self.confidence).sum() / total) if total else float("nan")
+
+    def facts(self) -> list[dict[str, Any]]:
+        """Bins that have answers: their share of all, mean confidence and share of right ones."""
+        filled = np.flatnonzero(self.count)
+        return [
+            {
+                "share": float(self.count[i] / self.count.sum()),
+                "confidence": float(self.confidence[i] / self.count[i]),
+                "right": float(self.right[i] / self.count[i]),
+            }
+            for i in filled
+        ]
+
 
 # --- answers to a test case -------------------------------------------------------------------------------------------
 
@@ -405,15 +592,17 @@ class Scoring:
         gpu: whether whoever scores moves the model to a GPU of its own first.
     """
 
-    model: Model
+    model: Trained
     registrar: Registrar | None
     case: Callable[[int], TestCase]
     kept: int
     gpu: bool = False
 
     @cached_property
-    def here(self) -> tuple[Model, Registrar | None]:
+    def here(self) -> tuple[Trained, Registrar | None]:
         """Model and registrar where this is called, moved there once."""
+        from mereo.models.elsewhere import arrived  # needs torch, and results do not
+
         model = arrived(self.model, self.gpu)
         return model, None if self.registrar is None else self.registrar.asking(model)
 
@@ -453,7 +642,7 @@ def _places(one: TestCase, answer: Candidate) -> RegisteredPlaces | None:
     )
 
 
-def _evaluated_view(one: TestCase, model: Model, found: Candidates, colors: Sequence[Color]) -> EvaluatedView:
+def _evaluated_view(one: TestCase, model: Trained, found: Candidates, colors: Sequence[Color]) -> EvaluatedView:
     """Truth and answer on the truth's grid and ``PICTURE_MARGIN`` cells around it."""
     wide = _widened(one.truth)
     reference = np.minimum(wide.grid.labels, np.uint8(len(colors)))
@@ -471,7 +660,7 @@ def _widened(truth: TruthGrid) -> TruthGrid:
 class EvaluationTally:
     """Running sums over a test set, whose cases are added in order."""
 
-    def __init__(self, model: Model, answers: Sequence[AnswerName]) -> None:
+    def __init__(self, model: Trained, answers: Sequence[AnswerName]) -> None:
         self.model = model
         self.answer, self.tallies = Tally(), {name: Tally() for name in answers}
         self.cases: list[ScoredCase] = []

@@ -16,9 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from mereo.geometry.manifold import Faces, Vertices, mesh_of, solid_of
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import examine, faces_astray
+from mereo.geometry.mesh_check import Faces, Vertices, examine, faces_astray, mesh_of, solid_of
 from mereo.geometry.overlap import overlaps
 
 MERGED_WITHIN = (1e-6, 1e-4)

@@ -8,8 +8,8 @@ from itertools import combinations
 import manifold3d
 import numpy as np
 
-from mereo.geometry.manifold import solid_of
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh_check import solid_of
 from mereo.geometry.solids import label_grid
 
 TOLERANCE = 1e-3

@@ -22,7 +22,7 @@ from mereo.io.atomic_files import write_json
 from mereo.io.progress import progress
 from mereo.learning.object_files import SEARCH
 from mereo.reconstruction.observation import observe
-from mereo.scenes.kept_model import kept_model
+from mereo.scenes.random_states import kept_model
 from mereo.scenes.rest_pose import rest_digest
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START

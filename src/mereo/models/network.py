@@ -9,10 +9,7 @@ from torch import Tensor, nn
 
 from mereo.models.config import NetworkConfig
 from mereo.models.decoder import Code, ConditionedMLP, Decoder, Prediction
-from mereo.models.encoders.autodecoder import Autodecoder
-from mereo.models.encoders.encoding import Encoding
-from mereo.models.encoders.point_transformer import PointTransformer
-from mereo.models.encoders.pointnet2 import PointNet2
+from mereo.models.encoders.encoding import Autodecoder, Encoding, PointNet2, PointTransformer
 from mereo.models.rigid_alignment import Alignment, fit_rigid
 
 ALIGNED_QUERIES = 128

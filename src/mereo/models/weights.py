@@ -16,13 +16,12 @@ from mereo.io.errors import reason
 from mereo.models.calibration import Calibration
 from mereo.models.config import InferenceConfig
 from mereo.models.device import find_device
-from mereo.models.encoders.autodecoder import CODES
+from mereo.models.encoders.encoding import CODES
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights_header import CURE, FORMAT_VERSION, Header, check_tensors, read_config, read_header
 from mereo.models.weights_place import STATES, find_weights
-from mereo.scenes.statistical_model import StatisticalModel
-from mereo.scenes.statistical_model_file import pack_model, unpack_model
+from mereo.scenes.statistical_model import StatisticalModel, pack_model, unpack_model
 
 PACKED = "decoder.lookup.distance"
 """The template's signed distances: with ten segments more than half of a float16 file."""

@@ -13,7 +13,7 @@ from mereo.models.config import NetworkConfig, Supervision
 from mereo.models.weights import PACKED
 from mereo.models.weights_header import Header, read_config, read_header
 from mereo.models.weights_place import STATES, find_weights
-from mereo.scenes.source_frame import SourceFrame
+from mereo.scenes.scene import SourceFrame
 
 NOT_LEARNT = ("running_mean", "running_var", "num_batches_tracked")
 """Tensors of batch normalization that are measured, not learnt."""

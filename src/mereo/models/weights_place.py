@@ -8,8 +8,7 @@ from safetensors import safe_open
 from mereo.io.extras import network_needed
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
-from mereo.scenes.statistical_model import StatisticalModel
-from mereo.scenes.statistical_model_file import unpack_model
+from mereo.scenes.statistical_model import StatisticalModel, unpack_model
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 

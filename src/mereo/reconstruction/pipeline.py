@@ -23,10 +23,9 @@ from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.models.trained import EncodedCloud, Trained, checked_points
-from mereo.reconstruction.coarse_to_fine import Field
-from mereo.reconstruction.isosurfaces import extract_whole, locate
+from mereo.reconstruction.isolation import Reading
+from mereo.reconstruction.isosurfaces import Field, extract_whole, locate
 from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
-from mereo.reconstruction.strays import Reading
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""

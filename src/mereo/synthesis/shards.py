@@ -12,7 +12,7 @@ with further observations (``synthesis.examples``), of which each has k,
     seen f16 [e, k, p, 3], seen_count i32 [e, k]
 
 and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``scenes.rest_pose``), and
-``statistical_model.safetensors``, the modes of the object's random states (``scenes.statistical_model_file``).
+``statistical_model.safetensors``, the modes of the object's random states (``scenes.statistical_model``).
 
 When all are there the manifest gets the SHA-256 of each (``synthesis.dataset_contents``).
 
@@ -44,10 +44,9 @@ from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.rest_pose import rest_digest, rest_distances
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.scenes.statistical_model_file import statistical_model_bytes
+from mereo.scenes.statistical_model import statistical_model_bytes
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
-from mereo.synthesis.dataset_contents import FILES, DatasetContents, shard_name
-from mereo.synthesis.dataset_files import MANIFEST, check_space, dataset_key
+from mereo.synthesis.dataset_contents import FILES, MANIFEST, DatasetContents, check_space, dataset_key, shard_name
 from mereo.synthesis.examples import Clouds, Example, synthesize
 from mereo.workers.config import Cluster
 from mereo.workers.spread import spread

@@ -9,7 +9,7 @@ import torch
 
 from mereo.io.free_memory import free_bytes
 from mereo.io.object_storage import Place
-from mereo.synthesis.dataset_files import dataset_key, list_shards, read_manifest, recorded_files
+from mereo.synthesis.dataset_contents import dataset_key, list_shards, read_manifest, recorded_files
 from mereo.training.config import DataPlace, TrainConfig
 from mereo.training.dataset import Dataset, read_part
 from mereo.training.processes import Process, told

@@ -14,10 +14,9 @@ from jaxtyping import Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 
 from mereo.io.object_storage import Place
-from mereo.scenes.statistical_model import StatisticalModel
-from mereo.scenes.statistical_model_file import load_statistical_model
+from mereo.scenes.statistical_model import StatisticalModel, load_statistical_model
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE
-from mereo.synthesis.dataset_files import (
+from mereo.synthesis.dataset_contents import (
     OBSERVED,
     dataset_key,
     list_shards,

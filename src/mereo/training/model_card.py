@@ -21,7 +21,7 @@ from mereo.models.config import NetworkConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model, weights_bytes
 from mereo.scenes.random_states import built_in_model, with_frame
-from mereo.scenes.statistical_model_file import modes_within, with_fewer_modes
+from mereo.scenes.statistical_model import modes_within, with_fewer_modes
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS
 from mereo.training.examples_seen import told

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mereo.models.encoders.autodecoder import CODES
+from mereo.models.encoders.encoding import CODES
 from mereo.training.config import TrainConfig
 
 

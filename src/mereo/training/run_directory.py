@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mereo.io.output_folders import claim_directory
 from mereo.models.config import NetworkConfig
-from mereo.models.encoders.autodecoder import Autodecoder
+from mereo.models.encoders.encoding import Autodecoder
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model

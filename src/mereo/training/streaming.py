@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mereo.io.object_storage import Place
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis.dataset_files import dataset_key, list_shards, read_manifest, recorded_files
+from mereo.synthesis.dataset_contents import dataset_key, list_shards, read_manifest, recorded_files
 from mereo.training.batches import Batch, Draws
 from mereo.training.config import AugmentConfig
 from mereo.training.dataset import (

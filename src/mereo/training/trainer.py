@@ -20,7 +20,7 @@ from mereo.io.object_storage import Place
 from mereo.io.scratch_folders import check_place
 from mereo.models.config import Device
 from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
-from mereo.models.encoders.autodecoder import Autodecoder
+from mereo.models.encoders.encoding import Autodecoder
 from mereo.models.network import Network
 from mereo.models.weights import save_model, trained_steps
 from mereo.models.weights_place import WEIGHTS

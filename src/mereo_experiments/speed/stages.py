@@ -20,8 +20,15 @@ from mereo.models.decoder import Code
 from mereo.models.model import Model
 from mereo.models.ops.neighbors import gpu_kernels
 from mereo.models.trained import EncodedCloud, check_enough
-from mereo.reconstruction.coarse_to_fine import changing_cells, over_corners, sample_coarse_to_fine, sample_dense
-from mereo.reconstruction.isosurfaces import extract, extract_whole, locate
+from mereo.reconstruction.isosurfaces import (
+    changing_cells,
+    extract,
+    extract_whole,
+    locate,
+    over_corners,
+    sample_coarse_to_fine,
+    sample_dense,
+)
 from mereo.reconstruction.pipeline import SEARCH_BOX
 from mereo_experiments.speed.baseline import Rival
 from mereo_experiments.speed.roofline import Machine, Work, count_operations, seconds

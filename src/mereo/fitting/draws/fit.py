@@ -16,9 +16,21 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.fitting.draws.approach import Near, Shape, approach, derivatives, near, secant
 from mereo.fitting.draws.playback import Drawn, shares_of
-from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, beside, misfit, normal_equations, played
+from mereo.fitting.draws.problem import (
+    DrawsFit,
+    DrawsProblem,
+    Near,
+    Shape,
+    approach,
+    beside,
+    derivatives,
+    misfit,
+    near,
+    normal_equations,
+    played,
+    secant,
+)
 from mereo.fitting.modes.fit import refine, robust_poses
 from mereo.fitting.problem.gauss_newton import POSE, Posed
 from mereo.fitting.problem.joints import branches

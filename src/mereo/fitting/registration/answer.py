@@ -20,11 +20,11 @@ from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
+from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.isosurfaces import Extraction
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, encode_frame, extract, timed, turned_back
 from mereo.reconstruction.segment_statistics import measure, segment_points
-from mereo.reconstruction.strays import Reading
 
 
 @dataclass(frozen=True, eq=False)

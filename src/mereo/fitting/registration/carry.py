@@ -23,7 +23,7 @@ from mereo.io.attachments import Attachment, Content, Placeable, Surfaces
 from mereo.io.config import CarryFrame
 from mereo.io.volume_files import Volume, is_labels
 from mereo.scenes.random_states import with_frame
-from mereo.scenes.source_frame import SourceFrame
+from mereo.scenes.scene import SourceFrame
 from mereo.scenes.statistical_model import StatisticalModel
 
 # --- volumes ----------------------------------------------------------------------------------------------------------

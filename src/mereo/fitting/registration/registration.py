@@ -14,8 +14,7 @@ from mereo.fitting.draws.playback import Drawn
 from mereo.fitting.uncertainty.uncertainty import Explanation, Optimum, Uncertainty
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.moments import owned_centroids
-from mereo.geometry.solids import Solids, signed_distance_and_direction
+from mereo.geometry.solids import Solids, owned_centroids, signed_distance_and_direction
 from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.statistical_model import StatisticalModel, following
 

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, 
 from pydantic_core import ErrorDetails
 
 from mereo.fitting.draws.playback import Drawn, material_moved, shares_of
-from mereo.fitting.problem.noise import ACCEPTED
+from mereo.fitting.problem.problem import ACCEPTED
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CURE, other_mesh
 from mereo.fitting.registration.registration import BELIEVED, Method, Registration

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.modes.fit import Judged, explored, fit_cloud, fit_wide, refined
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.joints import corner_places
-from mereo.fitting.problem.priors import Prior
 from mereo.fitting.problem.problem import UNEXPLAINED, Problem
+from mereo.fitting.problem.residuals import Prior
 from mereo.fitting.search.screening import Poses, Screen, tables_of
 
 

@@ -20,10 +20,8 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, in_space
-from mereo.fitting.problem.noise import constants_for
-from mereo.fitting.problem.priors import Prior
-from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem, constants_for
+from mereo.fitting.problem.residuals import NetworkTerm, Prior
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.search.search import WHOLE
 from mereo.fitting.tracking.config import TrackConfig

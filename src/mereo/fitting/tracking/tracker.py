@@ -18,9 +18,8 @@ import numpy as np
 
 from mereo.fitting.config import FitConfig, FoundBy, Tracking
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.answer_frame import answer_of, find, in_found_unit
+from mereo.fitting.registration.answer_frame import answer_of, find, in_found_unit, search_hypotheses
 from mereo.fitting.registration.fit import ModesFit
-from mereo.fitting.registration.hypotheses import search_hypotheses
 from mereo.fitting.registration.recognition import MOST, Recognition, recognize
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
@@ -29,8 +28,8 @@ from mereo.fitting.tracking.next_fit import Track, gated, next_fit, seen_area
 from mereo.geometry.brief import counted
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.transforms import transform_points
+from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.strays import Reading
 
 # --- search in the background -----------------------------------------------------------------------------------------
 

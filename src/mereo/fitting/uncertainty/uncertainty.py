@@ -15,13 +15,12 @@ from mereo.fitting.draws.problem import terms as terms_of_draws
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.problem.own_turns import left_open
 from mereo.fitting.problem.posterior import WITHIN, Observed, Posterior, RadiusParts, Terms, radius95
-from mereo.fitting.problem.priors import Prior
 from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import Surface, add_witnesses
+from mereo.fitting.problem.residuals import Prior, Surface, add_witnesses
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.moments import owned_gradients
 from mereo.geometry.radii import Radii
+from mereo.geometry.solids import owned_gradients
 from mereo.geometry.transforms import transform_points
 from mereo.io.cores import one_blas_thread
 from mereo.scenes.statistical_model import StatisticalModel

@@ -17,16 +17,23 @@ from manifold3d import Manifold, OpType
 
 from mereo.deformation.maps import Deformation
 from mereo.deformation.samplers import RandomMotion
-from mereo.geometry.manifold import mesh_of, solid_of
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.geometry.mesh_check import examine
+from mereo.geometry.mesh_check import examine, mesh_of, solid_of
 from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.defaults import default_deformations
-from mereo.scenes.files.deformation_blocks import AnyDeformation, Misfit, Target
-from mereo.scenes.files.schema import CameraBlock, FilePart, ModelPart, PartLook, SceneFile
+from mereo.scenes.files.deformation_blocks import (
+    AnyDeformation,
+    CameraBlock,
+    FilePart,
+    Misfit,
+    ModelPart,
+    PartLook,
+    SceneFile,
+    Target,
+)
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import SCENES, Scene, Workspace
 from mereo.scenes.seeds import example_rng
