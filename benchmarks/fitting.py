@@ -21,7 +21,7 @@ from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.draws.playback import DrawnStates
-from mereo.fitting.registration.fit import fit_frame
+from mereo.fitting.registration.fit import CloudToFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
@@ -96,7 +96,7 @@ def row(
         grid = truth_grid(case.truth, cells)
         confusion = grid_confusion(grid, predict_grid(network, case.cloud, grid), len(network.names))
         alone = intersection_over_union(confusion, True)
-        modes = fit_frame(case.cloud, network, model, case.unit)
+        modes = fit_frame(CloudToFit(case.cloud.points, case.unit), network, model)
         best = modes.registration() if states is None else modes.with_draws(states)
         near, far = errors(best, case)
         seen.append(near)

@@ -27,6 +27,7 @@ import numpy as np
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking.config import TrackConfig
@@ -107,7 +108,7 @@ def frames_of(moments: list[Moment], more_noise: float = 0.0) -> Frames:
 
 
 def alone(registrar: Registrar, cloud: PointCloud) -> Registration:
-    return replace(registrar.fit_modes(cloud, scene_unit=1.0), rest=None).registration()
+    return replace(registrar.fit_modes(CloudToFit(cloud.points, scene_unit=1.0)), rest=None).registration()
 
 
 def phases(moments: list[Moment], chosen: list[int], hidden: tuple[float, float]) -> Iterator[list[bool]]:

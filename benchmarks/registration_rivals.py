@@ -45,7 +45,7 @@ from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import find_correspondences
-from mereo.fitting.registration.fit import fit_frame
+from mereo.fitting.registration.fit import CloudToFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
@@ -130,7 +130,7 @@ def ours(view: Prepared, network: Model, grid: TruthGrid) -> dict[str, Row]:
     """Scores of the network alone and of the fit of the modes."""
     case, model = view.case, view.rest.model
     alone = score(predict_grid(network, case.cloud, grid), grid, len(network.names))
-    modes = scored(fit_frame(case.cloud, network, model, case.unit).registration(), case, grid)
+    modes = scored(fit_frame(CloudToFit(case.cloud.points, case.unit), network, model).registration(), case, grid)
     return {"network": (*alone, np.nan, True, np.empty(0), np.empty(0)), "modes (ours)": modes}
 
 

@@ -12,6 +12,7 @@ from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores
 from mereo.evaluation.scoring import evaluate
 from mereo.evaluation.tables import markdown_table, metrics
+from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.transforms import inverse_rigid, transform_points
@@ -64,7 +65,7 @@ def test_a_registration_is_as_far_off_as_its_points_are(model: Model, view: View
     truth = state_points(state, statistical.nodes, statistical.node_labels)
     truth = transform_points(inverse_rigid(view.T_world_camera), truth)
     cloud = view.depth.to_points()
-    found = Registrar.of(model, "modes").register(cloud, scene_unit=1.0)
+    found = Registrar.of(model, "modes").register(CloudToFit(cloud.points, scene_unit=1.0))
     shown = seen_points(truth, cloud, 1.0)
     exact = RegistrationErrors.of(replace(found, material=truth), truth, shown, 1.0)
     assert exact.seen.max() == exact.hidden.max() == 0.0

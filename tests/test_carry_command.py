@@ -10,7 +10,7 @@ import trimesh
 
 from mereo import __main__ as command_line
 from mereo.evaluation.sample_views import SampleView, load_view
-from mereo.fitting.registration.fit import fit_frame
+from mereo.fitting.registration.fit import CloudToFit, fit_frame
 from mereo.fitting.registration.register import Registrar
 from mereo.io.attachments import Surfaces, read_attachments
 from mereo.io.mesh_formats import read_segmented_mesh
@@ -92,15 +92,18 @@ def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Pa
 
 def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
     registrar, cloud = Registrar.of(weights, "modes"), view.depth.to_points()
-    free = registrar.register(cloud)
+    free = registrar.register(CloudToFit(cloud.points))
     metres, true = (registrar.stated_scene_unit(unit_m) for unit_m in (1.0, 0.01))
-    wrong = registrar.register(cloud, scene_unit=metres, is_certain=False)  # the cloud is said to be in metres
-    right = registrar.register(cloud, scene_unit=true, is_certain=False)
+    # the cloud is said to be in metres
+    wrong = registrar.register(CloudToFit(cloud.points, scene_unit=metres, is_unit_certain=False))
+    right = registrar.register(CloudToFit(cloud.points, scene_unit=true, is_unit_certain=False))
     np.testing.assert_array_equal(wrong.material, free.material)
     assert not wrong.unit_known and not free.unit_known
     assert right.unit_known and right.scene_unit == pytest.approx(1.0, rel=1e-4)
     assert weights.statistical_model is not None
-    near = fit_frame(cloud, weights, weights.statistical_model, scene_unit=0.95, is_certain=False)
+    near = fit_frame(
+        CloudToFit(cloud.points, scene_unit=0.95, is_unit_certain=False), weights, weights.statistical_model
+    )
     assert near.unit == 0.95  # within what the network's own estimate leaves open
 
 

@@ -12,7 +12,7 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation
 from mereo.fitting.draws.fit import chosen_otherwise
 from mereo.fitting.draws.playback import Drawn, DrawnStates
-from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.registration.fit import CloudToFit, ModesFit
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import scene_model, state_points
@@ -102,7 +102,7 @@ def test_a_choice_that_no_start_has_made_is_found() -> None:
     pushed = states_with(model, 1, 1).seeds[0]
     state = SCENE.deform(random_state(SCENE, pushed).deformations)
     material = transform_points(IN_FRONT, state_points(state, model.nodes, model.node_labels))
-    fitted = ModesFit.of(seen(state.mesh.transformed(IN_FRONT)), said(model, material), model, 1.0)
+    fitted = ModesFit.of(CloudToFit(seen(state.mesh.transformed(IN_FRONT)), 1.0), said(model, material), model)
     found = fitted.with_draws(states_with(model, 3, 16))
     assert found.method == "draws" and found.drawn is not None
     assert box_of(found.drawn) == 1

@@ -14,7 +14,7 @@ from mereo.fitting.draws.problem import narrowing as draws_narrowing
 from mereo.fitting.modes.fit import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.residuals import NetworkTerm
-from mereo.fitting.registration.fit import ModesFit, is_drawn
+from mereo.fitting.registration.fit import CloudToFit, ModesFit, is_drawn
 from mereo.scenes.statistical_model import StatisticalModel
 
 SCENE = toy_scene()
@@ -85,7 +85,7 @@ def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, stat
 def test_the_simpler_description_is_preferred_by_its_evidence(model: StatisticalModel, states: DrawnStates) -> None:
     """Draws are taken where their misfit is lower, or higher by less than what the modes' more free numbers buy."""
     points, material = shown(model, 0.5)
-    fitted = ModesFit.of(points, said(model, material), model, 1.0)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
     problem = DrawsProblem.of(fitted.problem, states, fitted.found)
     drawn = fit_draws(problem, fitted.posed)
     assert drawn is not None
@@ -98,7 +98,7 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
 
 def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
     points, material = shown(model, 0.5)
-    fitted = ModesFit.of(points, said(model, material), model, 1.0)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
     problem = DrawsProblem.of(fitted.problem, states, fitted.found)
     drawn = fit_draws(problem, fitted.posed)
     assert drawn is not None and drawn.motion is not None
@@ -114,7 +114,7 @@ def test_a_second_pass_follows_where_the_first_has_failed(
 ) -> None:
     """Modes that are wrong and a single step leave the cloud unexplained; a pass from there comes nearer."""
     points, material = shown(model, 0.5)
-    fitted = ModesFit.of(points, said(model, material), model, 1.0)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
     problem = DrawsProblem.of(fitted.problem, states, fitted.found)
     wrong = replace(fitted.posed, z=np.full(model.count, 2.0))
     poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, hopeless=0.0)
@@ -130,7 +130,7 @@ def test_after_a_search_nobody_is_asked_about_a_frame_that_is_not_explained(
 ) -> None:
     """A search has no correspondences, and draws are fitted all the same."""
     points, material = shown(model, 0.5)
-    fitted = ModesFit.of(points, said(model, material), model, 1.0)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
     base = replace(fitted.problem, network=NetworkTerm.none(model))
     problem = DrawsProblem.of(base, states, nothing())
     strict = replace(problem, config=replace(problem.config, explained=0.0, jumps=0))

@@ -18,6 +18,7 @@ from mereo.fitting.registration.answer_frame import (
     more_evident,
     search_modes,
 )
+from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.sight_lines import SightLines
@@ -155,5 +156,5 @@ def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: Point
 
 def test_a_search_finds_an_unknown_unit(liver: Model, cloud: PointCloud) -> None:
     assert liver.statistical_model is not None
-    found = search_modes(0.001 * cloud.points, liver.statistical_model).registration()
+    found = search_modes(CloudToFit(0.001 * cloud.points), liver.statistical_model).registration()
     assert found.accepted and found.scene_unit == pytest.approx(0.001, rel=0.05)

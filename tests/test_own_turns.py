@@ -19,7 +19,7 @@ from mereo.fitting.draws.problem import DrawsProblem, played
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.own_turns import ANGLES, left_open, own_turns
 from mereo.fitting.problem.posterior import Posterior, covariance_factor
-from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.registration.fit import CloudToFit, ModesFit
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.random_states import scene_model
@@ -180,7 +180,7 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
     deformations = drawn.deformations(scene, truth)
     assert deformations is not None
     material = transform_points(IN_FRONT, material_moved(scene, model, deformations))
-    fitted = ModesFit.of(seen(model.mesh(material)), said(model, material), model, 1.0)
+    fitted = ModesFit.of(CloudToFit(seen(model.mesh(material)), 1.0), said(model, material), model)
     config = replace(MANY_DRAWS, explained=0.01)
     problem = DrawsProblem.of(fitted.problem, states, fitted.found, config)
     wrong = truth.copy()

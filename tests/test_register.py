@@ -19,7 +19,7 @@ from mereo.evaluation.scoring import evaluate
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.registration.fit import CloudToFit, ModesFit
 from mereo.fitting.registration.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
@@ -124,7 +124,7 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
     said = (
         rf"'rope' has other .* \(its segment 'base' has {len(finer.vertices)} vertices, theirs {len(base.vertices)}\)"
     )
-    fitted = Registrar.of(model, "modes").fit_modes(view.depth.to_points())
+    fitted = Registrar.of(model, "modes").fit_modes(CloudToFit(view.depth.to_points().points))
     monkeypatch.setattr(register, "load_scene", lambda name: changed)
     for registrar in (Registrar.of(model), Registrar.of(model, scene=changed)):
         with pytest.warns(ChangedSceneWarning, match=f"{said}: it has changed since .* only the modes .* train them"):
@@ -146,7 +146,7 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
 ) -> None:
     """The fit of its draws takes long, and is the command's above; here it is asked for, and with what."""
     registrar = Registrar.of(model)
-    fitted = registrar.fit_modes(view.depth.to_points())
+    fitted = registrar.fit_modes(CloudToFit(view.depth.to_points().points))
     assert fitted.rest is None
     modes = replace(registrar, method="modes")
     assert modes.finish(fitted).method == "modes" and "states" not in vars(modes)

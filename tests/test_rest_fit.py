@@ -12,7 +12,7 @@ from mereo.fitting.modes.fit import narrowing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.registration.fit import ModesFit, fit_correspondences
+from mereo.fitting.registration.fit import CloudToFit, ModesFit, fit_correspondences
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -44,7 +44,7 @@ def test_a_bent_object_is_not(model: StatisticalModel, excess: float) -> None:
 
 def test_an_object_at_rest_needs_no_draws(model: StatisticalModel) -> None:
     points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
-    fitted = ModesFit.of(points, said(model, material), model, 1.0)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
     assert fitted.rest is not None
     found = fitted.with_draws(DrawnStates.of(SCENE, model, 30))
     assert found.method == "rest" and found.seconds == fitted.seconds
@@ -52,7 +52,7 @@ def test_an_object_at_rest_needs_no_draws(model: StatisticalModel) -> None:
 
 def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(model: StatisticalModel) -> None:
     points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
-    clean = ModesFit.of(points, said(model, material), model, 1.0)
+    clean = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
     noisy = replace(clean, problem=replace(clean.problem, noisy=True))
     assert noisy.asks_draws and not clean.asks_draws
     found = noisy.with_draws(DrawnStates.of(SCENE, model, 30))

@@ -11,6 +11,7 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.answer_frame import search_modes, size_of
+from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.search.screening import CELLS, Poses, Screen, SightTable, medoids, tables_of
 from mereo.fitting.search.search import rotations
 from mereo.geometry.sight_lines import SightLines
@@ -119,7 +120,7 @@ def test_a_rigid_step_draws_a_pose_to_the_frame(model: StatisticalModel) -> None
 def test_a_view_is_found_from_nothing(model: StatisticalModel, index: int, unit: float | None) -> None:
     posed = state(model, index)
     scale = 1.0 if unit else 0.0021
-    fitted = search_modes(scale * view(model, posed), model, unit)
+    fitted = search_modes(CloudToFit(scale * view(model, posed), unit), model)
     found = fitted.registration()
     assert found.accepted and off(model, found.material / scale, posed) < 0.05
     assert found.scene_unit == pytest.approx(scale, rel=0.02)
@@ -129,9 +130,9 @@ def test_a_view_is_found_from_nothing(model: StatisticalModel, index: int, unit:
 def test_a_view_of_which_a_half_is_hidden_is_found_as_one(model: StatisticalModel) -> None:
     posed = state(model, 4)
     points, unknown = cut(view(model, posed), 0.4)
-    told = search_modes(points, model, 1.0, lines=SightLines(np.empty((0, 3)), unknown, "past"))
-    open_ = search_modes(points, model, 1.0)
-    wrong = search_modes(points, model, 1.0, lines=SightLines.of_cloud("past"))
+    told = search_modes(CloudToFit(points, 1.0, lines=SightLines(np.empty((0, 3)), unknown, "past")), model)
+    open_ = search_modes(CloudToFit(points, 1.0), model)
+    wrong = search_modes(CloudToFit(points, 1.0, lines=SightLines.of_cloud("past")), model)
     apart = [off(model, fitted.registration().material, posed) for fitted in (told, open_, wrong)]
     assert max(apart[:2]) < 0.1 < apart[2]
     assert open_.problem.evidence.elsewhere == "unknown"
@@ -148,9 +149,9 @@ def test_noise_is_told_from_a_wrong_state(model: StatisticalModel) -> None:
     points = view(model, posed)
     rng = np.random.default_rng(0)
     noisy = points * (1 + rng.normal(scale=0.5, size=(len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True))
-    fitted = search_modes(noisy, model, 1.0, lines=SightLines.of_cloud("past"))
+    fitted = search_modes(CloudToFit(noisy, 1.0, lines=SightLines.of_cloud("past")), model)
     assert fitted.problem.noisy and off(model, fitted.registration().material, posed) < 0.1
-    assert not search_modes(points, model, 1.0, replace(FitConfig())).problem.noisy
+    assert not search_modes(CloudToFit(points, 1.0), model, replace(FitConfig())).problem.noisy
 
 
 def test_errors_that_neighbours_share_are_noise_too(model: StatisticalModel) -> None:
@@ -161,6 +162,6 @@ def test_errors_that_neighbours_share_are_noise_too(model: StatisticalModel) -> 
     patch = np.unique((across // 0.012).astype(int), axis=0, return_inverse=True)[1].ravel()
     off_by = np.random.default_rng(0).normal(scale=0.5, size=patch.max() + 1)[patch]
     noisy = points * (1 + off_by / np.linalg.norm(points, axis=1))[:, None]
-    fitted = search_modes(noisy, model, 1.0, lines=SightLines.of_cloud("past"))
+    fitted = search_modes(CloudToFit(noisy, 1.0, lines=SightLines.of_cloud("past")), model)
     assert fitted.problem.noisy and fitted.registration().accepted
     assert off(model, fitted.registration().material, posed) < 0.1

@@ -11,6 +11,7 @@ from answers import reconstruct
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking.config import TrackConfig
@@ -97,7 +98,7 @@ def test_noise_alone_moves_a_still_object_less_than_it_moves_single_fits(
     tracker, clouds = Tracker(registrar), [seen(scene, here, 0.1, seed) for seed in range(10)]
     found = [tracker.follow(observe(cloud), number / RATE_HZ, scene_unit=1.0) for number, cloud in enumerate(clouds)]
     places = np.stack([vertices(one.surfaces) for one in found[4:]])
-    alone = [registrar.fit_modes(cloud, scene_unit=1.0).registration().mesh for cloud in clouds[4:7]]
+    alone = [registrar.fit_modes(CloudToFit(cloud.points, scene_unit=1.0)).registration().mesh for cloud in clouds[4:7]]
     spread, single = (
         float(np.sqrt(one.var(axis=0).sum(axis=1).mean())) for one in (places, np.stack([vertices(m) for m in alone]))
     )
@@ -115,7 +116,7 @@ def test_a_jump_is_found_again_in_its_own_frame(
     found = [tracker.follow(observe(seen(scene, there)), number / RATE_HZ, scene_unit=1.0) for number in (2, 3)]
     assert [one.tracked for one in found] == [False, True]
     assert found[0].registration is not None
-    own = registrar.fit_modes(seen(scene, there), scene_unit=1.0).registration()
+    own = registrar.fit_modes(CloudToFit(seen(scene, there).points, scene_unit=1.0)).registration()
     np.testing.assert_allclose(found[0].registration.material, own.material, atol=1e-9)
     assert apart(found[1], there) < apart(found[0], there) + 0.05
 
@@ -231,7 +232,7 @@ def test_without_evidence_the_expected_state_is_the_answer(
     registrar: Registrar, scene: Scene, here: SegmentedMesh
 ) -> None:
     config = TrackConfig()
-    track = Track.of(registrar.fit_modes(seen(scene, here), scene_unit=1.0), 0.0, config)
+    track = Track.of(registrar.fit_modes(CloudToFit(seen(scene, here).points, scene_unit=1.0)), 0.0, config)
     count = POSE + track.problem.model.count
     velocity = 0.1 * np.random.default_rng(0).normal(size=count)
     moving = replace(track, velocity=velocity)
@@ -254,7 +255,7 @@ def test_without_evidence_the_expected_state_is_the_answer(
 
 
 def test_the_speed_of_a_track_is_that_of_its_points(registrar: Registrar, scene: Scene, here: SegmentedMesh) -> None:
-    track = Track.of(registrar.fit_modes(seen(scene, here), scene_unit=1.0), 0.0, TrackConfig())
+    track = Track.of(registrar.fit_modes(CloudToFit(seen(scene, here).points, scene_unit=1.0)), 0.0, TrackConfig())
     shift = np.zeros(POSE + track.problem.model.count)
     assert track.speed == 0.0
     shift[3:6] = (1.0, -2.0, 2.0)

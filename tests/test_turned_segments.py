@@ -16,7 +16,7 @@ from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, played
 from mereo.fitting.problem.evidence import PARTNERS
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.registration.fit import CloudToFit, ModesFit
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.random_states import scene_model
@@ -73,7 +73,7 @@ def moved(z: np.ndarray) -> np.ndarray:
 def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
     material = transform_points(IN_FRONT, moved(z))
     cloud = seen(model().mesh(material))
-    fitted = ModesFit.of(cloud[:: max(1, len(cloud) // points)], said(model(), material), model(), 1.0)
+    fitted = ModesFit.of(CloudToFit(cloud[:: max(1, len(cloud) // points)], 1.0), said(model(), material), model())
     return DrawsProblem.of(fitted.problem, states(), fitted.found)
 
 

@@ -21,6 +21,7 @@ from mereo.cli.stream import line
 from mereo.cli.stream_answers import FrameAnswer
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking.tracker import Tracker
 from mereo.geometry.camera import PointCloud
@@ -221,7 +222,7 @@ def test_a_stream_says_it_where_it_is_asked_to(model: Model, cloud: PointCloud) 
 def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -> None:
     known = replace(model, calibration=Calibration(seed=1, views=2, radius_scale=2.5))
     registrar = Registrar.of(known, "modes")
-    registration = registrar.fit_modes(cloud).registration()
+    registration = registrar.fit_modes(CloudToFit(cloud.points)).registration()
     assert registration.uncertainty is not None and registration.uncertainty.scale == 2.5
     tracker = Tracker(registrar)
     followed = [tracker.follow(observe(cloud), 0.05 * number).registration for number in range(2)]

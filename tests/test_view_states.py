@@ -13,6 +13,7 @@ from toy_scene import toy_scene
 
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.draws.playback import Drawn, material_moved
+from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.registration.state import STATE, load_state, save_state, state_of
@@ -257,7 +258,7 @@ def test_while_a_slider_moves_the_modes_alone_are_fitted(model: Model) -> None:
     view = laboratory.look(random_state(laboratory.scene, 3), laboratory.first_place())
     quick = laboratory.quick_registrar
     assert isinstance(quick, QuickRegistrar)
-    fitted = quick.fit_modes(view.depth.to_points())
+    fitted = quick.fit_modes(CloudToFit(view.depth.to_points().points))
     assert quick.finish(fitted).method == "modes" and "states" not in vars(quick)
     assert "registered model (modes)" in laboratory.rebuild(view, 16, 12, quick=True).source
 

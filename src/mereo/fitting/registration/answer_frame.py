@@ -14,10 +14,10 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.modes.fit import fit_rest, is_at_rest
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
+from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Surface
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.fit import ModesFit
+from mereo.fitting.registration.fit import CloudToFit, ModesFit
 from mereo.fitting.registration.recognition import Recognition, recognize
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
@@ -257,11 +257,8 @@ def fit_hypotheses(
         return Candidate(likelier), likelier
 
     def fit(encoded: EncodedFrame, patience: Registrar) -> Candidate:
-        dropped = encoded.reading.whole.points[~encoded.reading.keep]
-        doubtful = transform_points(encoded.T_camera_input, dropped)
         try:
-            lines = seen.lines.transformed(encoded.T_camera_input)
-            modes = patience.fit_modes(encoded.seen, encoded.code, scene_unit, is_certain, doubtful, lines)
+            modes = patience.fit_modes(cloud_to_fit(encoded, seen.lines, scene_unit, is_certain), encoded.code)
         except ValueError as error:
             return Candidate(encoded, error=error)
         return Candidate(encoded, modes)
@@ -307,15 +304,21 @@ def search_hypotheses(
 
 def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, beside: SightLines) -> Candidate:
     """Candidate of one hypothesis by a search; ``beside`` are the lines of sight beside the object."""
-    dropped = frame.reading.whole.points[~frame.reading.keep]
-    doubtful = transform_points(frame.T_camera_input, dropped) if len(dropped) else None
     try:
         check_size(frame, registrar.model, scene_unit)
-        lines = beside.transformed(frame.T_camera_input)
-        modes = search_modes(frame.seen.points, registrar.model, scene_unit, registrar.config, doubtful, lines)
+        modes = search_modes(cloud_to_fit(frame, beside, scene_unit), registrar.model, registrar.config)
     except ValueError as error:
         return Candidate(frame, error=error, found_by="search")
     return Candidate(frame, modes, found_by="search")
+
+
+def cloud_to_fit(
+    frame: EncodedFrame, lines: SightLines, scene_unit: float | None, is_unit_certain: bool = True
+) -> CloudToFit:
+    """Cloud that one hypothesis takes for the object's; ``lines`` are those beside it, in the frame's axes."""
+    dropped = frame.reading.whole.points[~frame.reading.keep]
+    outliers = transform_points(frame.T_camera_input, dropped) if len(dropped) else None
+    return CloudToFit(frame.seen.points, scene_unit, is_unit_certain, outliers, lines.transformed(frame.T_camera_input))
 
 
 def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float | None) -> None:
@@ -376,32 +379,17 @@ ROTATIONS = 200
 
 
 def search_modes(
-    points: Float[np.ndarray, "n 3"],
+    cloud: CloudToFit,
     model: StatisticalModel,
-    scene_unit: float | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-    doubtful: Float[np.ndarray, "d 3"] | None = None,
-    lines: SightLines | None = None,
 ) -> ModesFit:
-    """Fit of the modes to a cloud, seen from the origin, found by search.
-
-    Args:
-        points: the cloud, any unit.
-        model: the statistical model.
-        scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
-        config: constants.
-        doubtful: points that are none of the cloud: along their lines of sight nothing is known (``Evidence.of``).
-        lines: what is known of the lines of sight beside the cloud; where they leave it open, the fits decide.
-    """
+    """Fit of the modes to a cloud, found by search; where it leaves open what is beside it, the fits decide."""
     started = time.perf_counter()
     with one_blas_thread():
-        unit = size_of(points, model) if scene_unit is None else scene_unit
-        lines = SightLines.of_cloud() if lines is None else lines
-        outliers = None if doubtful is None else doubtful / unit
-        evidence = Evidence.of(points / unit, outliers, lines=lines.scaled(1 / unit))
-        scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD
-        whole = Problem(model, NetworkTerm.none(model), evidence, scale_std, config)
-        is_open = lines.elsewhere is None
+        unit = size_of(cloud.points, model) if cloud.scene_unit is None else cloud.scene_unit
+        is_open = cloud.lines is None or cloud.lines.elsewhere is None
+        evidence = cloud.evidence(unit)
+        whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std(config), config)
         partial = replace(whole, evidence=replace(evidence, elsewhere="unknown")) if is_open else None
         found = search(whole, partial)
         problem, modes = found.problem, found.best

@@ -33,6 +33,36 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 
 @dataclass(frozen=True, eq=False)
+class CloudToFit:
+    """Cloud to which a model is fitted, seen from the origin of the camera frame, in any unit.
+
+    Attributes:
+        points: observed points of the object.
+        scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
+        is_unit_certain: whether that is known for certain; else it is believed where the network's correspondences
+            agree with it.
+        outliers: points that were left out: along their lines of sight nothing is known.
+        lines: what is known of the lines of sight beside the cloud; None of a bare cloud.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    scene_unit: float | None = None
+    is_unit_certain: bool = True
+    outliers: Float[np.ndarray, "o 3"] | None = None
+    lines: SightLines | None = None
+
+    def evidence(self, unit: float) -> Evidence:
+        """Evidence in scene units, of which one has this length in the cloud's unit."""
+        outliers = None if self.outliers is None else self.outliers / unit
+        lines = None if self.lines is None else self.lines.scaled(1 / unit)
+        return Evidence.of(self.points / unit, outliers, lines=lines)
+
+    def scale_std(self, config: FitConfig) -> float:
+        """``Problem.scale_std``."""
+        return config.scale_std if self.scene_unit is None else KNOWN_SCALE_STD
+
+
+@dataclass(frozen=True, eq=False)
 class ModesFit:
     """Frame to which the modes are fitted, and to which the scene's own draws can be fitted as well.
 
@@ -59,33 +89,26 @@ class ModesFit:
     @classmethod
     def of(
         cls,
-        points: Float[np.ndarray, "n 3"],
+        cloud: CloudToFit,
         found: Correspondences,
         model: StatisticalModel,
-        scene_unit: float | None = None,
         config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-        doubtful: Float[np.ndarray, "d 3"] | None = None,
         ask: Ask | None = None,
-        lines: SightLines | None = None,
     ) -> "ModesFit":
-        """Fit of the modes to a cloud, seen from the origin, with correspondences in its unit.
+        """Fit of the modes to a cloud, with correspondences in its unit.
 
         Where much is unexplained, the network is asked again with the camera turned (``with_turns``); where what is
         left is noise, the frame is fitted once more as a noisy one.
 
         Args:
-            points: the cloud.
+            cloud: its lines of sight went past the object where it leaves that open.
             found: correspondences.
             model: the statistical model.
-            scene_unit: length of a scene unit in the cloud's unit, where it is known.
             config: constants.
-            doubtful: points that are none of the cloud: along their lines of sight nothing is known.
-            lines: what is known of the lines of sight beside the cloud; where they leave it open, they went past.
             ask: what the network states about points of the camera frame, in the cloud's unit; None without one.
         """
         started = time.perf_counter()
-        unit = estimate_unit(found) if scene_unit is None else scene_unit
-        scale_std = config.scale_std if scene_unit is None else KNOWN_SCALE_STD
+        unit = estimate_unit(found) if cloud.scene_unit is None else cloud.scene_unit
         found = found.scaled(1 / unit)
 
         def asked(seen: Float[np.ndarray, "s 3"]) -> Correspondences:
@@ -93,12 +116,10 @@ class ModesFit:
             return ask(seen * unit).scaled(1 / unit)
 
         with one_blas_thread():
-            beside = None if lines is None else lines.scaled(1 / unit)
-            evidence = Evidence.of(points / unit, None if doubtful is None else doubtful / unit, lines=beside)
-            problem = Problem.of(model, found, evidence, scale_std, config)
+            problem = Problem.of(model, found, cloud.evidence(unit), cloud.scale_std(config), config)
             understood = problem, found, fit_modes(problem)
             again = None if ask is None else asked
-            problem, found, modes = as_noisy(with_turns(understood, again), points / unit, again)
+            problem, found, modes = as_noisy(with_turns(understood, again), cloud.points / unit, again)
             rest = fit_rest(problem, found, modes.posed)
             at_rest = is_at_rest(problem, modes, rest)
         return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
@@ -224,28 +245,20 @@ def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: Judged 
 
 
 def fit_frame(
-    cloud: PointCloud,
+    cloud: CloudToFit,
     network: Trained,
     model: StatisticalModel,
-    scene_unit: float | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
     code: EncodedCloud | None = None,
-    is_certain: bool = True,
-    doubtful: Float[np.ndarray, "d 3"] | None = None,
-    lines: SightLines | None = None,
 ) -> ModesFit:
     """Fit of the modes to a cloud, from the network's correspondences.
 
     Args:
-        cloud: observed points, camera frame, any unit.
+        cloud: the observed points, with what is known of their unit and surroundings.
         network: trained on this object, with rest coordinates.
         model: statistical model of the same object.
-        scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
         config: constants.
         code: of the cloud, where it is known already.
-        is_certain: whether ``scene_unit`` is that for certain; else it is believed where the correspondences agree.
-        doubtful: points that were left out of the cloud as outliers.
-        lines: what is known of the lines of sight beside the cloud.
 
     Raises ``ValueError`` for a network without rest coordinates or of other segments, and where it finds too little.
     """
@@ -255,16 +268,17 @@ def fit_frame(
             f"the weights know the segments {', '.join(network.names)} but the statistical model has "
             f"{', '.join(model.rest.names)}; they must be of one object: build the model from the weights' own scene"
         )
-    code = network.encode(cloud) if code is None else code
+    code = network.encode(PointCloud(cloud.points)) if code is None else code
     found = _asked(network, model, code)
-    if scene_unit is not None and not is_certain and not agree(estimate_unit(found), scene_unit):
-        scene_unit = None
+    unit = cloud.scene_unit
+    if unit is not None and not cloud.is_unit_certain and not agree(estimate_unit(found), unit):
+        cloud = replace(cloud, scene_unit=None)
     asked = time.perf_counter() - started
 
     def ask(points: Float[np.ndarray, "s 3"]) -> Correspondences:
         return _asked(network, model, network.encode(PointCloud(points)))
 
-    fitted = ModesFit.of(cloud.points, found, model, scene_unit, config, doubtful, ask, lines)
+    fitted = ModesFit.of(cloud, found, model, config, ask)
     return replace(fitted, seconds=fitted.seconds + asked, calibration=network.calibration)
 
 
@@ -287,5 +301,5 @@ def fit_correspondences(
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
 ) -> Registration:
     """Registration from given correspondences, with ``states`` by the scene's draws too; ``points`` are the cloud."""
-    fitted = ModesFit.of(points, found, model, scene_unit, config)
+    fitted = ModesFit.of(CloudToFit(points, scene_unit), found, model, config)
     return fitted.registration() if states is None else fitted.with_draws(states)

@@ -8,16 +8,11 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
-from jaxtyping import Float
-
 from mereo.fitting.config import AnswerMethod, FitConfig
 from mereo.fitting.draws.playback import MOST_DRAWS, DrawnStates, number_of_draws
-from mereo.fitting.registration.fit import ModesFit, fit_frame
+from mereo.fitting.registration.fit import CloudToFit, ModesFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.brief import listed
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.sight_lines import SightLines
 from mereo.io.progress import stage
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.random_states import built_in_model
@@ -173,37 +168,17 @@ class Registrar:
         unit_m = frame.unit_m / registration.scene_unit
         return 1.0 if registration.unit_known and abs(unit_m - 1.0) < ROUNDING else unit_m
 
-    def fit_modes(
-        self,
-        seen: PointCloud,
-        code: EncodedCloud | None = None,
-        scene_unit: float | None = None,
-        is_certain: bool = True,
-        doubtful: Float[np.ndarray, "d 3"] | None = None,
-        lines: SightLines | None = None,
-    ) -> ModesFit:
+    def fit_modes(self, cloud: CloudToFit, code: EncodedCloud | None = None) -> ModesFit:
         """Fit of the modes from the network, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
         assert self.network is not None
-        return fit_frame(seen, self.network, self.model, scene_unit, self.config, code, is_certain, doubtful, lines)
+        return fit_frame(cloud, self.network, self.model, self.config, code)
 
-    def register(
-        self,
-        seen: PointCloud,
-        code: EncodedCloud | None = None,
-        scene_unit: float | None = None,
-        is_certain: bool = True,
-    ) -> Registration:
-        """Registration of the model to a cloud, as ``method`` says.
-
-        Args:
-            seen: observed points, camera frame, any unit.
-            code: what ``network`` made of them, where it is known already.
-            scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
-            is_certain: whether it is that for certain; else only where the network's own estimate agrees.
+    def register(self, cloud: CloudToFit, code: EncodedCloud | None = None) -> Registration:
+        """Registration of the model to a cloud, as ``method`` says; ``code`` is what ``network`` made of it, if known.
 
         Raises ``ValueError`` as ``fit_frame`` does.
         """
-        return self.finish(self.fit_modes(seen, code, scene_unit, is_certain))
+        return self.finish(self.fit_modes(cloud, code))
 
     def finish(self, fitted: ModesFit) -> Registration:
         """The answer from a fit of the modes: the draws too where ``method`` asks for them.
