@@ -148,7 +148,7 @@ def test_far_away_things_are_refused(registrar: Registrar) -> None:
 def test_the_frame_of_the_files_must_be_known(registrar: Registrar) -> None:
     older = replace(registrar, model=replace(registrar.model, source_frame=None))
     points = Positions(SCENE.rest.segments[0].vertices)
-    with pytest.raises(ValueError, match="do not say how the object's own files lie in the scene, .* with --scene, or"):
+    with pytest.raises(ValueError, match="do not say how the object's own files lie in the scene: .* with --scene, or"):
         placed_one(older, points, "source")
     np.testing.assert_array_equal(placed_one(older, points, "scene").content.points, points.points)
     frame = replace(SCENE, T_scene_source=np.diag([10.0, 10.0, 10.0, 1.0]))

@@ -16,7 +16,7 @@ from mereo.geometry.transforms import transform_points
 from mereo.io.attachments import Attachment, Positions
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.models.weights import load_model, save_model
-from mereo.scenes.random_states import scene_model, with_frame
+from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import pack_model, unpack_model
 
@@ -59,16 +59,6 @@ def test_built_in_scenes_say_how_their_files_lie_in_them(
         own = next(part.vertices for part in mesh.segments if "skull_bone" in part.name)
     distance = Solids(loaded.rest).nearest(transform_points(loaded.T_scene_source, own)).distance
     assert np.median(distance) < 0.05, np.median(distance)
-
-
-def test_a_model_from_before_gets_the_frame_of_its_built_in_scene() -> None:
-    rope = load_scene("rope")
-    old = replace(scene_model(rope, 10), source_frame=None)
-    found = with_frame(old, "rope").source_frame
-    assert found is not None
-    np.testing.assert_array_equal(found.T_scene_source, np.eye(4))
-    assert with_frame(old, "mine").source_frame is None
-    assert with_frame(old, "engine").source_frame is None  # another object
 
 
 def test_the_frame_survives_weights_and_older_ones_have_none(tmp_path: Path) -> None:

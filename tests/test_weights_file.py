@@ -84,12 +84,6 @@ def test_what_is_wrong_with_weights_is_one_sentence(text: str, tmp_path: Path) -
     assert trained_steps(path) is None or text in WRONG_STATES
 
 
-def test_weights_that_skip_to_a_layer_that_is_not_there_are_read_as_ever(tmp_path: Path) -> None:
-    """Earlier versions trained such networks, without the skip connection; new ones are refused."""
-    decoder = load_model(changed(tmp_path, lambda h, t: h["network"].update(skip_after=99))).network.config.decoder
-    assert decoder.skip_after == decoder.depth
-
-
 def test_the_command_line_says_so_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad = changed(tmp_path, WRONG["lacks the tensor decoder.head.bias"])
     np.save(tmp_path / "cloud.npy", np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))

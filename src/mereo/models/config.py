@@ -278,8 +278,6 @@ class NetworkConfig:
     def from_dict(cls, settings: Mapping[str, Any]) -> "NetworkConfig":
         """Settings from ``to_dict``, also after a trip through JSON.
 
-        What older weights do not state has its default: what it switches on did not exist then.
-
         Raises:
             ValueError: a name is unknown, or a value of another type or out of its bounds.
         """

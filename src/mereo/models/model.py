@@ -61,7 +61,7 @@ class Model:
         nested: pairs of names (inner, outer), see ``SegmentedMesh``.
         precision: of the products; float32 is exact, bfloat16 faster on GPUs and some CPUs (`mereo bench` says what it
             costs), auto takes bfloat16 there.
-        statistical_model: of the object's states, which a registration fits; older weights have none.
+        statistical_model: of the object's states, which a registration fits; None without.
         calibration: how far the answers can be trusted, as training seeds showed; None where that was not measured.
         name: how the weights were named when they were loaded, a shipped name or a file; "" for others.
     """

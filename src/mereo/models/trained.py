@@ -96,7 +96,7 @@ class Trained(Protocol):
 
     @property
     def statistical_model(self) -> StatisticalModel | None:
-        """Statistical model of the object's states; older weights have none."""
+        """Statistical model of the object's states; None without."""
         ...
 
     @property

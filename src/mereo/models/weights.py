@@ -45,7 +45,7 @@ def weights_bytes(model: Model, dtype: torch.dtype = torch.float32) -> bytes:
     """Content of the file that ``save_model`` writes."""
     states, facts = ({}, None) if model.statistical_model is None else pack_model(model.statistical_model)
     header = {
-        "version": 2 if facts is None else FORMAT_VERSION,
+        "version": FORMAT_VERSION,
         "network": model.network.config.to_dict(),
         "names": model.names,
         "colors": model.colors,

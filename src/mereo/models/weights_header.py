@@ -14,7 +14,7 @@ from mereo.models.config import Loss, NetworkConfig, Supervision
 from mereo.models.network import Network
 
 FORMAT_VERSION = 3
-"""Version of the files: 2 may hold the template in bytes, 3 holds a statistical model too; all are read."""
+"""Version of the files."""
 
 CURE = "the file is damaged or was changed: take it anew, or train again"
 
@@ -42,7 +42,7 @@ class Header(BaseModel):
 
     Attributes:
         network: settings as ``NetworkConfig.to_dict`` gives them.
-        states: facts about the statistical model, which ``statistical_model_file`` reads; older weights have none.
+        states: facts about the statistical model, which ``scenes.statistical_model`` reads; None without one.
     """
 
     network: dict[str, Any]
@@ -65,10 +65,10 @@ def read_header(path: Path, metadata: Mapping[str, str]) -> Header:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} has a header that is not JSON ({error}); {CURE}") from None
     version = content.get("version") if isinstance(content, dict) else None
-    if version not in range(1, FORMAT_VERSION + 1):
+    if version != FORMAT_VERSION:
         raise ValueError(
-            f"{path} has weights format {version}; this mereo reads formats up to {FORMAT_VERSION}: "
-            "train again, or install the matching version"
+            f"{path} has weights format {version}; this mereo reads format {FORMAT_VERSION}: train again, or install "
+            "the matching version"
         )
     header = _checked(path, Header, content)
     _checked(path, Provenance, header.provenance, "provenance")
@@ -105,11 +105,8 @@ def _checked(path: Path, model: type[Checked], content: Any, *within: str) -> Ch
 
 def read_config(path: Path, header: Header) -> NetworkConfig:
     """Settings of the network; ``ValueError`` names the file and the setting that is unknown or out of its bounds."""
-    layers, after = header.network.get("depth"), header.network.get("skip_after")
-    # earlier versions took a layer that there is not, and it meant what the last one means
-    beyond = isinstance(layers, int) and isinstance(after, int) and after > layers
     try:
-        return NetworkConfig.from_dict(header.network | ({"skip_after": layers} if beyond else {}))
+        return NetworkConfig.from_dict(header.network)
     except ValueError as error:
         raise ValueError(f"{path} has a header of no possible network ({error}); {CURE}") from None
 

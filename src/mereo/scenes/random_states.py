@@ -15,9 +15,8 @@ from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import align_all, fit_rigid
 from mereo.io.cores import one_blas_thread
 from mereo.io.progress import stage, tracked
-from mereo.scenes.registry import load_scene
 from mereo.scenes.rest_pose import rest_frame
-from mereo.scenes.scene import SCENES, AssetUnavailable, Scene, State
+from mereo.scenes.scene import Scene, State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import (
     StatisticalModel,
@@ -83,23 +82,6 @@ def sample_states(
             for i in tracked("model", count, "states", quiet=quiet)
         ]
     )
-
-
-def built_in_model(name: str, segments: tuple[str, ...]) -> StatisticalModel | None:
-    """Statistical model of a built-in scene, where it has these segments; None for other objects."""
-    scene = load_scene(name) if name in SCENES else None
-    return scene_model(scene) if scene is not None and scene.rest.names == segments else None
-
-
-def with_frame(model: StatisticalModel, name: str) -> StatisticalModel:
-    """The model with the frame of its built-in scene's own files, where it is from before models kept that."""
-    if model.source_frame is not None or name not in SCENES:
-        return model
-    try:
-        scene = load_scene(name)
-    except AssetUnavailable:
-        return model
-    return replace(model, source_frame=scene.source_frame) if scene.rest.names == model.rest.names else model
 
 
 def states_for(examples: int) -> int:

@@ -20,7 +20,6 @@ from mereo.models.calibration import calibration_rows
 from mereo.models.config import NetworkConfig
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model, weights_bytes
-from mereo.scenes.random_states import built_in_model, with_frame
 from mereo.scenes.statistical_model import modes_within, with_fewer_modes
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS
@@ -254,15 +253,10 @@ def _metrics(folder: Path, model: Model) -> dict[str, Any]:
 
 
 def _with_statistical_model(model: Model) -> Model:
-    """The weights with as many modes of the object's states as fit into ``MOST_BYTES`` beside the network.
-
-    Older weights hold none: they get those of the built-in scene that they were trained on.
-    """
-    scene = str(model.provenance.get("scene"))
-    found = model.statistical_model or built_in_model(scene, model.names)
+    """The weights with as many modes of the object's states as fit into ``MOST_BYTES`` beside the network."""
+    found = model.statistical_model
     if found is None:
         return model
-    found = with_frame(found, scene)
     left = MOST_BYTES - HEADER_BYTES - len(weights_bytes(replace(model, statistical_model=None), torch.float16))
     return replace(model, statistical_model=with_fewer_modes(found, modes_within(found, left)))
 

@@ -22,7 +22,6 @@ from mereo.geometry.transforms import best_rotations, transform_points
 from mereo.io.attachments import Attachment, Content, Placeable, Surfaces
 from mereo.io.config import CarryFrame
 from mereo.io.volume_files import Volume, is_labels
-from mereo.scenes.random_states import with_frame
 from mereo.scenes.scene import SourceFrame
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -490,14 +489,13 @@ def local_rotations(
 
 
 def _source_frame(registrar: Registrar) -> SourceFrame:
-    found = with_frame(registrar.model, registrar.trained_scene).source_frame
+    found = registrar.model.source_frame
     if found is None and registrar.given is not None:
         found = registrar.given.source_frame
     if found is None:
         raise ValueError(
             f"the weights of {', '.join(registrar.model.rest.names)} do not say how the object's own files lie in the "
-            "scene, as they are from before that was kept: name the object's scene file with --scene, or carry files "
-            "in scene units with --carry-frame scene"
+            "scene: name the object's scene file with --scene, or carry files in scene units with --carry-frame scene"
         )
     return found
 

@@ -15,7 +15,6 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.brief import listed
 from mereo.io.progress import stage
 from mereo.models.trained import EncodedCloud, Trained
-from mereo.scenes.random_states import built_in_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.statistical_model import StatisticalModel
@@ -50,15 +49,15 @@ class Registrar:
 
     @classmethod
     def of(cls, network: Trained, method: AnswerMethod = "auto", scene: Scene | str | None = None) -> "Registrar":
-        """Registrar of the model that the weights carry, or of that of their built-in scene, which takes seconds.
+        """Registrar of the model that the weights carry.
 
         Args:
             network: the weights.
             method: which description of the states is fitted.
             scene: the object's scene, its name or its file, where it is not the built-in one of the weights.
 
-        Raises ``ValueError`` where the weights carry no statistical model and know no built-in scene, and where
-        ``method`` is "full" without a scene or with one of another object.
+        Raises ``ValueError`` where the weights carry no statistical model, and where ``method`` is "full" without a
+        scene or with one of another object.
         """
         given = load_scene(scene) if isinstance(scene, str) else scene
         return cls(network, statistical_model_of(network), method, given).checked()
@@ -239,15 +238,14 @@ def other_mesh(scene: Scene, model: StatisticalModel) -> str | None:
 
 
 def statistical_model_of(model: Trained) -> StatisticalModel:
-    """Statistical model that the weights carry; older ones get that of their built-in scene, which takes seconds."""
-    found = model.statistical_model or built_in_model(str(model.provenance.get("scene")), model.names)
-    if found is None:
+    """Statistical model that the weights carry."""
+    if model.statistical_model is None:
         raise ValueError(
             f"the weights of {', '.join(model.names)} carry no statistical model of their object's states; a "
             "registration needs one: finish the dataset with `mereo generate ... --resume` and train again, or use "
             "--method network"
         )
-    return found
+    return model.statistical_model
 
 
 def describe(registration: Registration) -> dict[str, object]:
