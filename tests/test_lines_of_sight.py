@@ -41,7 +41,7 @@ def test_each_pixel_has_its_kind() -> None:
     wrong = image[reach] != expected[reach]
     # at the ends of the wall, at other depths beside it, a pixel may have too few that agree
     assert wrong.sum() <= 4 and not wrong[12:38, 17:43].any()
-    assert lines.elsewhere == "unknown"
+    assert lines.other_lines == "unknown"
 
 
 def test_a_lone_depth_between_object_and_wall_is_no_surface() -> None:
@@ -68,7 +68,7 @@ def test_any_unit_gives_the_same_lines(factor: float) -> None:
     for expected, found in ((lines.scaled(factor), other), (lines, other.scaled(1 / factor))):
         np.testing.assert_allclose(found.past, expected.past)
         np.testing.assert_allclose(found.unknown, expected.unknown)
-        assert found.elsewhere == expected.elsewhere
+        assert found.other_lines == expected.other_lines
 
 
 def test_many_lines_are_thinned_far_from_the_object_only() -> None:
@@ -103,7 +103,7 @@ def test_a_cloud_has_the_kinds_of_its_image() -> None:
     by_cloud = find_object(
         SensorFrame(Path("x"), whole.to_points(), 1.0, "camera"), IsolationConfig(depth_range=(0.9, 1.1))
     ).lines
-    assert by_cloud.elsewhere is None
+    assert by_cloud.other_lines is None
     past, unknown = (
         {place for place in zip(*pixels(points, CAMERA), strict=True) if 5 <= place[0] < 45 and 5 <= place[1] < 55}
         for points in (by_cloud.past, by_cloud.unknown)
@@ -130,13 +130,13 @@ def test_a_scanner_has_the_lines_of_a_camera() -> None:
     assert (np.isclose(lines.unknown[:, 2], -0.8)).sum() > 100
     turned = SightLines(lines.past, lines.unknown, "past").transformed(axes)
     np.testing.assert_allclose(turned.past, lines.past * [1, -1, -1])
-    assert turned.elsewhere == "past"
+    assert turned.other_lines == "past"
 
 
 def test_a_bare_cloud_says_nothing() -> None:
     points = np.random.default_rng(0).normal((0, 0, 10), size=(100, 3))
     for lines in (observe(PointCloud(points)).lines, lines_of_points(points, np.ones(100, dtype=bool))):
-        assert lines.elsewhere is None and len(lines.past) == len(lines.unknown) == 0
+        assert lines.other_lines is None and len(lines.past) == len(lines.unknown) == 0
 
 
 def test_points_that_were_only_thinned_out_are_the_objects() -> None:
@@ -162,15 +162,15 @@ def test_points_that_were_only_thinned_out_are_the_objects() -> None:
 # --- options and files -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("extent", "elsewhere"), [("whole", "past"), ("partial", "unknown"), ("auto", None)])
-def test_the_extent_can_be_stated(extent: Extent, elsewhere: str | None) -> None:
+@pytest.mark.parametrize(("extent", "other_lines"), [("whole", "past"), ("partial", "unknown"), ("auto", None)])
+def test_the_extent_can_be_stated(extent: Extent, other_lines: str | None) -> None:
     lines = observe(PointCloud(np.random.default_rng(0).normal((0, 0, 10), size=(50, 3))), extent=extent).lines
-    assert lines.elsewhere == elsewhere and len(lines.past) == len(lines.unknown) == 0
+    assert lines.other_lines == other_lines and len(lines.past) == len(lines.unknown) == 0
     whole = DepthImage(scene(), CAMERA)
     cut = DepthImage(np.where(SHOWN, whole.depth, 0.0), CAMERA)
     frame = SensorFrame(Path("x"), cut.to_points(), 1.0, "camera", cut, whole=whole)
     lines = find_object(frame, IsolationConfig(extent=extent)).lines
-    assert lines.elsewhere == (elsewhere or "unknown")
+    assert lines.other_lines == (other_lines or "unknown")
     assert (len(lines.past) > 0) == (extent != "partial") and (len(lines.unknown) > 0) == (extent == "auto")
     assert not IsolationConfig(extent=extent).on and FrameOptions(extent=extent).isolation().extent == extent
 
@@ -183,7 +183,7 @@ def test_a_file_keeps_what_its_mask_leaves_out(tmp_path: Path) -> None:
     assert frame.depth is not None and frame.whole is not None and len(frame.cloud) == 400
     np.testing.assert_allclose(frame.whole.depth, scene())
     seen = find_object(frame)
-    assert len(seen.lines.past) > 500 and seen.lines.elsewhere == "unknown"
+    assert len(seen.lines.past) > 500 and seen.lines.other_lines == "unknown"
     # strays are dropped from the points, and remain lines of sight that met something
     fewer = seen.read_as(Reading(seen.cloud, np.arange(400) > 20))
     assert len(fewer.cloud) == 379

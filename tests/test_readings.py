@@ -150,7 +150,7 @@ def test_a_noisy_frame_is_fitted_by_its_own_noise(model: Model, registrar: Regis
     assert clean.problem.config == FitConfig()
     config = found.problem.config
     assert 0.3 < config.cloud_sigma <= LARGEST and config.tolerance == pytest.approx(4.5 * config.cloud_sigma, rel=0.5)
-    assert len(found.problem.evidence.partners) > len(clean.problem.evidence.partners)
+    assert len(found.problem.evidence.observed_samples) > len(clean.problem.evidence.observed_samples)
     assert found.registration().accepted
     metres = fitted(model, registrar, noisy(points, 0.4) * 0.005, unit=0.005).modes
     assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=0.02)

@@ -129,12 +129,12 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
     for registrar in (Registrar.of(model), Registrar.of(model, scene=changed)):
         with pytest.warns(ChangedSceneWarning, match=f"{said}: it has changed since .* only the modes .* train them"):
             assert registrar.finish(fitted).method == "modes"
-        assert registrar.at_hand is None  # said once
+        assert registrar.states_or_none is None  # said once
     for given in (None, changed):
         with pytest.raises(ValueError, match=f"{said}, so its draws .* or use --method modes"):
             Registrar.of(model, "full", given)
     with pytest.raises(ValueError, match=f"{said}, so its draws"):  # named as that of other weights
-        assert Registrar.of(replace(model, provenance={"scene": "mine"}), scene=changed).at_hand
+        assert Registrar.of(replace(model, provenance={"scene": "mine"}), scene=changed).states_or_none
     for method in ("auto", "modes", "full"):
         with pytest.raises(ValueError, match=f"{said}, so places cannot be compared: .* with --method network"):
             evaluate(model, changed, examples=1, method=method)
@@ -151,7 +151,7 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
     modes = replace(registrar, method="modes")
     assert modes.finish(fitted).method == "modes" and "states" not in vars(modes)
     foreign = replace(registrar, network=replace(model, provenance={"scene": "mine"}))
-    assert foreign.finish(fitted).method == "modes" and foreign.at_hand is None
+    assert foreign.finish(fitted).method == "modes" and foreign.states_or_none is None
     asked: list[DrawnStates] = []
 
     def with_draws(self: ModesFit, states: DrawnStates) -> Registration:
@@ -160,7 +160,7 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
 
     monkeypatch.setattr(ModesFit, "with_draws", with_draws)
     registrar.finish(fitted)
-    assert asked == [few_rope_states] and registrar.at_hand is few_rope_states
+    assert asked == [few_rope_states] and registrar.states_or_none is few_rope_states
 
 
 def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(
@@ -170,7 +170,7 @@ def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(
         raise AssetUnavailable("the mesh is not here")
 
     monkeypatch.setattr(register, "load_scene", missing)
-    assert Registrar.of(model).at_hand is None
+    assert Registrar.of(model).states_or_none is None
     with pytest.raises(AssetUnavailable, match="the mesh is not here"):
         Registrar.of(model, "full")
 
@@ -184,7 +184,7 @@ def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> N
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
     stretched = view.depth.to_points().points * np.array([1.0, 2.5, 1.0])
     without_scene = replace(model, provenance={"scene": "mine"})
-    found = answer_to(stretched, model, Registrar.of(without_scene).at_once, 32)  # asks no search either
+    found = answer_to(stretched, model, Registrar.of(without_scene).without_retries, 32)  # asks no search either
     assert found.registration is not None and not found.registration.accepted and not found.taken
     forced = answer_to(stretched, model, Registrar.of(model, "modes"), 32)
     assert forced.taken and forced.registration is not None and not forced.registration.accepted

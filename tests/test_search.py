@@ -124,7 +124,7 @@ def test_a_view_is_found_from_nothing(model: StatisticalModel, index: int, unit:
     found = fitted.registration()
     assert found.accepted and off(model, found.material / scale, posed) < 0.05
     assert found.scene_unit == pytest.approx(scale, rel=0.02)
-    assert fitted.problem.evidence.elsewhere == "past"  # seen whole, and taken for that
+    assert fitted.problem.evidence.other_lines == "past"  # seen whole, and taken for that
 
 
 def test_a_view_of_which_a_half_is_hidden_is_found_as_one(model: StatisticalModel) -> None:
@@ -135,7 +135,7 @@ def test_a_view_of_which_a_half_is_hidden_is_found_as_one(model: StatisticalMode
     wrong = search_modes(CloudToFit(points, 1.0, lines=SightLines.of_cloud("past")), model)
     apart = [off(model, fitted.registration().material, posed) for fitted in (told, open_, wrong)]
     assert max(apart[:2]) < 0.1 < apart[2]
-    assert open_.problem.evidence.elsewhere == "unknown"
+    assert open_.problem.evidence.other_lines == "unknown"
 
 
 def test_the_size_of_a_cloud_is_guessed(model: StatisticalModel) -> None:

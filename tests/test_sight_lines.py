@@ -65,7 +65,7 @@ def test_past_is_empty_and_nothing_is_known_where_the_object_is_hidden(views: li
             # an occlusion edge is no silhouette: hidden pixels beside the visible ones are there, and unknown
             near = ~surrounded(~seen.mask)
             assert (labels[hidden & near] == "u").all()
-            assert lines.elsewhere == "unknown"
+            assert lines.other_lines == "unknown"
 
 
 @pytest.mark.parametrize("sensor", ["structured-light", "time-of-flight"])
@@ -88,12 +88,12 @@ def test_a_rendered_image_leaves_open_what_is_beside_the_object(views: list[View
     for number, view in enumerate(views):
         seen = occlude(view, "none", 0.0, np.random.default_rng(0), CLEAN, wall=False)
         lines = find_object(seen.frame()).lines
-        assert lines.elsewhere is None and len(lines.past) == len(lines.unknown) == 0
+        assert lines.other_lines is None and len(lines.past) == len(lines.unknown) == 0
         # an occluder before nothing is unknown, and the zeros around it remain open
         seen = occlude(view, "hand", 0.3, np.random.default_rng(number), CLEAN, wall=False)
         lines = find_object(seen.frame()).lines
         labels = kinds(seen, lines)
-        assert lines.elsewhere is None and (labels[seen.source == NOTHING] == "").all()
+        assert lines.other_lines is None and (labels[seen.source == NOTHING] == "").all()
         hidden = (seen.alone.depth > 0) & (seen.source == OCCLUDER)
         assert hidden.any() and (labels[hidden] == "u").all()
 
@@ -114,7 +114,7 @@ def test_outside_the_picture_is_unknown_where_the_object_reaches_its_edge(views:
         sight = lines.unknown[outside, :2] / lines.unknown[outside, 2:]
         gap = np.linalg.norm(sight[:, None] - (lost[:, :2] / lost[:, 2:])[None], axis=2).min(axis=0)
         assert gap.max() < 4 / camera.focal_x_px and np.median(gap) < 1e-9 + 1 / camera.focal_x_px
-        assert lines.elsewhere == ("unknown" if wall else None)
+        assert lines.other_lines == ("unknown" if wall else None)
 
 
 # --- the simulator ---------------------------------------------------------------------------------------------------

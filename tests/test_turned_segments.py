@@ -14,7 +14,7 @@ from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.fitting.draws.fit import by_sight, descend, lower, turned, twins, with_twins_turned
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, played
-from mereo.fitting.problem.evidence import PARTNERS
+from mereo.fitting.problem.evidence import OBSERVED_SAMPLES
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.fit import CloudToFit, ModesFit
 from mereo.geometry.mesh import SegmentedMesh
@@ -129,12 +129,12 @@ def test_a_step_never_leads_up() -> None:
 
 def test_the_answer_is_fitted_to_every_point_and_judged_by_them() -> None:
     problem = problem_of(TRUTH)
-    assert len(problem.base.evidence.points) > PARTNERS
+    assert len(problem.base.evidence.points) > OBSERVED_SAMPLES
     dense = problem.base.by_every_point
-    assert len(dense.evidence.partners) == len(problem.base.evidence.points) and dense.by_every_point is dense
+    assert len(dense.evidence.observed_samples) == len(problem.base.evidence.points) and dense.by_every_point is dense
     found = by_sight(problem, state(problem, TRUTH + 0.02))
     again = played(replace(problem, by_sight=True, base=dense), found.drawn, found.z, found.posed)
-    assert again is not None and found.misfit == again.misfit and len(found.distance) == PARTNERS
+    assert again is not None and found.misfit == again.misfit and len(found.distance) == OBSERVED_SAMPLES
     assert found.motion is not None
     few = problem_of(TRUTH, points=300)
     assert few.base.by_every_point is few.base

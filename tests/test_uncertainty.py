@@ -219,9 +219,9 @@ def test_the_scale_is_that_which_holds_95_percent(found: Registration, material:
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
     one = RadiusRatios.of(found, material, shown)
     np.testing.assert_array_equal(one.seen, shown)
-    calibrated = RadiusRatios.of(replace(found, radius_scale=7.0, radius_beside=0.05), material, shown)
-    np.testing.assert_allclose(calibrated.radii, one.by(7.0).with_beside(0.05).radii)
-    np.testing.assert_allclose(calibrated.ratios, one.by(7.0).with_beside(0.05).ratios, atol=1e-12)
+    calibrated = RadiusRatios.of(replace(found, radius_scale=7.0, extra_radius=0.05), material, shown)
+    np.testing.assert_allclose(calibrated.radii, one.by(7.0).with_extra_radius(0.05).radii)
+    np.testing.assert_allclose(calibrated.ratios, one.by(7.0).with_extra_radius(0.05).ratios, atol=1e-12)
     off = np.linalg.norm(found.material - material, axis=1)
     assert found.uncertainty is not None
     np.testing.assert_array_equal(one.ratios <= 1.0, off <= found.uncertainty.material)

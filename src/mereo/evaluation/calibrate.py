@@ -392,7 +392,9 @@ class Measured:
 
     def widened(self, factors: RadiusFactors) -> RadiusRatios:
         """Ratios to the radii that a calibration makes wider; its scale is left out."""
-        return self.ratios.by(factors.widening(self.misfit)).with_beside(self.half * factors.beside(self.displaced))
+        return self.ratios.by(factors.widening(self.misfit)).with_extra_radius(
+            self.half * factors.beside(self.displaced)
+        )
 
 
 class RadiusGauge:
@@ -404,7 +406,7 @@ class RadiusGauge:
     """
 
     def __init__(self, full: Registrar | None = None) -> None:
-        self.full = None if full is None or full.at_hand is None else full
+        self.full = None if full is None or full.states_or_none is None else full
         self.clean: tuple[list[Measured], list[Measured]] = [], []
         self.noisy: tuple[list[Measured], list[Measured]] = [], []
         self.asked = 0

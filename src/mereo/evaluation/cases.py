@@ -111,7 +111,7 @@ class RadiusRatios:
             return self
         return RadiusRatios(self.ratios / scale, self.gaussian * scale, self.beside, self.seen)
 
-    def with_beside(self, radius: float) -> "RadiusRatios":
+    def with_extra_radius(self, radius: float) -> "RadiusRatios":
         """The same with a radius, in scene units, that every point has beside the others."""
         off = np.maximum((self.ratios * self.gaussian) ** 2 - radius**2, 0.0)
         return RadiusRatios(np.sqrt(off) / self.gaussian, self.gaussian, np.hypot(self.beside, radius), self.seen)
@@ -317,7 +317,7 @@ def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
     """Names of the answers that can be had: the draws only of an object whose scene is at hand."""
     if registrar is None:
         return ("network",)
-    if registrar.method == "modes" or registrar.at_hand is None:
+    if registrar.method == "modes" or registrar.states_or_none is None:
         return ("network", "modes")
     return ("network", "modes", "full")
 

@@ -23,25 +23,25 @@ class FitConfig:
     Attributes:
         start_sigma: standard deviation of the network's correspondences.
         first_steps: steps on the correspondences alone, their sigma falling from ``first_widening`` times to once.
-        first_worth: how many independent points the correspondences are worth in these.
-        last_steps: steps on cloud, witnesses and correspondences; the cloud's sigma falls by ``cooling`` in each.
+        first_weight: how many independent points the correspondences are worth in these.
+        last_steps: steps on cloud, silhouette and correspondences; the cloud's sigma falls by ``cooling`` in each.
         cloud_sigma: last standard deviation of the cloud, in scene units, where its noise is not larger.
-        cloud_worth: how many independent points the cloud is worth.
-        network_worth: the same of the correspondences, at the first and at the last of these steps.
-        pair_worth: the same of the distances that the states keep.
+        cloud_weight: how many independent points the cloud is worth.
+        network_weight: the same of the correspondences, at the first and at the last of these steps.
+        pair_weight: the same of the distances that the states keep.
         pair_slack: how far these distances may be off at first; it falls by ``pair_cooling`` in each step.
         damping: of every step, relative to the diagonal.
         neighbors: states of the library around an answer whose Gaussian is the prior of the next.
         neighbor_std: standard deviation of each coefficient that is added to theirs.
         refine_sigma, refine_steps: the cloud's first sigma, and steps, under the prior of the neighbours.
-        explained: the cloud's misfit, in squared standard deviations of a partner, above which other states are tried.
+        explained: the cloud's misfit, in squared standard deviations of a sample, above which other states are tried.
         tries, places: states of the library that are tried, and states in which one joint is elsewhere, of each joint.
         screened, screen_steps: how many of either are drawn towards the frame by few points, and in how many steps.
         refined, last_widening, last_refine: how many are refined, from which ``refine_sigma`` and in how many steps.
         rounds: how often other states are tried.
         curved: other states are tried only where this many distances are kept: smooth bending has one optimum.
         samples, coarse_samples: points of the surface that stand for it in most steps, and in the choice of states.
-        witnesses: how many of them are compared with what the frame rules out.
+        silhouette_vertices: how many of them are compared with what the frame rules out.
         exact_steps: last steps, which ask the faces themselves.
         search_rounds: rounds of the search at most, while nothing explains the frame.
         scale_std: standard deviation of the scale's logarithm where the unit is not known.
@@ -56,13 +56,13 @@ class FitConfig:
     start_sigma: float = 0.06
     first_steps: int = 8
     first_widening: float = 2.5
-    first_worth: float = 500.0
+    first_weight: float = 500.0
     last_steps: int = 15
     cooling: float = 0.75
     cloud_sigma: float = 0.2
-    cloud_worth: float = 3000.0
-    network_worth: tuple[float, float] = (60.0, 10.0)
-    pair_worth: float = 100.0
+    cloud_weight: float = 3000.0
+    network_weight: tuple[float, float] = (60.0, 10.0)
+    pair_weight: float = 100.0
     pair_slack: float = 0.05
     pair_cooling: float = 0.7
     damping: float = 1e-3
@@ -84,7 +84,7 @@ class FitConfig:
     scale_std: float = 0.1
     samples: int = 3000
     coarse_samples: int = 1000
-    witnesses: int = 500
+    silhouette_vertices: int = 500
     exact_steps: int = 3
     accepted: float = 0.95
     tolerance: float = 0.45
@@ -106,8 +106,8 @@ class DrawsConfig:
             and the ``chosen`` most like the shape approach it.
         shape_std: standard deviation of the shape that the modes found, as a share of half the rest box's longest side.
         shape_worth: how many independent points a shape is worth.
-        cloud_worth, network_worth: the same of the cloud and of the correspondences, from beginning to end, also where
-            draws and modes are compared.
+        cloud_weight, network_weight: the same of the cloud and of the correspondences, from beginning to end, also
+            where draws and modes are compared.
         first_rounds, last_rounds: sets of differences in the fit to the frame, after a jump and else.
         steps: at most with one set of differences.
         tries: dampings at most in one step.
@@ -140,8 +140,8 @@ class DrawsConfig:
     sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
     shape_std: float = 0.04
     shape_worth: float = 500.0
-    cloud_worth: float = 1500.0
-    network_worth: float = 30.0
+    cloud_weight: float = 1500.0
+    network_weight: float = 30.0
     first_rounds: int = 1
     last_rounds: int = 2
     steps: int = 6
@@ -167,8 +167,8 @@ class DrawsConfig:
 
 
 MANY_DRAWS = DrawsConfig(
-    cloud_worth=3000.0,
-    network_worth=10.0,
+    cloud_weight=3000.0,
+    network_weight=10.0,
     batches=2,
     passes=1,
     starts=16,

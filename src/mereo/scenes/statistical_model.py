@@ -110,12 +110,12 @@ def _distances(
 SPARSE = 200
 """Material points by which states of the library are compared."""
 
-WITNESSES = 1500
+SILHOUETTE_VERTICES = 1500
 """Vertices that are compared with what a frame rules out."""
 
 OF_REST: tuple[str, ...] = (
     *("faces", "vertex_counts", "labels", "rest_points", "half", "rest_center"),
-    *("anchors", "rest_anchors", "witnesses", "sparse"),
+    *("anchors", "rest_anchors", "silhouette_vertices", "sparse"),
 )
 """Derived values that depend on the rest pose alone."""
 
@@ -209,9 +209,9 @@ class StatisticalModel:
         return tuple(Anchors(index, self.rest_points[index]) for index in self.anchors)
 
     @cached_property
-    def witnesses(self) -> Int[np.ndarray, " w"]:
+    def silhouette_vertices(self) -> Int[np.ndarray, " w"]:
         """Surface vertices, evenly spread."""
-        return spread(self.rest_points[: sum(self.vertex_counts)], WITNESSES)
+        return spread(self.rest_points[: sum(self.vertex_counts)], SILHOUETTE_VERTICES)
 
     @cached_property
     def sparse(self) -> Int[np.ndarray, " p"]:

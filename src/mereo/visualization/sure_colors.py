@@ -77,7 +77,7 @@ class SureColors:
 def point_marks(one: Explanation, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
     """A byte for each observed point: how much it decides a place, 0 to ``MOST``, or that it is ``UNEXPLAINED``.
 
-    The weights are those of the fit's partners, which stand for the points around them.
+    The weights are those of the fit's observed samples, which stand for the points around them.
     """
     away, nearest = cKDTree(one.points).query(points)
     share = one.weights[nearest] / max(float(one.weights.max()), np.finfo(np.float64).tiny)

@@ -34,8 +34,8 @@ from mereo.fitting.draws.problem import (
 from mereo.fitting.modes.fit import refine, robust_poses
 from mereo.fitting.problem.gauss_newton import POSE, Posed
 from mereo.fitting.problem.joints import branches
-from mereo.fitting.problem.own_turns import OwnTurn, own_turns
 from mereo.fitting.problem.residuals import robust_square
+from mereo.fitting.problem.symmetries import Symmetry, find_symmetries
 from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder
 from mereo.scenes.parameters import play, played_back
@@ -71,7 +71,7 @@ def by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """The state brought to what the lines of sight meet, by every observed point.
 
     Nearest places lead there from afar, and noise takes them a little beside it; over more points it averages out. The
-    answer has the partners of all other states, but its misfit by every point: those it was fitted to.
+    answer has the observed samples of all other states, but its misfit by every point: those it was fitted to.
     """
     sighted = replace(problem, by_sight=True)
     dense = replace(sighted, base=problem.last)
@@ -356,7 +356,7 @@ def _drawn_anew(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: i
 
 # Shapes in which segments that look alike turned are turned together, as a target for the draws.
 #
-#     rest shapes, joints -own_turns-> OwnTurn -twins-> groups -turned-> a shape -fit-> another state
+#     rest shapes, joints -find_symmetries-> Symmetry -twins-> groups -turned-> a shape -fit-> another state
 #
 # An arm looks the same with the forearm half a turn round, the wrist bent the other way and the hand turned back. No
 # small step leads there, and no jump of one draw: several change at once. But the shape is known, so that the draws can
@@ -367,7 +367,7 @@ def _drawn_anew(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: i
 NEXT = np.deg2rad(15.0)
 """Turns that are no farther apart than this are one: the angles asked about are 10 degrees apart."""
 
-Twins = tuple[tuple[OwnTurn, float], ...]
+Twins = tuple[tuple[Symmetry, float], ...]
 """Segments that hang on each other, and the angle by which each is turned."""
 
 
@@ -377,7 +377,9 @@ def twins(model: StatisticalModel) -> tuple[Twins, ...]:
 
     A segment that spins, or looks alike in many turns, is left to single draws, which slide along its surface.
     """
-    single = {turn.label - 1: (turn, angle) for turn, angle in map(_only_angle, own_turns(model)) if angle is not None}
+    single = {
+        turn.label - 1: (turn, angle) for turn, angle in map(_only_angle, find_symmetries(model)) if angle is not None
+    }
     if len(single) < 2:
         return ()
     touch = np.zeros((len(model.anchors),) * 2, dtype=bool)
@@ -391,7 +393,7 @@ def twins(model: StatisticalModel) -> tuple[Twins, ...]:
     return tuple(tuple(some) for some in members if len(some) > 1)
 
 
-def _only_angle(turn: OwnTurn) -> tuple[OwnTurn, float | None]:
+def _only_angle(turn: Symmetry) -> tuple[Symmetry, float | None]:
     """The middle of a turn's angles where these are one run no wider than ``NEXT`` on either side, else None."""
     middle = float(turn.angles.mean())
     return turn, middle if np.abs(turn.angles - middle).max() <= NEXT else None

@@ -18,7 +18,14 @@ from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, geman_mcclure, in_space
 from mereo.fitting.problem.posterior import Terms
 from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import MOST_VIOLATIONS, ROBUST, WITNESS_WEIGHT, NetworkTerm, Surface, robust_square
+from mereo.fitting.problem.residuals import (
+    MOST_VIOLATIONS,
+    ROBUST,
+    SILHOUETTE_WEIGHT,
+    NetworkTerm,
+    Surface,
+    robust_square,
+)
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.transforms import best_rotations
 from mereo.scenes.scene import Scene
@@ -68,7 +75,7 @@ class DrawsProblem:
         model = base.model
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= DrawsConfig().few else MANY_DRAWS
-        worths = replace(base.config, cloud_worth=config.cloud_worth, network_worth=(config.network_worth,) * 2)
+        worths = replace(base.config, cloud_weight=config.cloud_weight, network_weight=(config.network_weight,) * 2)
         base = replace(base, config=worths)
         return cls(base, states, found, model.weights(found.rest, found.labels), config)
 
@@ -102,7 +109,7 @@ class DrawsFit:
         posed: rigid pose; its ``z`` is empty.
         material: material points, unposed.
         surface: the posed surface.
-        distance, face, place: of what each observed partner is compared with.
+        distance, face, place: of what each observed sample is compared with.
         misfit: with the prior of the draws, the cloud by its last sigma.
         motion: of the played points for a standard deviation of each draw, where it is known.
     """
@@ -144,20 +151,20 @@ def beside(
     surface = Surface.through(problem.model, rigid.place(material))
     if len(surface.facing) == 0:
         return None
-    partners = problem.base.evidence.partners
-    met = problem.base.met(surface) if problem.by_sight else surface.nearest(partners)
+    observed_samples = problem.base.evidence.observed_samples
+    met = problem.base.met(surface) if problem.by_sight else surface.nearest(observed_samples)
     fit = DrawsFit(drawn, z, rigid, material, surface, *met, np.inf)
     return replace(fit, misfit=misfit(problem, fit, problem.base.config.cloud_sigma))
 
 
 def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
-    """Misfit as ``Problem.misfit`` counts it, by any sigma of the cloud, without looking for partners again."""
+    """Misfit as ``Problem.misfit`` counts it, by any sigma of the cloud, without looking for observed samples again."""
     base = problem.base
-    cloud = base.config.cloud_worth * float(robust_square(fit.distance, sigma).mean())
-    network = base.config.network_worth[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
-    amount = base.evidence.violations(fit.surface.material[base.witnesses], ROBUST * sigma)[1]
-    witnesses = WITNESS_WEIGHT * float(robust_square(amount, sigma, 4 * ROBUST).sum())
-    return cloud + network + witnesses + float(fit.z @ fit.z)
+    cloud = base.config.cloud_weight * float(robust_square(fit.distance, sigma).mean())
+    network = base.config.network_weight[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
+    amount = base.evidence.violations(fit.surface.material[base.silhouette_vertices], ROBUST * sigma)[1]
+    silhouette_vertices = SILHOUETTE_WEIGHT * float(robust_square(amount, sigma, 4 * ROBUST).sum())
+    return cloud + network + silhouette_vertices + float(fit.z @ fit.z)
 
 
 def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:
@@ -182,15 +189,15 @@ def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3
     network = problem.network(fit, (problem.followed @ flat).reshape(-1, 3, count))
     return Terms(
         known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
-        network=network.add_to(nothing, state, base.network_sigma, config.network_worth[1], robust=True),
+        network=network.add_to(nothing, state, base.network_sigma, config.network_weight[1], robust=True),
         cloud=cloud_rows(problem, fit, motion, sigma),
-        partners=base.evidence.partners,
+        observed_samples=base.evidence.observed_samples,
         ruled_out=ruled_out(problem, fit, motion, sigma),
     )
 
 
 def cloud_rows(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Rows:
-    """Each observed partner's distance to its plane of the surface, its derivatives, and its weight."""
+    """Each observed sample's distance to its plane of the surface, its derivatives, and its weight."""
     base, spread = problem.base, problem.states.played.spread
     corners = problem.model.faces[fit.surface.facing[fit.face]]
     within = barycentric(fit.surface.material[corners], fit.place).astype(np.float32)
@@ -198,8 +205,8 @@ def cloud_rows(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray,
     at_places = csr_array((within.ravel(), (rows, corners.ravel())), shape=(len(corners), spread.shape[0])) @ spread
     modes = (at_places @ motion.reshape(len(motion), -1)).reshape(-1, 3, len(fit.z))
     direction = fit.surface.normals[fit.face]
-    residual = np.einsum("pi,pi->p", direction, fit.place - base.evidence.partners)
-    weight = geman_mcclure(residual, ROBUST * sigma) * (base.config.cloud_worth / len(residual) / sigma**2)
+    residual = np.einsum("pi,pi->p", direction, fit.place - base.evidence.observed_samples)
+    weight = geman_mcclure(residual, ROBUST * sigma) * (base.config.cloud_weight / len(residual) / sigma**2)
     return along(fit.posed, fit.place, modes, direction), residual, weight
 
 
@@ -208,7 +215,7 @@ def ruled_out(
 ) -> NormalEquations:
     """Normal equations of the vertices that are outside the silhouette or in free space."""
     base, spread, nothing = problem.base, problem.states.played.spread, NormalEquations.nothing(POSE + len(fit.z))
-    chosen = base.witnesses
+    chosen = base.silhouette_vertices
     direction, amount = base.evidence.violations(fit.surface.material[chosen], ROBUST * sigma)
     rows = np.flatnonzero(amount > 0)
     if len(rows) == 0:
@@ -216,7 +223,7 @@ def ruled_out(
     rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
     modes = (spread[chosen[rows]] @ motion.reshape(len(motion), -1)).reshape(-1, 3, len(fit.z))
     jacobian = along(fit.posed, fit.surface.material[chosen[rows]], modes, direction[rows])
-    weight = WITNESS_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
+    weight = SILHOUETTE_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
     return nothing.add(jacobian, -amount[rows], weight)
 
 

@@ -26,17 +26,17 @@ from mereo.geometry.surface_patches import smoothed
 from mereo.geometry.transforms import best_rotations, fit_rigid, robust_rigid, rotation_along
 
 
-def fit_modes(problem: Problem) -> "Judged":
+def fit_modes(problem: Problem) -> "ScoredFit":
     """The whole fit, and how well it explains the frame."""
     return explored(problem, refined(problem, fit_whole(problem)))
 
 
-def refined(problem: Problem, posed: Posed) -> "Judged":
+def refined(problem: Problem, posed: Posed) -> "ScoredFit":
     """The better of a state and of what its refinement makes of it."""
-    return Judged.of(problem, posed).better(problem, refine(problem, posed))
+    return ScoredFit.of(problem, posed).better(problem, refine(problem, posed))
 
 
-def explored(problem: Problem, best: "Judged") -> "Judged":
+def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     """The best of a state and, while that does not explain the cloud, of others that agree with it or the network."""
     config = problem.config
     for number in range(config.rounds if len(problem.model.pairs) >= config.curved else 0):
@@ -51,7 +51,7 @@ def explored(problem: Problem, best: "Judged") -> "Judged":
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class ScoredFit:
     """A state, its misfit, and the surface that was judged."""
 
     posed: Posed
@@ -59,14 +59,14 @@ class Judged:
     surface: Surface
 
     @classmethod
-    def of(cls, problem: Problem, posed: Posed) -> "Judged":
+    def of(cls, problem: Problem, posed: Posed) -> "ScoredFit":
         """Judge a state."""
         surface = Surface.of(problem.model, posed)
         return cls(posed, problem.misfit(posed, surface), surface)
 
-    def better(self, problem: Problem, other: Posed) -> "Judged":
+    def better(self, problem: Problem, other: Posed) -> "ScoredFit":
         """This, or the other where its misfit is lower."""
-        judged = Judged.of(problem, other)
+        judged = ScoredFit.of(problem, other)
         return judged if judged.misfit.total < self.misfit.total else self
 
 
@@ -129,7 +129,7 @@ def fit_network(problem: Problem, posed: Posed, prior: Prior) -> Posed:
         sigma = problem.network_sigma * config.first_widening ** (1.0 - share)
         normal = problem.known(posed, prior, config.pair_slack * problem.model.half)
         robust = 3 * step >= config.first_steps
-        normal = problem.network.add_to(normal, posed, sigma, config.first_worth, robust)
+        normal = problem.network.add_to(normal, posed, sigma, config.first_weight, robust)
         posed = posed.moved(normal.step(config.damping))
     return posed
 
@@ -140,7 +140,7 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
     for step in range(steps):
         share = step / max(1, steps - 1)
         sigma = max(start * half * config.cooling**step, config.cloud_sigma)
-        worth = config.network_worth[0] * (1 - share) + config.network_worth[1] * share
+        worth = config.network_weight[0] * (1 - share) + config.network_weight[1] * share
         normal = problem.known(posed, prior, slack * half * config.pair_cooling**step)
         exact = steps - step <= config.exact_steps and sigma <= 2 * config.cloud_sigma
         posed = posed.moved(problem.seen(normal, posed, sigma, worth, exact).step(config.damping))
@@ -246,14 +246,14 @@ def _different(shapes: Float[np.ndarray, "n c"], count: int) -> Int[np.ndarray, 
 # prior is N(0, 1) each.
 
 
-def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> Judged:
+def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> ScoredFit:
     """Fit of the rest model's pose, from that of the modes; its ``posed.z`` is empty."""
     model, config, rest = problem.model, problem.config, of_rest(problem, found)
     T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
     start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
     prior = Prior(np.empty(0), np.empty((0, 0)))
     posed = fit_cloud(rest, start, prior, config.refine_sigma, config.refine_steps, 0.0)
-    return Judged.of(rest, posed)
+    return ScoredFit.of(rest, posed)
 
 
 def of_rest(problem: Problem, found: Correspondences) -> Problem:
@@ -263,7 +263,7 @@ def of_rest(problem: Problem, found: Correspondences) -> Problem:
     return replace(problem, model=rigid, network=NetworkTerm.of(rigid, found))
 
 
-def is_at_rest(problem: Problem, modes: Judged, rest: Judged) -> bool:
+def is_at_rest(problem: Problem, modes: ScoredFit, rest: ScoredFit) -> bool:
     """Whether the evidence of the rest model is greater than that of the modes."""
     return rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
 
@@ -272,21 +272,21 @@ def narrowing(problem: Problem, modes: Posed) -> float:
     """``NormalEquations.narrowing`` of the modes at a state."""
     config = problem.config
     known = problem.known(modes, Prior.whole(problem.model), 0.0)
-    return problem.seen(known, modes, config.cloud_sigma, config.network_worth[1], True).narrowing()
+    return problem.seen(known, modes, config.cloud_sigma, config.network_weight[1], True).narrowing()
 
 
 # --- noisy frames -----------------------------------------------------------------------------------------------------
 
 # A frame as it is understood: what the network states of it, and the fit to both; a noisy one is fitted once more.
 
-Ask = Callable[[Float[np.ndarray, "n 3"]], Correspondences]
+PredictCorrespondences = Callable[[Float[np.ndarray, "n 3"]], Correspondences]
 """What the network states about points of the camera frame, in their unit."""
 
-Understood = tuple[Problem, Correspondences, Judged]
+NetworkFit = tuple[Problem, Correspondences, ScoredFit]
 """A frame with what the network states of it, and the fit to both."""
 
 
-def as_noisy(start: Understood, points: Float[np.ndarray, "n 3"], ask: Ask | None) -> Understood:
+def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], ask: PredictCorrespondences | None) -> NetworkFit:
     """The fit to a noisy frame where what a fit leaves over is noise, else that one.
 
     Whether that is so is asked of the second fit: noise throws the first off by more than it is itself.
@@ -342,7 +342,7 @@ def turns(axis: Float[np.ndarray, "3"]) -> Iterator[Float[np.ndarray, "3 3"]]:
         yield (Rotation.from_rotvec(tilt) * Rotation.from_rotvec(number * ROLL * axis)).as_matrix()
 
 
-def with_turns(start: Understood, ask: Ask | None) -> Understood:
+def with_turns(start: NetworkFit, ask: PredictCorrespondences | None) -> NetworkFit:
     """A fit as it is, or where much is unexplained the best of it and of those with the camera turned.
 
     Args:
@@ -356,7 +356,7 @@ def with_turns(start: Understood, ask: Ask | None) -> Understood:
     best, waiting = start, turns(points.mean(axis=0))
     while rounds := list(islice(waiting, ROUND)):
         for problem, found in best_turned([seen_turned(start[0], points, turn, ask) for turn in rounds]):
-            modes = Judged.of(problem, refine(problem, fit_whole(problem)))
+            modes = ScoredFit.of(problem, refine(problem, fit_whole(problem)))
             if modes.misfit.without_network < best[2].misfit.without_network:
                 best = problem, found, modes
         if best[2].misfit.cloud < UNEXPLAINED or (anyway and best[0].leaves_noise(best[2].surface)):
@@ -365,7 +365,7 @@ def with_turns(start: Understood, ask: Ask | None) -> Understood:
 
 
 def seen_turned(
-    problem: Problem, points: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "3 3"], ask: Ask
+    problem: Problem, points: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "3 3"], ask: PredictCorrespondences
 ) -> tuple[Problem, Correspondences]:
     """The frame with what the network states when the camera is turned, turned back."""
     found = ask(points @ turn.T).turned(turn.T)

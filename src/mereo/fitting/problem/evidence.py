@@ -22,10 +22,10 @@ from mereo.geometry.transforms import rotation_along
 MOST_POINTS = 6000
 """Denser clouds are averaged to so many points, which have less noise."""
 
-PARTNERS = 500
+OBSERVED_SAMPLES = 500
 """Observed points, evenly spread, that are compared with the model's surface."""
 
-MORE_PARTNERS = 4000
+MORE_SAMPLES = 4000
 """The same of a noisy frame, whose noise averages out over more of them."""
 
 SILHOUETTE_PITCHES = 1.2
@@ -75,37 +75,37 @@ class Evidence:
 
     Attributes:
         points: observed, camera frame.
-        partners: some of them, evenly spread.
+        observed_samples: some of them, evenly spread.
         sight: search tree over the unit vectors towards ``points``, and along lines of sight on which nothing is known.
         ranges: distance of each point from the camera.
         front: nearest of these among each line of sight and those around it; 0 where nothing is known.
         pitch: angle between neighbouring lines of sight.
         around: indices of each point's neighbours among the lines of sight, up to 8.
         past: lines of sight that went past the object to something that was measured; None without any.
-        elsewhere: kind of the lines of sight that are near none of all these.
+        other_lines: kind of the lines of sight that are near none of all these.
     """
 
     points: Float[np.ndarray, "n 3"]
-    partners: Float[np.ndarray, "p 3"]
+    observed_samples: Float[np.ndarray, "p 3"]
     sight: cKDTree
     ranges: Float[np.ndarray, " n"]
     front: Float[np.ndarray, " s"]
     pitch: float
     around: Int[np.ndarray, "n k"]
     past: PastLines | None = None
-    elsewhere: SightKind = "past"
+    other_lines: SightKind = "past"
 
     @classmethod
     def of(
         cls,
         points: Float[np.ndarray, "n 3"],
-        doubtful: Float[np.ndarray, "d 3"] | None = None,
-        partners: int = PARTNERS,
+        outliers: Float[np.ndarray, "d 3"] | None = None,
+        observed_samples: int = OBSERVED_SAMPLES,
         lines: SightLines | None = None,
     ) -> "Evidence":
-        """Prepare a cloud, with so many ``partners`` at most; its lines of sight start at the origin.
+        """Prepare a cloud, with so many ``observed_samples`` at most; its lines of sight start at the origin.
 
-        Along those of ``doubtful`` points, which a front end has taken for outliers, anything may be: they are within
+        Along those of ``outliers`` points, which a front end has taken for outliers, anything may be: they are within
         the silhouette, and rule nothing out. ``lines`` says what is known beside the cloud; without it, and where it
         leaves that open, all lines of sight beside the cloud went past the object.
         """
@@ -116,27 +116,27 @@ class Evidence:
         # the fourth neighbour of a pixel is one pitch away, as the first is; irregular clouds are not so lucky
         pitch = float(np.median(angle[:, min(4, len(points)) - 1]))
         front = np.where(angle <= AROUND_PITCHES * pitch, ranges[near], np.inf).min(axis=1)
-        unknown = [part for part in (doubtful, None if lines is None else lines.unknown) if part is not None]
+        unknown = [part for part in (outliers, None if lines is None else lines.unknown) if part is not None]
         if sum(map(len, unknown)):
             toward = np.concatenate(unknown)
             toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
             sight = cKDTree(np.concatenate([sight.data, toward]))
             front = np.concatenate([front, np.zeros(len(toward))])
-        chosen, around = points[spread(points, partners)], near[:, 1:]
+        chosen, around = points[spread(points, observed_samples)], near[:, 1:]
         if lines is None:
             return cls(points, chosen, sight, ranges, front, pitch, around)
-        past, elsewhere = PastLines.of(lines.past, pitch), lines.elsewhere or "past"
-        return cls(points, chosen, sight, ranges, front, pitch, around, past, elsewhere)
+        past, other_lines = PastLines.of(lines.past, pitch), lines.other_lines or "past"
+        return cls(points, chosen, sight, ranges, front, pitch, around, past, other_lines)
 
     @property
-    def with_more_partners(self) -> "Evidence":
-        """The same with as many partners as a noisy frame needs."""
-        return replace(self, partners=self.points[spread(self.points, MORE_PARTNERS)])
+    def with_more_samples(self) -> "Evidence":
+        """The same with as many observed samples as a noisy frame needs."""
+        return replace(self, observed_samples=self.points[spread(self.points, MORE_SAMPLES)])
 
     @property
     def may_be_cut(self) -> bool:
         """Whether something may hide a part of the object, or lie beside it where nothing is known."""
-        return self.elsewhere == "unknown" or len(self.sight.data) > len(self.points)
+        return self.other_lines == "unknown" or len(self.sight.data) > len(self.points)
 
     @property
     def hidden_edge(self) -> float:
@@ -169,7 +169,7 @@ class Evidence:
         ahead = self.front[near] - slack - distance
         direction = np.where(beside[:, None], out, toward)
         amount = np.maximum(np.where(beside, length - self.pitch * distance, ahead), 0.0)
-        if self.past is not None or self.elsewhere == "unknown":
+        if self.past is not None or self.other_lines == "unknown":
             rows = np.flatnonzero(beside)
             nearest = np.where(near[rows] < len(self.points), np.inf, angle[rows])
             amount[rows[distance[rows] > self._free(toward[rows], nearest) - slack]] = 0.0
@@ -194,9 +194,9 @@ class Evidence:
         ``unknown`` is the angle to the nearest line of sight on which nothing is known, infinite where one that met the
         object is nearer; one that went past the object counts where it is nearer than that.
         """
-        elsewhere = np.inf if self.elsewhere == "past" else 0.0
+        other_lines = np.inf if self.other_lines == "past" else 0.0
         if self.past is None:
-            return np.full(len(toward), elsewhere)
+            return np.full(len(toward), other_lines)
         angle, near = self.past.sight.query(toward)
-        free = np.where(angle <= self.past.reach[near], self.past.ranges[near], elsewhere)
+        free = np.where(angle <= self.past.reach[near], self.past.ranges[near], other_lines)
         return np.where(unknown < angle, 0.0, free)

@@ -80,15 +80,15 @@ class Terms:
     Attributes:
         known: without the frame: prior, scale, kept distances.
         network: the correspondences.
-        cloud: distances of the observed partners from the surface, as rows.
-        partners: the partners, camera frame, scene units.
+        cloud: distances of the observed samples from the surface, as rows.
+        observed_samples: the observed samples, camera frame, scene units.
         ruled_out: silhouette and free space.
     """
 
     known: NormalEquations
     network: NormalEquations
     cloud: Rows
-    partners: Float[np.ndarray, "n 3"]
+    observed_samples: Float[np.ndarray, "n 3"]
     ruled_out: NormalEquations
 
     @cached_property
@@ -108,7 +108,7 @@ class Posterior:
         factor: p x p, ``factor factor^T`` is the covariance of the parameters.
         residue: root mean square distance of the object's states from what the coefficients can express.
         open: motion of the material points with further standard normal numbers, by the second moments of what is far
-            from Gaussian (``own_turns``, a state beside rest), in the camera's axes; None without.
+            from Gaussian (``find_symmetries``, a state beside rest), in the camera's axes; None without.
     """
 
     posed: Posed

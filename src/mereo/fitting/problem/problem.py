@@ -8,29 +8,29 @@ from jaxtyping import Float, Int
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.evidence import MORE_PARTNERS, PARTNERS, Evidence
+from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed, Rows
 from mereo.fitting.problem.joints import Joints
 from mereo.fitting.problem.residuals import (
     ROBUST,
-    WITNESS_WEIGHT,
+    SILHOUETTE_WEIGHT,
     NetworkTerm,
     PairTerm,
     Prior,
     SampledSurface,
     Surface,
     add_cloud,
-    add_witnesses,
+    add_silhouette,
     cloud_rows,
     robust_square,
 )
-from mereo.scenes.statistical_model import WITNESSES, StatisticalModel
+from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 COARSE = 3
-"""How many times fewer partners and correspondences a choice among many states needs."""
+"""How many times fewer observed samples and correspondences a choice among many states needs."""
 
 BESIDE = 1.0
-"""Share of the samples' spacing: a partner so far beside one is still on its plane."""
+"""Share of the samples' spacing: an observed sample so far beside one is still on its plane."""
 
 KNOWN_SCALE_STD = 1e-6
 """``Problem.scale_std`` of a frame whose unit is known."""
@@ -39,7 +39,7 @@ FAR = 1.0
 """Scene units beyond the tolerance by which a vertex is ruled out for good."""
 
 UNEXPLAINED = 0.3
-"""The cloud's misfit, in squared standard deviations of a partner, above which a fit is likely wrong."""
+"""The cloud's misfit, in squared standard deviations of an observed sample, above which a fit is likely wrong."""
 
 TAILS = 1.5
 """The same, in those of normal noise as great as what the fit leaves over."""
@@ -50,9 +50,9 @@ class Misfit:
     """Misfit: how badly a state explains a frame, as squared standard deviations.
 
     Attributes:
-        cloud: of one partner on average.
+        cloud: of one observed sample on average.
         network: of all correspondences, as much as they are worth.
-        witnesses: of all vertices that the frame rules out.
+        silhouette: of all vertices that the frame rules out.
         prior: of the coefficients, under the Gaussian of all states.
         pairs: of the kept distances, as much as they are worth.
         total: all of it, the cloud as much as it is worth.
@@ -60,7 +60,7 @@ class Misfit:
 
     cloud: float
     network: float
-    witnesses: float
+    silhouette: float
     prior: float
     pairs: float
     total: float
@@ -109,9 +109,9 @@ class Problem:
         return PairTerm.of(self.model)
 
     @property
-    def witnesses(self) -> Int[np.ndarray, " w"]:
+    def silhouette_vertices(self) -> Int[np.ndarray, " w"]:
         """Surface vertices that are compared with silhouette and free space."""
-        return self.model.witnesses
+        return self.model.silhouette_vertices
 
     @property
     def network_sigma(self) -> float:
@@ -121,7 +121,7 @@ class Problem:
     def known(self, posed: Posed, prior: Prior, slack: float) -> NormalEquations:
         """Normal equations of what is known without the frame: prior, scale, kept distances up to ``slack``."""
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
-        return self.pairs.add_to(normal, posed.z, self.config.pair_worth, slack)
+        return self.pairs.add_to(normal, posed.z, self.config.pair_weight, slack)
 
     def noise_beside(self, surface: Surface) -> float:
         """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
@@ -138,7 +138,7 @@ class Problem:
         config = constants_for(noise, self.config)
         if config is self.config:
             return None
-        return replace(self, config=config, evidence=self.evidence.with_more_partners, noisy=True)
+        return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
     def wants_turns(self, cloud: float, surface: Surface) -> bool:
         """Whether a misfit of the cloud, much greater than its noise, says that the fit is likely wrong."""
@@ -150,11 +150,11 @@ class Problem:
 
     @property
     def by_every_point(self) -> "Problem":
-        """The problem with as many partners as a noisy frame has; the same where they are all of them already."""
+        """The problem with as many observed samples as a noisy frame has; the same where it has them already."""
         evidence = self.evidence
-        if len(evidence.partners) >= min(len(evidence.points), MORE_PARTNERS):
+        if len(evidence.observed_samples) >= min(len(evidence.points), MORE_SAMPLES):
             return self
-        return replace(self, evidence=evidence.with_more_partners)
+        return replace(self, evidence=evidence.with_more_samples)
 
     def with_network(self, found: Correspondences) -> "Problem":
         """The problem with other correspondences."""
@@ -180,11 +180,11 @@ class Problem:
         return ROBUST * self.config.cloud_sigma
 
     def met(self, surface: Surface) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
-        """``Surface.along_sight`` of the observed partners."""
-        return surface.along_sight(self.evidence.partners, self.far)
+        """``Surface.along_sight`` of the observed samples."""
+        return surface.along_sight(self.evidence.observed_samples, self.far)
 
     def cloud_misfit(self, surface: Surface) -> float:
-        """Misfit of the cloud, in squared standard deviations of a partner."""
+        """Misfit of the cloud, in squared standard deviations of an observed sample."""
         return float(robust_square(self.met(surface)[0], self.config.cloud_sigma).mean())
 
     @cached_property
@@ -200,12 +200,16 @@ class Problem:
     @cached_property
     def coarse(self) -> "Problem":
         """Problem with fewer points, for the choice among many states."""
-        config = replace(self.config, samples=self.config.coarse_samples, witnesses=self.config.witnesses // COARSE)
+        config = replace(
+            self.config,
+            samples=self.config.coarse_samples,
+            silhouette_vertices=self.config.silhouette_vertices // COARSE,
+        )
         if self.noisy:  # its sigma would ask the faces in all steps
             config = replace(config, exact_steps=0)
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
-        evidence = replace(self.evidence, partners=self.evidence.partners[: PARTNERS // COARSE])
+        evidence = replace(self.evidence, observed_samples=self.evidence.observed_samples[: OBSERVED_SAMPLES // COARSE])
         coarse = Problem(self.model, network, evidence, self.scale_std, config, self.noisy)
         vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))
         return coarse
@@ -213,12 +217,12 @@ class Problem:
     def screen(self, posed: Posed, sigma: float) -> Misfit:
         """Misfit by the samples alone: good enough to choose among states, and ten times as fast."""
         samples = self.samples.posed(posed)
-        place, normal, _ = samples.planes(self.evidence.partners)
-        offset = self.evidence.partners - place
+        place, normal, _ = samples.planes(self.evidence.observed_samples)
+        offset = self.evidence.observed_samples - place
         across = np.einsum("pi,pi->p", offset, normal)
         beside = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
         distance = np.hypot(across, np.maximum(beside - BESIDE * self.samples.spacing, 0.0))
-        amount = self.evidence.violations(samples.few(self.config.witnesses).place, ROBUST * sigma)[1]
+        amount = self.evidence.violations(samples.few(self.config.silhouette_vertices).place, ROBUST * sigma)[1]
         return self.total(
             float(robust_square(distance, sigma).mean()),
             self.network.energy(posed, self.network_sigma),
@@ -227,48 +231,49 @@ class Problem:
         )
 
     def seen(
-        self, normal: NormalEquations, posed: Posed, sigma: float, network_worth: float, exact: bool
+        self, normal: NormalEquations, posed: Posed, sigma: float, network_weight: float, exact: bool
     ) -> NormalEquations:
-        """Sum with cloud, witnesses and correspondences; ``exact`` asks the faces and not the samples."""
-        samples, partners = self.samples.posed(posed), self.evidence.partners
-        planes = Surface.of(self.model, posed).planes(partners, self.far) if exact else samples.planes(partners)
-        normal = self.network.add_to(normal, posed, self.network_sigma, network_worth, robust=True)
-        normal = add_cloud(normal, posed, partners, planes, sigma, self.config.cloud_worth)
-        return add_witnesses(normal, posed, samples.few(self.config.witnesses), self.evidence, sigma)
+        """Sum with cloud, silhouette and correspondences; ``exact`` asks the faces and not the samples."""
+        samples, observed = self.samples.posed(posed), self.evidence.observed_samples
+        planes = Surface.of(self.model, posed).planes(observed, self.far) if exact else samples.planes(observed)
+        normal = self.network.add_to(normal, posed, self.network_sigma, network_weight, robust=True)
+        normal = add_cloud(normal, posed, observed, planes, sigma, self.config.cloud_weight)
+        return add_silhouette(normal, posed, samples.few(self.config.silhouette_vertices), self.evidence, sigma)
 
     def cloud_rows(self, posed: Posed) -> Rows:
-        """Residuals of the observed partners from the faces, as the last steps of a fit have them."""
-        partners, config = self.evidence.partners, self.config
-        planes = Surface.of(self.model, posed).planes(partners, self.far)
-        return cloud_rows(posed, partners, planes, config.cloud_sigma, config.cloud_worth)
+        """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
+        observed_samples, config = self.evidence.observed_samples, self.config
+        planes = Surface.of(self.model, posed).planes(observed_samples, self.far)
+        return cloud_rows(posed, observed_samples, planes, config.cloud_sigma, config.cloud_weight)
 
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""
         surface = surface or Surface.of(self.model, posed)
         cloud, network = self.cloud_misfit(surface), self.network.energy(posed, self.network_sigma)
-        return self.total(cloud, network, self._witness_square(surface), posed.z)
+        return self.total(cloud, network, self._silhouette_square(surface), posed.z)
 
-    def witness_misfit(self, surface: Surface) -> float:
+    def silhouette_misfit(self, surface: Surface) -> float:
         """Misfit of all vertices that the frame rules out."""
-        return self._witness_square(surface) * WITNESS_WEIGHT * WITNESSES
+        return self._silhouette_square(surface) * SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES
 
-    def _witness_square(self, surface: Surface) -> float:
+    def _silhouette_square(self, surface: Surface) -> float:
         """Mean square of how far a vertex is ruled out, in standard deviations."""
         sigma = self.config.cloud_sigma
-        amount = self.evidence.violations(surface.material[self.witnesses], ROBUST * sigma)[1]
+        amount = self.evidence.violations(surface.material[self.silhouette_vertices], ROBUST * sigma)[1]
         return float(robust_square(amount, sigma, 4 * ROBUST).mean())
 
     def ruled_out(self, surface: Surface) -> float:
         """Share of a surface's vertices that the frame rules out by more than ``FAR``."""
-        amount = self.evidence.violations(surface.material[self.witnesses], self.config.tolerance)[1]
+        amount = self.evidence.violations(surface.material[self.silhouette_vertices], self.config.tolerance)[1]
         return float((amount > FAR).mean())
 
-    def total(self, cloud: float, network: float, witnesses: float, z: Float[np.ndarray, " k"]) -> Misfit:
-        """Misfit from the mean squares of one partner, one correspondence and one witness."""
-        network, witnesses = network * self.config.network_worth[1], witnesses * WITNESS_WEIGHT * WITNESSES
-        prior, pairs = float(z @ z), self.config.pair_worth * self.pairs.energy(z)
-        total = self.config.cloud_worth * cloud + network + witnesses + prior + pairs
-        return Misfit(cloud, network, witnesses, prior, pairs, total)
+    def total(self, cloud: float, network: float, silhouette: float, z: Float[np.ndarray, " k"]) -> Misfit:
+        """Misfit from the mean squares of one observed sample, one correspondence and one silhouette vertex."""
+        network = network * self.config.network_weight[1]
+        silhouette = silhouette * SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES
+        prior, pairs = float(z @ z), self.config.pair_weight * self.pairs.energy(z)
+        total = self.config.cloud_weight * cloud + network + silhouette + prior + pairs
+        return Misfit(cloud, network, silhouette, prior, pairs, total)
 
     def unposed(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 3"]:
         """The correspondences' places in the model's frame."""

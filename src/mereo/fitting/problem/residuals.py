@@ -1,7 +1,7 @@
 """Terms of the fit: what the network said, the observed points, and what the frame rules out.
 
 Every term gives normal equations near a state; lengths in scene units, camera frame. Notation: n correspondences, p
-partners, k modes.
+observed samples, k modes.
 """
 
 from dataclasses import dataclass
@@ -117,7 +117,7 @@ ROBUST = 2.5
 """Residuals beyond this many sigma count for little."""
 
 MOST_VIOLATIONS = 400
-WITNESS_WEIGHT = 0.2
+SILHOUETTE_WEIGHT = 0.2
 
 
 def robust_square(residual: Float[np.ndarray, " r"], sigma: float, robust: float = ROBUST) -> Float[np.ndarray, " r"]:
@@ -290,7 +290,7 @@ def cloud_rows(posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, s
     return along(posed, place, modes, across), residual, weight
 
 
-def add_witnesses(
+def add_silhouette(
     normal: NormalEquations, posed: Posed, samples: PosedSamples, evidence: Evidence, sigma: float
 ) -> NormalEquations:
     """Sum with the samples of the surface that are outside the silhouette or in free space."""
@@ -301,7 +301,7 @@ def add_witnesses(
         return normal
     rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
     jacobian = along(posed, place[rows], samples.surface.modes[rows, 0], direction[rows])
-    weight = WITNESS_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
+    weight = SILHOUETTE_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
     return normal.add(jacobian, -amount[rows], weight)
 
 

@@ -163,7 +163,7 @@ def is_forced(candidate: Candidate) -> bool:
     modes = candidate.modes
     assert modes is not None
     surface = modes.surface if modes.rest is None else Surface.of(modes.problem.model, modes.posed)
-    return modes.problem.witness_misfit(surface) + float(modes.posed.z @ modes.posed.z) > FORCED
+    return modes.problem.silhouette_misfit(surface) + float(modes.posed.z @ modes.posed.z) > FORCED
 
 
 def is_astray(candidate: Candidate) -> bool:
@@ -177,7 +177,7 @@ def is_hidden_in_part(seen: Observation, candidate: Candidate) -> bool:
     """Whether an occluder or the picture's edge cuts the object: networks are trained on whole ones."""
     frame = candidate.encoded
     lines = seen.lines.transformed(frame.T_camera_input)
-    if len(lines.unknown) == 0 and lines.elsewhere != "unknown":
+    if len(lines.unknown) == 0 and lines.other_lines != "unknown":
         return False
     return Evidence.of(frame.seen.points, lines=lines).hidden_edge > HIDDEN
 
@@ -192,11 +192,11 @@ def more_evident(first: Candidate, second: Candidate) -> Candidate:
         return first if second.modes is None else second
     if second.is_accepted and not first.is_accepted:
         return second
-    one, other = first.modes.problem.evidence.elsewhere, second.modes.problem.evidence.elsewhere
+    one, other = first.modes.problem.evidence.other_lines, second.modes.problem.evidence.other_lines
     if one == other:
         return second if misfit_in(first.modes, second.modes) < misfit_in(first.modes, first.modes) else first
     cost = [
-        misfit_in(each, each) + (WHOLE if each.problem.evidence.elsewhere == "unknown" else 0.0)
+        misfit_in(each, each) + (WHOLE if each.problem.evidence.other_lines == "unknown" else 0.0)
         for each in (first.modes, second.modes)
     ]
     return second if cost[1] < cost[0] else first
@@ -266,7 +266,7 @@ def fit_hypotheses(
     if len(hypotheses) == 1:
         return fit(likelier, registrar), likelier
     # beside outliers much stays unexplained in any case, which is no reason to ask again
-    quick = registrar.at_once
+    quick = registrar.without_retries
     pair = fit(likelier, quick), fit(encode_frame(hypotheses[1], model, axes), quick)
     everything, surfaces = sorted(pair, key=lambda candidate: candidate.hypothesis.dropped)
     best = everything if surfaces.modes is None else surfaces
@@ -277,7 +277,7 @@ def fit_hypotheses(
             again = surfaces if given_back is None else fit(encode_frame(given_back, model, axes), quick)
             best = _most_explained(everything, surfaces, surfaces if again.modes is None else again)
     if best.modes is not None and not best.is_accepted:  # then it is not for outliers alone
-        best = better(best, fit(best.encoded, registrar.at_last))
+        best = better(best, fit(best.encoded, registrar.with_retries))
     if best.modes is not None:
         spent = time.perf_counter() - started - best.encoded.timings_s["encode"]
         best = replace(best, modes=replace(best.modes, seconds=spent))
@@ -387,10 +387,10 @@ def search_modes(
     started = time.perf_counter()
     with one_blas_thread():
         unit = size_of(cloud.points, model) if cloud.scene_unit is None else cloud.scene_unit
-        is_open = cloud.lines is None or cloud.lines.elsewhere is None
+        is_open = cloud.lines is None or cloud.lines.other_lines is None
         evidence = cloud.evidence(unit)
         whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std(config), config)
-        partial = replace(whole, evidence=replace(evidence, elsewhere="unknown")) if is_open else None
+        partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
         found = search(whole, partial)
         problem, modes = found.problem, found.best
         rest = fit_rest(problem, nothing(), modes.posed)

@@ -15,7 +15,16 @@ from mereo.fitting.draws.fit import fit_draws
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws.problem import narrowing as draws_narrowing
-from mereo.fitting.modes.fit import Ask, Judged, as_noisy, fit_modes, fit_rest, is_at_rest, of_rest, with_turns
+from mereo.fitting.modes.fit import (
+    PredictCorrespondences,
+    ScoredFit,
+    as_noisy,
+    fit_modes,
+    fit_rest,
+    is_at_rest,
+    of_rest,
+    with_turns,
+)
 from mereo.fitting.modes.fit import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import Correspondences, agree, estimate_unit, find_correspondences
 from mereo.fitting.problem.evidence import Evidence
@@ -82,7 +91,7 @@ class ModesFit:
     unit: float
     posed: Posed
     seconds: float
-    rest: Judged | None = None
+    rest: ScoredFit | None = None
     calibration: Calibration | None = None
     alike: int = 1
 
@@ -93,7 +102,7 @@ class ModesFit:
         found: Correspondences,
         model: StatisticalModel,
         config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-        ask: Ask | None = None,
+        ask: PredictCorrespondences | None = None,
     ) -> "ModesFit":
         """Fit of the modes to a cloud, with correspondences in its unit.
 
@@ -182,7 +191,7 @@ class ModesFit:
     def _registration(
         self, method: Method, z: Float[np.ndarray, " k"], optimum: Optimum, posed: Posed, surface: Surface
     ) -> Registration:
-        distance = surface.nearest(self.problem.evidence.partners)[0]
+        distance = surface.nearest(self.problem.evidence.observed_samples)[0]
         explained = float((distance <= self.tolerance).mean())
         scale, beside = self._radius_factors(method, surface)
         return Registration(
@@ -200,12 +209,12 @@ class ModesFit:
             needed=self.problem.config.accepted,
             optimum=optimum,
             radius_scale=scale,
-            radius_beside=beside,
+            extra_radius=beside,
             alike=self.alike,
         )
 
     def _radius_factors(self, method: Method, surface: Surface) -> tuple[float | None, float]:
-        """``Registration.radius_scale`` and ``radius_beside``."""
+        """``Registration.radius_scale`` and ``extra_radius``."""
         if self.calibration is None:
             return None, 0.0
         factors, model = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy), self.problem.model
@@ -232,7 +241,7 @@ class ModesFit:
         return float((model.labels[model.faces[surface.facing[face], 0]] == seen.labels).mean())
 
 
-def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: Judged | None = None) -> bool:
+def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: ScoredFit | None = None) -> bool:
     """Whether a state of the draws is to be preferred to the modes, or to the rest model, where that is given.
 
     By the points that the answer was fitted to.

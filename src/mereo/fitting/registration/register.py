@@ -131,18 +131,18 @@ class Registrar:
     def prepare(self) -> None:
         """Do once what all frames need: simulate the states in which a fit of draws begins, where draws are fitted.
 
-        Raises as ``at_hand`` does.
+        Raises as ``states_or_none`` does.
         """
         if self.fits_draws:
-            _ = self.at_hand
+            _ = self.states_or_none
 
     @property
-    def at_once(self) -> "Registrar":
+    def without_retries(self) -> "Registrar":
         """The same without the patience to ask about a frame again with the camera turned."""
         return replace(self, config=replace(self.config, turned=False))
 
     @property
-    def at_last(self) -> "Registrar":
+    def with_retries(self) -> "Registrar":
         """The same, which asks about a frame with the camera turned however noisy it may be."""
         return replace(self, config=replace(self.config, turned_anyway=True))
 
@@ -187,7 +187,7 @@ class Registrar:
         """
         modes = fitted.registration()
         hopeless = self.method != "full" and not modes.accepted
-        states = None if not self.fits_draws or hopeless or not fitted.asks_draws else self.at_hand
+        states = None if not self.fits_draws or hopeless or not fitted.asks_draws else self.states_or_none
         return modes if states is None else fitted.with_draws(states)
 
     def takes(self, registration: Registration) -> bool:
@@ -195,7 +195,7 @@ class Registrar:
         return registration.accepted or self.method != "auto" or self.network is None
 
     @cached_property
-    def at_hand(self) -> DrawnStates | None:
+    def states_or_none(self) -> DrawnStates | None:
         """``states``, but None where the scene's mesh cannot be had: the weights carry all that the modes need.
 
         With "full" that raises ``AssetUnavailable``.

@@ -82,7 +82,7 @@ class Registration:
         optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
             where the registration was read from a file.
         radius_scale: factor of the radii by the weights' calibration of such fits to such frames; None without one.
-        radius_beside: radius that every place has beside that, as ``Uncertainty.beside``; scene units.
+        extra_radius: radius that every place has beside that, as ``Uncertainty.beside``; scene units.
         alike: number of states, each elsewhere, that a search found to explain the frame alike, this one included.
     """
 
@@ -101,7 +101,7 @@ class Registration:
     needed: float = BELIEVED
     optimum: Optimum | None = None
     radius_scale: float | None = None
-    radius_beside: float = 0.0
+    extra_radius: float = 0.0
     alike: int = 1
 
     def __repr__(self) -> str:
@@ -182,7 +182,7 @@ class Registration:
         """How far the true places may be from the registered ones; None where the registration was read from a file."""
         if self.optimum is None:
             return None
-        return Uncertainty(self.optimum, self.model, self.radius_scale, self.radius_beside)
+        return Uncertainty(self.optimum, self.model, self.radius_scale, self.extra_radius)
 
     def radius95(
         self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Literal["camera", "rest"]

@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import cross
-from mereo.fitting.problem.residuals import ROBUST, WITNESS_WEIGHT, SampledSurface
+from mereo.fitting.problem.residuals import ROBUST, SILHOUETTE_WEIGHT, SampledSurface
 from mereo.geometry.transforms import rotation_along
 from mereo.io.cores import cores
-from mereo.scenes.statistical_model import WITNESSES, StatisticalModel
+from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 # --- table of lines of sight ------------------------------------------------------------------------------------------
 
@@ -200,7 +200,7 @@ LOOKED_UP = 128
 BLOCK = 150
 """Poses in one array operation: their arrays fit a core's cache, where 3,600 at once take seven times as long each."""
 
-OUTSIDE = WITNESS_WEIGHT * WITNESSES / 3000.0
+OUTSIDE = SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES / 3000.0
 """Weight of what the frame rules out beside that of the cloud: as in the fit."""
 
 DAMPING = 1e-3
@@ -270,7 +270,7 @@ class Screen:
     @classmethod
     def of(cls, tables: ShapeTables, evidence: Evidence, half: float, scaled: bool = False) -> "Screen":
         """Screen of a frame."""
-        points, sight = evidence.partners[:POINTS].astype(np.float32), SightTable.of(evidence)
+        points, sight = evidence.observed_samples[:POINTS].astype(np.float32), SightTable.of(evidence)
         return cls(tables, points, sight, half, scaled, evidence.may_be_cut)
 
     def starts(self, rotations: Float[np.ndarray, "r 3 3"]) -> Poses:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mereo.fitting.modes.fit import Judged, explored, fit_cloud, fit_wide, refined
+from mereo.fitting.modes.fit import ScoredFit, explored, fit_cloud, fit_wide, refined
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.joints import corner_places
 from mereo.fitting.problem.problem import UNEXPLAINED, Problem
@@ -89,7 +89,7 @@ class SearchOutcome:
     """
 
     problem: Problem
-    best: Judged
+    best: ScoredFit
     alike: int
     tried: int
 
@@ -110,10 +110,10 @@ class _Trail:
 
     problem: Problem
     handicap: float = 0.0
-    fitted: list[Judged] = field(default_factory=list)
+    fitted: list[ScoredFit] = field(default_factory=list)
 
     @property
-    def best(self) -> Judged:
+    def best(self) -> ScoredFit:
         return min(self.fitted, key=_total)
 
     @property
@@ -174,18 +174,18 @@ def search(whole: Problem, partial: Problem | None = None) -> SearchOutcome:
     return chosen.outcome()
 
 
-def _total(judged: Judged) -> float:
+def _total(judged: ScoredFit) -> float:
     return judged.misfit.total
 
 
-def is_explained(problem: Problem, judged: Judged) -> bool:
+def is_explained(problem: Problem, judged: ScoredFit) -> bool:
     """Whether a state explains the cloud, noise aside."""
     return problem.explained(judged.misfit.cloud, judged.surface, problem.config.explained)
 
 
-def fit_likely(problem: Problem, candidates: list[tuple[float, Posed]], most: int) -> list[Judged]:
+def fit_likely(problem: Problem, candidates: list[tuple[float, Posed]], most: int) -> list[ScoredFit]:
     """Fits of candidates that may be the best, of those given with their misfits by few points, the lowest first."""
-    fitted: list[Judged] = []
+    fitted: list[ScoredFit] = []
     for cost, posed in candidates[:most]:
         if fitted and cost > RIVAL * candidates[0][0] and is_explained(problem, min(fitted, key=_total)):
             break

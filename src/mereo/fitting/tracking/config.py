@@ -25,7 +25,7 @@ class TrackConfig:
         smoothing: share of what a frame says of the motion that is believed, the rest is what was known before.
         motion_worth: how many independent points the expectation is worth, in each direction.
         points: denser clouds are averaged to so many points.
-        partners: observed points, evenly spread, that are compared with the surface.
+        observed_samples: observed points, evenly spread, that are compared with the surface.
         first_sigma: the cloud's first standard deviation, as a share of half the rest box's longest side; it falls by
             ``cooling`` in each step to that of the frame's noise.
         steps, exact_steps: steps that ask samples of the surface, and last ones that ask its faces.
@@ -47,7 +47,7 @@ class TrackConfig:
     smoothing: float = 0.2
     motion_worth: float = 300.0
     points: int = 2000
-    partners: int = 500
+    observed_samples: int = 500
     first_sigma: float = 0.04
     cooling: float = 0.5
     steps: int = 3

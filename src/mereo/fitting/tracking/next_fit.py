@@ -44,7 +44,7 @@ class Track:
         unsure: how far the velocity may be off because little is known yet, scene units per second.
         noise: of the frames, smoothed, scene units.
         clean: constants of frames without noise; ``problem`` has those for ``noise``.
-        elsewhere: kind of the lines of sight of which a frame says nothing, as it was when the track began.
+        other_lines: kind of the lines of sight of which a frame says nothing, as it was when the track began.
         area: greatest area of the object that was seen (``seen_area``).
         calibration: as ``ModesFit`` has it.
     """
@@ -57,7 +57,7 @@ class Track:
     unsure: float
     noise: float
     clean: FitConfig
-    elsewhere: SightKind
+    other_lines: SightKind
     area: float
     calibration: Calibration | None = None
 
@@ -77,7 +77,7 @@ class Track:
         share_surfaces(base, problem)
         still, noise = np.zeros(POSE + model.count), fitted.problem.noise_beside(fitted.surface)
         unit, unsure, seen = fitted.unit * scale, config.first_speed, base.evidence
-        area, kind = seen_area(seen), seen.elsewhere
+        area, kind = seen_area(seen), seen.other_lines
         return cls(problem, unit, posed, time_s, still, unsure, noise, clean, kind, area, fitted.calibration)
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
@@ -128,7 +128,7 @@ def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config:
 def next_fit(
     track: Track,
     points: Float[np.ndarray, "n 3"],
-    doubtful: Float[np.ndarray, "d 3"],
+    outliers: Float[np.ndarray, "d 3"],
     time_s: float,
     config: TrackConfig,
     lines: SightLines,
@@ -138,7 +138,7 @@ def next_fit(
     Args:
         track: up to the frame before.
         points: of the object, camera frame, the clouds' unit.
-        doubtful: points that are none of it (``Evidence.of``).
+        outliers: points that are none of it (``Evidence.of``).
         time_s: of the frame.
         config: constants.
         lines: what is known of the lines of sight beside the points, in the same frame and unit. Where they leave it
@@ -151,15 +151,17 @@ def next_fit(
         start = track.expected(time_s, config)
         expectation = Expectation.of(track, start, max(time_s - track.time_s, 0.0), config)
 
-        def fit(elsewhere: SightKind) -> ModesFit:
-            beside = replace(lines.scaled(1 / track.unit), elsewhere=elsewhere)
-            problem = replace(track.problem, evidence=Evidence.of(few, doubtful / track.unit, config.partners, beside))
+        def fit(other_lines: SightKind) -> ModesFit:
+            beside = replace(lines.scaled(1 / track.unit), other_lines=other_lines)
+            problem = replace(
+                track.problem, evidence=Evidence.of(few, outliers / track.unit, config.observed_samples, beside)
+            )
             share_surfaces(track.problem, problem)
             posed = descend(problem, start, expectation, config)
             return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
 
-        fitted = fit(lines.elsewhere or track.elsewhere)
-        if lines.elsewhere is None and is_ruled_out(fitted):
+        fitted = fit(lines.other_lines or track.other_lines)
+        if lines.other_lines is None and is_ruled_out(fitted):
             fitted = less_ruled_out(fitted, fit("unknown"))
     fitted = replace(fitted, seconds=time.perf_counter() - started)
     return fitted, followed(track, fitted, time_s, config)
@@ -167,7 +169,7 @@ def next_fit(
 
 def is_ruled_out(fitted: ModesFit) -> bool:
     """Whether a frame rules out so much of a state that something may hide the object in part."""
-    return fitted.problem.witness_misfit(fitted.surface) > WHOLE
+    return fitted.problem.silhouette_misfit(fitted.surface) > WHOLE
 
 
 def less_ruled_out(whole: ModesFit, partial: ModesFit) -> ModesFit:

@@ -163,7 +163,7 @@ class Tracker:
             executor: what searches for a lost object (``BackgroundSearch``); None for a thread of its own.
         """
         # a frame that nobody understands comes 30 times a second while the object is away
-        self.registrar = registrar.at_once
+        self.registrar = registrar.without_retries
         self.config = config
         self._search = BackgroundSearch(registrar, executor)
         self.forget()

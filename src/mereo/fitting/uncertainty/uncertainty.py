@@ -13,10 +13,10 @@ from jaxtyping import Float, Float32, UInt8
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws.problem import terms as terms_of_draws
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
-from mereo.fitting.problem.own_turns import left_open
 from mereo.fitting.problem.posterior import WITHIN, Observed, Posterior, RadiusParts, Terms, radius95
 from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import Prior, Surface, add_witnesses
+from mereo.fitting.problem.residuals import Prior, Surface, add_silhouette
+from mereo.fitting.problem.symmetries import left_open
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
@@ -60,15 +60,15 @@ class ModesOptimum:
         problem, posed, config = self.problem, self.posed, self.problem.config
         nothing = NormalEquations.nothing(POSE + len(posed.z))
         with one_blas_thread():
-            samples = problem.samples.posed(posed).few(config.witnesses)
+            samples = problem.samples.posed(posed).few(config.silhouette_vertices)
             return Terms(
                 known=problem.known(posed, Prior.whole(problem.model), 0.0),
                 network=problem.network.add_to(
-                    nothing, posed, problem.network_sigma, config.network_worth[1], robust=True
+                    nothing, posed, problem.network_sigma, config.network_weight[1], robust=True
                 ),
                 cloud=problem.cloud_rows(posed),
-                partners=problem.evidence.partners,
-                ruled_out=add_witnesses(nothing, posed, samples, problem.evidence, config.cloud_sigma),
+                observed_samples=problem.evidence.observed_samples,
+                ruled_out=add_silhouette(nothing, posed, samples, problem.evidence, config.cloud_sigma),
             )
 
     @cached_property
@@ -151,7 +151,9 @@ class DrawsOptimum:
 def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:
     """How far turns of single segments that the frame does not tell apart may have moved the material points."""
     config = problem.config
-    return left_open(problem.model, material, problem.evidence.partners, config.cloud_sigma, config.cloud_worth)
+    return left_open(
+        problem.model, material, problem.evidence.observed_samples, config.cloud_sigma, config.cloud_weight
+    )
 
 
 Optimum = ModesOptimum | DrawsOptimum
@@ -168,14 +170,15 @@ Optimum = ModesOptimum | DrawsOptimum
 #
 #     A S A^T = sum_t A S H_t S A^T
 #
-# Notation: n observed partners, p parameters, J_i and w_i derivatives and weight of a partner's residual.
+# Notation: n observed samples, p parameters, J_i and w_i derivatives and weight of an observed sample's residual.
 
 Evidence = Literal["points", "network", "silhouette", "states"]
 """What leaves a place unsure by its errors: the observed points, what the network says of them, what the frame rules
 out, and what was known of the object's states before the frame was seen."""
 
 Decided = tuple[dict[Evidence, float], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
-"""Shares of each kind of evidence in what is unsure, weight of each partner, and its influence in the camera's axes."""
+"""Shares of each kind of evidence in what is unsure; weight of each observed sample, and its influence in the camera's
+axes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +212,7 @@ class Explanation:
         return cls(
             place=place,
             shares=shares,
-            points=transform_points(T_here_fit, unit * optimum.terms.partners),
+            points=transform_points(T_here_fit, unit * optimum.terms.observed_samples),
             weights=weights,
             influence=influence @ T_here_fit[:3, :3].T,
             unexplained=transform_points(T_here_fit, unit * observed[distance > optimum.tolerance]),
@@ -225,7 +228,7 @@ class Weighing:
     """Terms of a fit in parameters that are independent and standard normal after it (u = F v, ``F F^T = S``).
 
     Attributes:
-        rows: derivatives of the partners' residuals.
+        rows: derivatives of the observed samples' residuals.
         weight: of the residuals.
         parts: of each kind of evidence but the points in the unit matrix that is their sum.
     """
@@ -333,7 +336,7 @@ class Uncertainty:
     @cached_property
     def outline(self) -> Float[np.ndarray, " w"]:
         """``radius95`` of a few hundred vertices, evenly spread: quicker than of all."""
-        rows = self.model.witnesses[:: max(1, len(self.model.witnesses) // OUTLINE)]
+        rows = self.model.silhouette_vertices[:: max(1, len(self.model.silhouette_vertices) // OUTLINE)]
         return self._of(self.posterior.radii_of(rows))
 
     @property

@@ -1,6 +1,6 @@
 """Turns of single segments that nothing in a frame tells apart: where the material may be while the surface stays.
 
-    rest shapes and the library's joints -own_turns-> OwnTurn -left_open-> how unsure they leave each material point
+    rest shapes, the library's joints -find_symmetries-> Symmetry -left_open-> how unsure they leave each material point
 
 A forearm that looks the same from both sides may be half a turn round, with the wrist bent the other way; a smooth ring
 may be anywhere round its post. Each such turn is another optimum of the fit, far from the first, of which the Gaussian
@@ -57,7 +57,7 @@ with this."""
 
 
 @dataclass(frozen=True, eq=False)
-class OwnTurn:
+class Symmetry:
     """Turns of a segment about an axis of its own which hardly change its shape.
 
     Attributes:
@@ -75,11 +75,11 @@ class OwnTurn:
 
 
 @lru_cache(maxsize=8)
-def own_turns(model: StatisticalModel) -> tuple[OwnTurn, ...]:
+def find_symmetries(model: StatisticalModel) -> tuple[Symmetry, ...]:
     """All such turns of an object that its states make, none of one without states; found once for a model."""
     if model.count == 0:
         return ()
-    corners, found = corners_of(model), list[OwnTurn]()
+    corners, found = corners_of(model), list[Symmetry]()
     # from the rest pose, not from the mean, in which a part that spins is crushed
     states = positions(model, corners, model.library[:: max(1, len(model.library) // STATES)])
     rotation, joints = segment_poses(model.rest_points[corners], states)[0], branches(model)
@@ -91,7 +91,7 @@ def own_turns(model: StatisticalModel) -> tuple[OwnTurn, ...]:
             plausible = turned_so(rotation, index, neighbors, axis, alike)
             kept = plausible > SELDOM
             if kept.any():
-                found.append(OwnTurn(index + 1, center, axis, alike[kept], plausible[kept]))
+                found.append(Symmetry(index + 1, center, axis, alike[kept], plausible[kept]))
     return tuple(found)
 
 
@@ -125,7 +125,7 @@ def turned_so(
     axis: Float[np.ndarray, "3"],
     angles: Float[np.ndarray, " a"],
 ) -> Float[np.ndarray, " a"]:
-    """``OwnTurn.plausible`` against that neighbour of a segment against which it turns most; 1 for all without any.
+    """``Symmetry.plausible`` against that neighbour of a segment against which it turns most; 1 for all without any.
 
     Of pairs of states in which the segment leans alike against the neighbour, so that the turn is a freedom of its own:
     a rope that bends twists too, but never by itself.
@@ -154,7 +154,7 @@ def turned_so(
 def left_open(
     model: StatisticalModel,
     material: Float[np.ndarray, "m 3"],
-    partners: Float[np.ndarray, "n 3"],
+    observed_samples: Float[np.ndarray, "n 3"],
     sigma: float,
     worth: float,
 ) -> Float32[np.ndarray, "m 3 e"]:
@@ -163,23 +163,23 @@ def left_open(
     Args:
         model: the statistical model.
         material: registered material points.
-        partners: observed points, in the same frame.
+        observed_samples: observed points, in the same frame.
         sigma: the cloud's, scene units.
-        worth: how many independent points all partners are worth.
+        worth: how many independent points all observed samples are worth.
     """
-    turns = own_turns(model)
+    turns = find_symmetries(model)
     motion = np.zeros((len(material), 3, 2 * len(turns)), dtype=np.float32)
     if not turns:
         return motion
     vertices = sum(model.vertex_counts)
-    owner = model.labels[cKDTree(material[:vertices]).query(partners)[1]]
+    owner = model.labels[cKDTree(material[:vertices]).query(observed_samples)[1]]
     segments = model.mesh(material).segments
     for number, turn in enumerate(turns):
         rows = np.flatnonzero(model.labels == turn.label)
         T = fit_rigid(model.rest_points[rows], material[rows])
         center, axis = T[:3, :3] @ turn.center + T[:3, 3], T[:3, :3] @ turn.axis
-        seen = partners[owner == turn.label]
-        worse = _worse(segments[turn.label - 1], turn.angles, seen, center, axis, sigma) * worth / len(partners)
+        seen = observed_samples[owner == turn.label]
+        worse = _worse(segments[turn.label - 1], turn.angles, seen, center, axis, sigma) * worth / len(observed_samples)
         weight = np.append(turn.plausible * np.exp(-0.5 * COUNTED * np.maximum(worse, 0.0)), 1.0)
         angle = np.append(turn.angles, 0.0)
         steps = np.stack([np.sin(angle), 1.0 - np.cos(angle)])
