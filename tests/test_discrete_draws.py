@@ -10,7 +10,7 @@ from toy_scene import Shear, rest_mesh, toy_scene
 
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation
-from mereo.fitting.draws.fit import chosen_otherwise
+from mereo.fitting.draws.fit import redraw_choices
 from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.registration.fit import CloudToFit, ModesFit
 from mereo.geometry.transforms import transform_points
@@ -53,7 +53,7 @@ def box_of(drawn: Drawn) -> int:
 @pytest.mark.parametrize("seed", [1001, 1002, 1003])
 def test_all_but_the_choice_and_what_it_asks_for_is_kept(seed: int) -> None:
     drawn = Drawn.of(SCENE, seed)
-    others = chosen_otherwise(SCENE, drawn, 40)
+    others = redraw_choices(SCENE, drawn, 40)
     assert {box_of(other) for other in others} == set(range(SIDES))
     for other in others:
         np.testing.assert_allclose(other.z[:3], drawn.z[:3])
@@ -65,12 +65,12 @@ def test_all_but_the_choice_and_what_it_asks_for_is_kept(seed: int) -> None:
 
 def test_the_same_state_gives_the_same_others() -> None:
     drawn = Drawn.of(SCENE, 1001)
-    first, second = (np.concatenate([other.z for other in chosen_otherwise(SCENE, drawn, 10)]) for _ in range(2))
+    first, second = (np.concatenate([other.z for other in redraw_choices(SCENE, drawn, 10)]) for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
 def test_a_scene_without_discrete_draws_has_no_others() -> None:
-    assert chosen_otherwise(toy_scene(), Drawn.of(toy_scene(), 1001), 10) == []
+    assert redraw_choices(toy_scene(), Drawn.of(toy_scene(), 1001), 10) == []
 
 
 def test_a_scene_that_begins_anew_is_refused() -> None:
@@ -85,7 +85,7 @@ def test_a_scene_that_begins_anew_is_refused() -> None:
     scene = replace(SCENE, sample_deformations=again)
     drawn = Drawn.of(scene, 1001)
     assert len(drawn.z) == 4
-    assert all(len(other.z) < 4 + 12 * 5 for other in chosen_otherwise(scene, drawn, 40))
+    assert all(len(other.z) < 4 + 12 * 5 for other in redraw_choices(scene, drawn, 40))
 
 
 def states_with(model: StatisticalModel, box: int, count: int) -> DrawnStates:
@@ -113,6 +113,6 @@ def test_draws_far_beyond_the_bounds_are_kept_as_they_are_played() -> None:
     """A fit may push a draw farther than its share can say; then the state is played at the bound."""
     drawn = Drawn.of(SCENE, 1001)
     far = replace(drawn, z=np.where(np.arange(len(drawn.z)) == 0, 9.0, drawn.z))
-    others = chosen_otherwise(SCENE, far, 10)
+    others = redraw_choices(SCENE, far, 10)
     assert others
     np.testing.assert_allclose([other.z[0] for other in others], 4.0)

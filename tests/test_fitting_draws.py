@@ -9,7 +9,7 @@ from toy_scene import toy_scene
 
 from mereo.fitting.draws.fit import fit_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.draws.problem import DrawsProblem, Shape, approach, derivatives, near, secant
+from mereo.fitting.draws.problem import DrawsProblem, Shape, approach, derivatives, lay_on_shape, secant
 from mereo.fitting.draws.problem import narrowing as draws_narrowing
 from mereo.fitting.modes.fit import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import nothing
@@ -74,7 +74,7 @@ def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, stat
     points = states.material[7][states.played.index].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
     shape = Shape.of(points, 0.04 * model.half, 500.0, np.ones(len(points)))
     drawn = Drawn.of(SCENE, states.seeds[3])
-    start = near(states, shape, drawn, drawn.z)
+    start = lay_on_shape(states, shape, drawn, drawn.z)
     assert start is not None
     found = approach(states, shape, start, 3)
     apart = [np.linalg.norm(n.points @ n.rotation.T + n.translation - points, axis=1) for n in (start, found)]
@@ -121,7 +121,7 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     poor = replace(poor, jumps=0, asked_again=False)
     once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
-    monkeypatch.setattr("mereo.fitting.draws.fit.second_pass", None)  # not called where the first explains the cloud
+    monkeypatch.setattr("mereo.fitting.draws.fit.fit_from_end", None)  # not called where the first explains the cloud
     assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None
 
 

@@ -13,9 +13,9 @@ from test_fitting_theorems import IN_FRONT, said, seen
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.fitting.config import MANY_DRAWS
-from mereo.fitting.draws.fit import descend, jump, likely_to_jump
+from mereo.fitting.draws.fit import descend, draws_that_may_jump, try_jumps
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.draws.problem import DrawsProblem, played
+from mereo.fitting.draws.problem import DrawsProblem, simulate
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.posterior import Posterior, covariance_factor
 from mereo.fitting.problem.symmetries import ANGLES, find_symmetries, left_open
@@ -186,11 +186,11 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
     wrong = truth.copy()
     wrong[0] = ndtri((ndtr(truth[0]) + 1 / 6) % 1.0)
     pose = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.empty(0))
-    start = played(problem, drawn, wrong, pose)
+    start = simulate(problem, drawn, wrong, pose)
     assert start is not None
     start = descend(problem, start, 1)
-    np.testing.assert_array_equal(likely_to_jump(problem, start), [0])
-    found = jump(problem, start)
+    np.testing.assert_array_equal(draws_that_may_jump(problem, start), [0])
+    found = try_jumps(problem, start)
     assert abs(ndtr(start.z[0]) - ndtr(truth[0])) > 0.1 and abs(ndtr(found.z[0]) - ndtr(truth[0])) < 0.01
     assert found.misfit < start.misfit
-    assert jump(replace(problem, config=replace(config, jumps=0)), start) is start
+    assert try_jumps(replace(problem, config=replace(config, jumps=0)), start) is start

@@ -11,9 +11,16 @@ from test_fitting_theorems import IN_FRONT, said, seen
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
-from mereo.fitting.draws.fit import by_sight, descend, lower, turned, twins, with_twins_turned
+from mereo.fitting.draws.fit import (
+    descend,
+    lower,
+    refine_by_sight,
+    symmetric_groups,
+    try_symmetric_states,
+    turn_segments,
+)
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, played
+from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, simulate
 from mereo.fitting.problem.evidence import OBSERVED_SAMPLES
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.fit import CloudToFit, ModesFit
@@ -78,7 +85,7 @@ def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
 
 
 def state(problem: DrawsProblem, z: np.ndarray) -> DrawsFit:
-    fit = played(problem, Drawn.of(scene(), 1000), z, POSE)
+    fit = simulate(problem, Drawn.of(scene(), 1000), z, POSE)
     assert fit is not None
     return fit
 
@@ -87,22 +94,22 @@ TRUTH = np.array([0.3, 0.9, -0.5])
 
 
 def test_an_arm_has_one_group_of_forearm_and_wrist() -> None:
-    (together,) = twins(model())
+    (together,) = symmetric_groups(model())
     assert [turn.label for turn, _ in together] == [2, 3]
     assert all(angle == pytest.approx(np.pi) and abs(turn.axis[0]) > 0.999 for turn, angle in together)
 
 
 def test_an_object_without_such_segments_has_no_group(toy_model: StatisticalModel) -> None:
-    assert twins(toy_model) == ()
+    assert symmetric_groups(toy_model) == ()
 
 
 def test_the_turned_shape_is_that_of_other_draws() -> None:
     """Exactly, as the segments lie on the axis of the roll; and twice turned is the same."""
-    (together,) = twins(model())
-    there = turned(model(), moved(TRUTH), together)
+    (together,) = symmetric_groups(model())
+    there = turn_segments(model(), moved(TRUTH), together)
     assert np.abs(there - moved(TRUTH)).max() > 4.0
     np.testing.assert_allclose(there, moved(flipped(TRUTH)), atol=0.02)
-    np.testing.assert_allclose(turned(model(), there, together), moved(TRUTH), atol=1e-6)
+    np.testing.assert_allclose(turn_segments(model(), there, together), moved(TRUTH), atol=1e-6)
 
 
 def test_a_state_that_is_turned_so_is_found() -> None:
@@ -111,11 +118,11 @@ def test_a_state_that_is_turned_so_is_found() -> None:
     right, wrong = state(problem, TRUTH), descend(problem, state(problem, flipped(TRUTH)), 1)
     assert np.abs(wrong.placed() - right.placed()).max() > 4.0
     many = replace(problem, config=replace(problem.config, turned_worse=np.inf))
-    found = with_twins_turned(many, wrong)
+    found = try_symmetric_states(many, wrong)
     assert found.misfit < wrong.misfit
     assert np.abs(found.placed() - right.placed()).max() < 0.2
-    assert with_twins_turned(many, found).misfit <= found.misfit
-    assert with_twins_turned(replace(many, config=replace(many.config, turned_worse=-np.inf)), wrong) is wrong
+    assert try_symmetric_states(many, found).misfit <= found.misfit
+    assert try_symmetric_states(replace(many, config=replace(many.config, turned_worse=-np.inf)), wrong) is wrong
 
 
 def test_a_step_never_leads_up() -> None:
@@ -132,8 +139,8 @@ def test_the_answer_is_fitted_to_every_point_and_judged_by_them() -> None:
     assert len(problem.base.evidence.points) > OBSERVED_SAMPLES
     dense = problem.base.by_every_point
     assert len(dense.evidence.observed_samples) == len(problem.base.evidence.points) and dense.by_every_point is dense
-    found = by_sight(problem, state(problem, TRUTH + 0.02))
-    again = played(replace(problem, by_sight=True, base=dense), found.drawn, found.z, found.posed)
+    found = refine_by_sight(problem, state(problem, TRUTH + 0.02))
+    again = simulate(replace(problem, by_sight=True, base=dense), found.drawn, found.z, found.posed)
     assert again is not None and found.misfit == again.misfit and len(found.distance) == OBSERVED_SAMPLES
     assert found.motion is not None
     few = problem_of(TRUTH, points=300)

@@ -20,16 +20,16 @@ from mereo.fitting.draws.playback import Drawn, shares_of
 from mereo.fitting.draws.problem import (
     DrawsFit,
     DrawsProblem,
-    Near,
     Shape,
+    StateOnShape,
     approach,
-    beside,
     derivatives,
+    lay_on_shape,
     misfit,
-    near,
     normal_equations,
-    played,
     secant,
+    simulate,
+    try_material,
 )
 from mereo.fitting.modes.fit import refine, robust_poses
 from mereo.fitting.problem.gauss_newton import POSE, Posed
@@ -54,20 +54,20 @@ SLIDES = 0.03
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """The best of several starts; None where the scene plays none of them back."""
-    found = like_modes(problem, modes, [])
+    found = fit_near_modes(problem, modes, [])
     for _ in range(problem.config.passes):
-        if explained(problem, found, problem.config.hopeless):
+        if explains_cloud(problem, found, problem.config.hopeless):
             break
-        found += second_pass(problem, min(found, key=by_misfit, default=None))
+        found += fit_from_end(problem, min(found, key=by_misfit, default=None))
     has_network = len(problem.found.points) > 0  # after a search there are no correspondences
-    if problem.config.asked_again and has_network and not explained(problem, found, problem.config.explained):
+    if problem.config.asked_again and has_network and not explains_cloud(problem, found, problem.config.explained):
         camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
-        found += fitted(problem, camera, shape_of_network(problem, modes.log_scale), [])
+        found += fit_from_shape(problem, camera, shape_of_network(problem, modes.log_scale), [])
     best = min(found, key=by_misfit, default=None)
-    return None if best is None else by_sight(problem, jump(problem, with_twins_turned(problem, best)))
+    return None if best is None else refine_by_sight(problem, try_jumps(problem, try_symmetric_states(problem, best)))
 
 
-def by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
+def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """The state brought to what the lines of sight meet, by every observed point.
 
     Nearest places lead there from afar, and noise takes them a little beside it; over more points it averages out. The
@@ -75,34 +75,34 @@ def by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """
     sighted = replace(problem, by_sight=True)
     dense = replace(sighted, base=problem.last)
-    start = played(dense, fit.drawn, fit.z, fit.posed)
+    start = simulate(dense, fit.drawn, fit.z, fit.posed)
     if start is None:
         return fit
     found = descend(dense, start, problem.config.last_rounds)
     if dense.base is sighted.base:
         return found
-    end = played(sighted, found.drawn, found.z, found.posed)
+    end = simulate(sighted, found.drawn, found.z, found.posed)
     assert end is not None  # it was played before
     return replace(end, motion=found.motion, misfit=found.misfit)
 
 
-def like_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:
+def fit_near_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:
     """States that explain the frame, from starts like a fit of the modes, and from ``others``."""
     guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
-    return fitted(problem, modes, shape_of(problem, problem.model.material(modes.z)), [guess, *others])
+    return fit_from_shape(problem, modes, shape_of(problem, problem.model.material(modes.z)), [guess, *others])
 
 
-def second_pass(problem: DrawsProblem, best: DrawsFit | None) -> list[DrawsFit]:
+def fit_from_end(problem: DrawsProblem, best: DrawsFit | None) -> list[DrawsFit]:
     """States like the modes' own fit from where the draws ended, which may be in another basin than their first."""
     if best is None:
         return []
     pose, z = problem.model.project(best.placed())
     scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
     modes = refine(problem.base, Posed(pose[:3, :3] / scale, pose[:3, 3], z, float(np.log(scale))))
-    return like_modes(problem, modes, [replace(best.drawn, z=best.z)])
+    return fit_near_modes(problem, modes, [replace(best.drawn, z=best.z)])
 
 
-def explained(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool:
+def explains_cloud(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool:
     """Whether one of the states explains the cloud: ``Problem.explained``."""
     sigma = problem.base.config.cloud_sigma
     misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in found]
@@ -125,56 +125,56 @@ def shape_of_network(problem: DrawsProblem, log_scale: float) -> Shape:
     return Shape.of(points, sigma, problem.config.shape_worth, found.confidence, problem.followed)
 
 
-def fitted(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
+def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
     """States that explain the frame, from starts like a shape; ``frame`` poses the shape in the camera frame.
 
     While what is found is far from explaining the cloud, the next starts are tried.
     """
     config, states = problem.config, problem.states
-    drawn = [states.drawn(seed) for seed in alike(problem, shape)] + guesses
-    found = [near(states, shape, one, one.z) for one in drawn]
-    here = sorted((one for one in found if one is not None), key=lambda one: one.misfit)
+    drawn = [states.drawn(seed) for seed in similar_states(problem, shape)] + guesses
+    near_shape = [lay_on_shape(states, shape, start, start.z) for start in drawn]
+    starts = sorted((start for start in near_shape if start is not None), key=by_misfit)
     batch, fits = config.sieve[0][1], list[DrawsFit]()
     for number in range(config.batches):
-        fits += followed(problem, frame, shape, here[number * batch : (number + 1) * batch])
-        if explained(problem, fits, config.hopeless):
+        fits += descend_best(problem, frame, shape, starts[number * batch : (number + 1) * batch])
+        if explains_cloud(problem, fits, config.hopeless):
             break
     return fits
 
 
-def followed(problem: DrawsProblem, frame: Posed, shape: Shape, here: list[Near]) -> list[DrawsFit]:
+def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list[StateOnShape]) -> list[DrawsFit]:
     """The best of some starts, followed to the end."""
     config, states = problem.config, problem.states
     for fresh, keep in config.sieve:
-        here = [approach(states, shape, one, fresh) for one in sorted(here, key=by_misfit)[:keep]]
-        here += chosen_better(problem, shape, min(here, key=by_misfit, default=None))
-    starts = [(played(problem, one.drawn, one.z, posed_on(frame, one)), one.motion) for one in here]
-    likely = sorted(((fit, motion) for fit, motion in starts if fit is not None), key=lambda start: start[0].misfit)
-    return [descend(problem, fit, config.last_rounds, motion) for fit, motion in likely[: config.kept]]
+        starts = [approach(states, shape, start, fresh) for start in sorted(starts, key=by_misfit)[:keep]]
+        starts += find_other_choices(problem, shape, min(starts, key=by_misfit, default=None))
+    fits = [(simulate(problem, start.drawn, start.z, pose_on_shape(frame, start)), start.motion) for start in starts]
+    best = sorted(((fit, motion) for fit, motion in fits if fit is not None), key=lambda pair: pair[0].misfit)
+    return [descend(problem, fit, config.last_rounds, motion) for fit, motion in best[: config.kept]]
 
 
-def chosen_better(problem: DrawsProblem, shape: Shape, best: Near | None) -> list[Near]:
+def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape | None) -> list[StateOnShape]:
     """States near a shape that ``best`` does not meet, made from that one by other discrete draws."""
     config, states = problem.config, problem.states
     if best is None or best.misfit < config.met:
         return []
-    others = chosen_otherwise(states.scene, replace(best.drawn, z=best.z), config.choices)
-    here = [near(states, shape, other, other.z) for other in others]
-    likely = sorted((one for one in here if one is not None and differs(one, best, shape.std)), key=by_misfit)
-    return [approach(states, shape, one, 1) for one in likely[: config.chosen]]
+    others = redraw_choices(states.scene, replace(best.drawn, z=best.z), config.choices)
+    states_near = [lay_on_shape(states, shape, other, other.z) for other in others]
+    new = [state for state in states_near if state is not None and differ(state, best, shape.std)]
+    return [approach(states, shape, state, 1) for state in sorted(new, key=by_misfit)[: config.chosen]]
 
 
-def differs(one: Near, other: Near, least: float) -> bool:
+def differ(one: StateOnShape, other: StateOnShape, least: float) -> bool:
     """Whether any played point of two states is farther apart than ``least``; a choice may come out the same again."""
     return bool(np.abs(one.points - other.points).max() > least)
 
 
-def by_misfit(one: Near | DrawsFit) -> float:
+def by_misfit(one: StateOnShape | DrawsFit) -> float:
     """Misfit, as a key to sort by."""
     return one.misfit
 
 
-def alike(problem: DrawsProblem, shape: Shape) -> list[int]:
+def similar_states(problem: DrawsProblem, shape: Shape) -> list[int]:
     """Seeds of the random states most like a shape."""
     states = problem.states
     some = spread(shape.points, RANKED_BY)
@@ -187,7 +187,7 @@ def alike(problem: DrawsProblem, shape: Shape) -> list[int]:
     return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
 
 
-def with_twins_turned(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
+def try_symmetric_states(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """The state, or one with segments turned that look alike turned, where that explains the frame better.
 
     A forearm by half a turn, for which several draws change at once. Only where the shape, stiffly turned, explains
@@ -195,21 +195,21 @@ def with_twins_turned(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """
     config = problem.config
     few = replace(problem, config=replace(config, sieve=config.turned_sieve, kept=1, batches=1))
-    for together in twins(problem.model):
-        material = turned(problem.model, fit.material, together)
-        stiff = beside(problem, fit.drawn, fit.z, fit.posed, material)
+    for together in symmetric_groups(problem.model):
+        material = turn_segments(problem.model, fit.material, together)
+        stiff = try_material(problem, fit.drawn, fit.z, fit.posed, material)
         if stiff is not None and stiff.misfit < fit.misfit + config.turned_worse:
-            fit = min([fit, *fitted(few, fit.posed, shape_of(problem, material), [])], key=by_misfit)
+            fit = min([fit, *fit_from_shape(few, fit.posed, shape_of(problem, material), [])], key=by_misfit)
     return fit
 
 
-def posed_on(frame: Posed, here: Near) -> Posed:
+def pose_on_shape(frame: Posed, state: StateOnShape) -> Posed:
     """Pose in the camera frame of a state that lies on a shape whose own pose there is ``frame``."""
-    translation = frame.place(here.translation[None])[0]
-    return Posed(frame.rotation @ here.rotation, translation, np.empty(0), frame.log_scale)
+    translation = frame.place(state.translation[None])[0]
+    return Posed(frame.rotation @ state.rotation, translation, np.empty(0), frame.log_scale)
 
 
-def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
+def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """One draw anywhere in its range, where that explains the frame better: a wheel by half a turn.
 
     Only while the cloud is not explained.
@@ -217,31 +217,31 @@ def jump(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     config = problem.config
     sigma = first_sigma(problem)
     for _ in range(config.jumps):
-        if explained(problem, [fit], config.explained):
+        if explains_cloud(problem, [fit], config.explained):
             break
-        each = [likely_places(problem, fit, int(number), sigma) for number in likely_to_jump(problem, fit)]
-        likely = sorted((place for places in each for place in places), key=lambda place: place[0])
-        found = [descend(problem, other, config.first_rounds) for _, other in likely[: config.kept + 1]]
-        best = min(found, key=by_misfit, default=fit)
+        each = [jump_candidates(problem, fit, int(number), sigma) for number in draws_that_may_jump(problem, fit)]
+        best_first = sorted((place for places in each for place in places), key=lambda place: place[0])
+        fits = [descend(problem, other, config.first_rounds) for _, other in best_first[: config.kept + 1]]
+        best = min(fits, key=by_misfit, default=fit)
         if best.misfit >= fit.misfit:
             break
         fit = descend(problem, best, config.first_rounds)
     return fit
 
 
-def likely_places(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
+def jump_candidates(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
     """A state with one draw at other places of its range: all, or the best where there are many draws, with misfits."""
-    config, there = problem.config, list[tuple[float, DrawsFit]]()
+    config, candidates = problem.config, list[tuple[float, DrawsFit]]()
     for turn in range(1, config.places):
         z = fit.z.copy()
         z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.places) % 1.0, SMALLEST, 1 - SMALLEST))
-        other = played(problem, fit.drawn, z, fit.posed)
+        other = simulate(problem, fit.drawn, z, fit.posed)
         if other is not None:
-            there.append((misfit(problem, other, sigma), other))
-    return sorted(there, key=lambda place: place[0])[: config.places_kept]
+            candidates.append((misfit(problem, other, sigma), other))
+    return sorted(candidates, key=lambda candidate: candidate[0])[: config.places_kept]
 
 
-def likely_to_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
+def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
     """Draws that may jump: of many, those that move what they move along its own surface, as a ring on its post.
 
     Only then a state far away may look nearly the same, so that no small step leads there.
@@ -300,7 +300,7 @@ def lower(
     index, least = problem.states.played.index, misfit(problem, fit, sigma)
     for _ in range(problem.config.tries):
         step = normal_equations(problem, fit, motion, sigma).step(damping)
-        tried = played(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))
+        tried = simulate(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))
         if tried is not None:
             motion = secant(motion, step[POSE:], (tried.material - fit.material)[index])
             if misfit(problem, tried, sigma) < least:
@@ -321,7 +321,7 @@ MORE_CALLS = 12
 """Calls that another choice may ask for in addition; a scene that asks for more has thrown its first attempt away."""
 
 
-def chosen_otherwise(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
+def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
     """States with some of the discrete draws, and what they ask for, drawn anew; fewer than ``count`` where refused.
 
     Nothing where the scene has no discrete draws. The same state gives the same ones.
@@ -356,7 +356,7 @@ def _drawn_anew(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: i
 
 # Shapes in which segments that look alike turned are turned together, as a target for the draws.
 #
-#     rest shapes, joints -find_symmetries-> Symmetry -twins-> groups -turned-> a shape -fit-> another state
+#     rest shapes, joints -find_symmetries-> Symmetry -symmetric_groups-> groups -turn_segments-> a shape to be fitted
 #
 # An arm looks the same with the forearm half a turn round, the wrist bent the other way and the hand turned back. No
 # small step leads there, and no jump of one draw: several change at once. But the shape is known, so that the draws can
@@ -372,7 +372,7 @@ Twins = tuple[tuple[Symmetry, float], ...]
 
 
 @lru_cache(maxsize=8)
-def twins(model: StatisticalModel) -> tuple[Twins, ...]:
+def symmetric_groups(model: StatisticalModel) -> tuple[Twins, ...]:
     """Groups of two segments or more that hang on each other and each look alike in exactly one other turn.
 
     A segment that spins, or looks alike in many turns, is left to single draws, which slide along its surface.
@@ -399,7 +399,9 @@ def _only_angle(turn: Symmetry) -> tuple[Symmetry, float | None]:
     return turn, middle if np.abs(turn.angles - middle).max() <= NEXT else None
 
 
-def turned(model: StatisticalModel, material: Float[np.ndarray, "m 3"], together: Twins) -> Float[np.ndarray, "m 3"]:
+def turn_segments(
+    model: StatisticalModel, material: Float[np.ndarray, "m 3"], together: Twins
+) -> Float[np.ndarray, "m 3"]:
     """Material points of a state with some segments turned, each stiffly about its own axis."""
     moved = material.copy()
     for turn, angle in together:

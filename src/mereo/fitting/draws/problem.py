@@ -130,16 +130,16 @@ class DrawsFit:
         return self.surface.material
 
 
-def played(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed) -> DrawsFit | None:
+def simulate(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed) -> DrawsFit | None:
     """The state of these draws and how badly it explains the frame; None where the scene refuses it."""
     deformations = drawn.deformations(problem.scene, z)
     if deformations is None:
         return None
     material = material_moved(problem.scene, problem.model, deformations)
-    return beside(problem, drawn, z, posed, material)
+    return try_material(problem, drawn, z, posed, material)
 
 
-def beside(
+def try_material(
     problem: DrawsProblem,
     drawn: Drawn,
     z: Float[np.ndarray, " d"],
@@ -287,16 +287,16 @@ class Shape:
         """Shape worth ``worth`` points."""
         return cls(points, std, confidence / confidence.sum() * (worth / std**2), follow)
 
-    def at(self, played: Float[np.ndarray, "a *c"]) -> Float[np.ndarray, "n *c"]:
+    def at(self, values: Float[np.ndarray, "a *c"]) -> Float[np.ndarray, "n *c"]:
         """Values at the points, from values at the played points."""
         if self.follow is None:
-            return played
-        result: np.ndarray = self.follow @ played.reshape(len(played), -1)
-        return result.reshape(-1, *played.shape[1:])
+            return values
+        result: np.ndarray = self.follow @ values.reshape(len(values), -1)
+        return result.reshape(-1, *values.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)
-class Near:
+class StateOnShape:
     """A state of a scene beside a shape.
 
     Attributes:
@@ -316,13 +316,13 @@ class Near:
     motion: Float32[np.ndarray, "a 3 d"] | None = None
 
 
-def near(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.ndarray, " d"]) -> Near | None:
+def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.ndarray, " d"]) -> StateOnShape | None:
     """The state of these draws, laid robustly onto the shape; None where the scene refuses it."""
     deformations = drawn.deformations(states.scene, z)
     if deformations is None:
         return None
-    played = states.played.moved(deformations)
-    points, weight = shape.at(played), shape.weight
+    positions = states.played.moved(deformations)
+    points, weight = shape.at(positions), shape.weight
     for _ in range(3):
         share = weight / weight.sum()
         center, goal = share @ points, share @ shape.points
@@ -332,7 +332,7 @@ def near(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.ndarray, "
         weight = shape.weight * geman_mcclure(distance, SHAPE_ROBUST * max(shape.std, float(np.median(distance))))
     squared = distance**2
     apart = float(shape.weight @ (squared / (1.0 + squared / (2 * SHAPE_ROBUST * shape.std) ** 2)))
-    return Near(drawn, z, played, rotation, translation, apart + float(z @ z))
+    return StateOnShape(drawn, z, positions, rotation, translation, apart + float(z @ z))
 
 
 def derivatives(
@@ -378,43 +378,45 @@ def secant(
     return motion + missed[..., None] * (step / max(float(step @ step), 1e-12)).astype(np.float32)
 
 
-def approach(states: DrawnStates, shape: Shape, here: Near, fresh: int) -> Near:
+def approach(states: DrawnStates, shape: Shape, state: StateOnShape, fresh: int) -> StateOnShape:
     """The state near the shape, by ``fresh`` sets of differences."""
     damping = 0.1
     for _ in range(fresh):
-        motion = derivatives(states, here.drawn, here.z, here.points)
-        before = here.misfit
+        motion = derivatives(states, state.drawn, state.z, state.points)
+        before = state.misfit
         for _ in range(STEPS):
-            nearer, motion, damping = _step(states, shape, here, motion, damping)
-            gain, here = here.misfit - nearer.misfit, nearer
-            if gain < ENOUGH * here.misfit:
+            nearer, motion, damping = _step(states, shape, state, motion, damping)
+            gain, state = state.misfit - nearer.misfit, nearer
+            if gain < ENOUGH * state.misfit:
                 break
-        here = replace(here, motion=motion)
-        if before - here.misfit < 2 * ENOUGH * before:
+        state = replace(state, motion=motion)
+        if before - state.misfit < 2 * ENOUGH * before:
             break
-    return here
+    return state
 
 
 def _step(
-    states: DrawnStates, shape: Shape, here: Near, motion: Float32[np.ndarray, "a 3 d"], damping: float
-) -> tuple[Near, Float32[np.ndarray, "a 3 d"], float]:
+    states: DrawnStates, shape: Shape, state: StateOnShape, motion: Float32[np.ndarray, "a 3 d"], damping: float
+) -> tuple[StateOnShape, Float32[np.ndarray, "a 3 d"], float]:
     """The next state, or the same; what was learnt of the motion; the next damping."""
     for _ in range(TRIES):
-        step = _solved(shape, here, motion, damping)
-        tried = near(states, shape, here.drawn, here.z + step)
+        step = _solved(shape, state, motion, damping)
+        tried = lay_on_shape(states, shape, state.drawn, state.z + step)
         if tried is not None:
-            motion = secant(motion, step, tried.points - here.points)
-            if tried.misfit < here.misfit:
+            motion = secant(motion, step, tried.points - state.points)
+            if tried.misfit < state.misfit:
                 return tried, motion, max(damping / 4.0, 1e-3)
         damping *= 5.0
-    return here, motion, damping
+    return state, motion, damping
 
 
-def _solved(shape: Shape, here: Near, motion: Float32[np.ndarray, "a 3 d"], damping: float) -> Float[np.ndarray, " d"]:
+def _solved(
+    shape: Shape, state: StateOnShape, motion: Float32[np.ndarray, "a 3 d"], damping: float
+) -> Float[np.ndarray, " d"]:
     """Levenberg and Marquardt's step of the draws, the pose free."""
-    normal = prior_of_draws(here.z, motion, 0.0, 1e-6)
-    posed = Posed(here.rotation, here.translation, np.zeros(len(here.z)))
-    points = posed.place(shape.at(here.points))
+    normal = prior_of_draws(state.z, motion, 0.0, 1e-6)
+    posed = Posed(state.rotation, state.translation, np.zeros(len(state.z)))
+    points = posed.place(shape.at(state.points))
     offset = points - shape.points
     weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * SHAPE_ROBUST * shape.std)
     jacobian = in_space(posed, points, shape.at(motion))
