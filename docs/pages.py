@@ -40,9 +40,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     config.nav = [
         *(config.nav or []),
         {"API by room": ["api/index.md", *_rooms(SOURCE)]},
-        {"Design notes": notes},
+        {"Decisions": notes},
         {"Model cards": [f"models/{card.name}" for card in _cards()]},
-        {"Project": ["conventions.md", "contributing.md", "changelog.md", "licence.md"]},
+        {"Project": ["contributing.md", "changelog.md", "licence.md"]},
     ]
     return config
 

@@ -2,7 +2,7 @@
 
 `bash -n` parses the scripts; torchrun's own parser and mereo's read the commands, in scripts after the variables are
 filled in as the scheduler would. Of YAML files the objects are checked where a slip would be found on the cluster only.
-What fields an object may have is Kubernetes' to say: docs/clusters.md names the tools that the files were checked with.
+What fields an object may have is Kubernetes' to say.
 """
 
 import re

@@ -151,6 +151,23 @@ def test_modules_and_definitions_that_pages_name_exist() -> None:
         assert [name for name in files if not (ROOT / "src" / "mereo" / name).exists()] == [], page
 
 
+def test_the_glossary_names_what_exists_and_each_term_once() -> None:
+    """Options by the fields that they are made of, other names by a definition anywhere in the packages."""
+    rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| ([^|]*) \|$", (ROOT / "docs" / "glossary.md").read_text(), re.MULTILINE)
+    terms = [term for term, _ in rows if term not in ("term", "---")]
+    assert len(terms) > 60 and len(set(terms)) == len(terms)
+    source = "\n".join(path.read_text() for path in ROOT.glob("src/**/*.py"))
+    defined = set(re.findall(r"^ *(?:class|def) (\w+)|^ *(\w+)(?:: | = )", source, re.MULTILINE))
+    known = {name for pair in defined for name in pair}
+    named = {name for _, names in rows for name in re.findall(r"`([^`]+)`", names)}
+    assert {name for name in named if name.removeprefix("--").replace("-", "_") not in known} == set()
+
+
+def test_decisions_are_short() -> None:
+    for page in ROOT.glob("docs/design/*.md"):
+        assert len(page.read_text().splitlines()) <= 40, page
+
+
 def test_citation_is_of_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -1,4 +1,4 @@
-"""A segment inside a segment: every rule of docs/design/0005-nested.md, on balls whose answers are in closed form."""
+"""A segment inside a segment: every rule of docs/method.md, on balls whose answers are in closed form."""
 
 from collections.abc import Callable
 

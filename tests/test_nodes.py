@@ -2,7 +2,7 @@
 
 Equal is: to rounding, because sums over processes are added in another order than those of one. Adam turns the rounding
 of a gradient near zero into a step of the size of its rate, so that in single precision runs that differ in one bit
-soon part (docs/clusters.md). These compute in double precision, where equal runs stay together.
+soon part (docs/many-machines.md). These compute in double precision, where equal runs stay together.
 """
 
 import csv

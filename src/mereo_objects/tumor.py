@@ -1,4 +1,4 @@
-"""Tumor: a lobulated tumour inside the liver, with the gallbladder: the nested scene (docs/design/0005-nested.md).
+"""Tumor: a lobulated tumour inside the liver, with the gallbladder: the nested scene (docs/method.md).
 
 Source: liver and gallbladder as in the scene `liver` (LapGym, MIT, (c) 2023 Paul Scheikl); the tumour is modelled here:
 eleven lobes, 40 mm across, 22 cubic centimetres, at least 22 mm below the liver's surface.

@@ -91,7 +91,7 @@ class SegmentedMesh:
         segments: in label order.
         nested: pairs of names (inner, outer): ``outer``'s mesh is its outer surface alone, and the volume inside
             ``inner`` belongs to ``inner``. The inner segment comes first in ``segments``, so that "the first segment
-            wins" decides everywhere. See docs/design/0005-nested.md.
+            wins" decides everywhere. See docs/method.md.
     """
 
     segments: tuple[Segment, ...]

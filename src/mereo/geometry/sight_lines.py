@@ -1,6 +1,6 @@
 """Lines of sight of a frame that did not meet the object: what they say of the space beside it.
 
-Every line of sight is of one of three kinds (docs/design/0028-sight-lines.md): it met the *object*; it went *past* it,
+Every line of sight is of one of three kinds (docs/registration.md): it met the *object*; it went *past* it,
 to something farther away, so that the space before that is empty; or it is *unknown*: something nearer hides what is
 behind, nothing was measured, or it lies outside the picture. The camera is at the origin.
 """

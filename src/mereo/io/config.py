@@ -16,7 +16,7 @@ Format = Literal["glb", "ply", "obj", "stl", "npz", "vti", "nifti", "seg.nrrd", 
 
 @dataclass(frozen=True)
 class FilesConfig:
-    """Files that a reconstruction becomes; where and in which unit: docs/design/0012-files-out.md.
+    """Files that a reconstruction becomes; where and in which unit: docs/files.md.
 
     Attributes:
         formats: surfaces as glb, ply, obj, stl; labels as npz, vti (ParaView), nifti, seg.nrrd (3D Slicer); points,

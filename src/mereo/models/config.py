@@ -1,7 +1,7 @@
 """Settings of networks, of what a loss teaches them, and of where and how exactly they answer.
 
 Light, so that the command line may import them. Defaults are the paper's (Henrich et al., WACV 2024, section 3 and
-appendix B) unless a comment says otherwise; what it leaves open is chosen as docs/paper-notes.md tells.
+appendix B) unless a comment says otherwise; what it leaves open is chosen as docs/method.md tells.
 """
 
 from collections.abc import Mapping

@@ -31,7 +31,7 @@ from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 # signed distance to every segment of the model it was trained for. Deformations are smooth, so the position is easy to
 # learn; thin parts and the borders between segments come from the model, not from weights. Compare canonical templates
 # (Deformed Implicit Field, Deng et al., CVPR 2021; D-NeRF, Pumarola et al., CVPR 2021), which learn the template too:
-# docs/design/0004-template.md.
+# docs/learning.md.
 #
 # Notation: b clouds, q queries, h hidden channels, s segments, n grid nodes.
 

@@ -133,7 +133,7 @@ def _check(config: NetworkConfig) -> None:
 # slowly. Here a small network first predicts rest-pose coordinates (normalized object coordinates; Wang et al., CVPR
 # 2019) at the observed points; the rigid motion that fits them best takes cloud and queries into the rest pose's frame.
 # What deformation and the estimate's error leave over is for the network behind it. Regressing the rotation directly,
-# as T-Net does (PointNet; Qi et al., CVPR 2017), learned far more slowly: docs/design/0003-alignment.md.
+# as T-Net does (PointNet; Qi et al., CVPR 2017), learned far more slowly: docs/learning.md.
 #
 # Notation: b clouds, n points, q queries.
 

@@ -219,7 +219,7 @@ def clusters_warning(observation: Observation) -> str | None:
 #     SensorFrame, Selection -lines_of_frame-> SightLines
 #
 # Depths beside the object are compared with those of the object's pixels nearest in the picture
-# (docs/design/0028-sight-lines.md). A depth image states a line of sight for each pixel, a point cloud for each point
+# (docs/registration.md). A depth image states a line of sight for each pixel, a point cloud for each point
 # that isolation left out.
 
 MOST_LINES = 10_000

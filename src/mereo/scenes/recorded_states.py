@@ -1,7 +1,7 @@
 """Simulated states: an object's deformations taken from a simulator's recorded frames instead of drawn by formula.
 
 A random state is one recorded frame, drawn at random. Frames are finitely many, so some are kept for testing: training
-and test seeds never share one. See docs/design/0008-simulated-states.md for formats and accuracy.
+and test seeds never share one. See docs/own-object.md for formats.
 """
 
 from dataclasses import dataclass, replace
@@ -88,7 +88,7 @@ def load_states(
     """Recorded states of an object.
 
     Args:
-        path: an NPZ file or a directory, see docs/design/0008-simulated-states.md.
+        path: an NPZ file or a directory, see docs/own-object.md.
         rest: the object at rest, in scene units.
         scale: ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
         shift: see ``scale``.

@@ -3,7 +3,7 @@
 Light, so that the command line may import them.
 
 Defaults are the paper's (Henrich et al., WACV 2024, section 3 and appendix B) unless a comment says otherwise. What it
-does not say, such as the optimizer, is chosen as docs/paper-notes.md tells.
+does not say, such as the optimizer, is chosen as docs/method.md tells.
 """
 
 from dataclasses import asdict, dataclass, field, replace
@@ -70,7 +70,7 @@ class TrainConfig:
         l1_weight: the paper's lambda.
         batch: examples per step, over all processes together.
         accumulate: parts in which each process takes its share of a batch, one after another, for batches that do not
-            fit into memory at once; only batch normalization sees the parts (docs/clusters.md).
+            fit into memory at once; only batch normalization sees the parts (docs/many-machines.md).
         data: hold all examples in memory, or read their shards while learning; auto streams what would take more than
             half of the memory that is free. Both learn from the same examples, in another order.
         queries: query points per example and step, a random subset; 0 means all of them.
@@ -153,10 +153,10 @@ class TrainConfig:
 PresetName = Literal["paper", "paper-autodecoder", "base", "large", "tiny", "tiny-autodecoder"]
 """Recipes to start from.
 
-    paper              as published, as far as it is (docs/paper-notes.md)
+    paper              as published, as far as it is (docs/method.md)
     paper-autodecoder  the same for the autodecoder, whose hyperparameters the paper lists apart (appendix B)
     base               what to train for real, also on a CPU: the paper's network at half its widths, local features at
-                       the query, a modern schedule, and many small steps (docs/design/0002-learning.md)
+                       the query, a modern schedule, and many small steps (docs/learning.md)
     large              the same with the widths of `paper` and larger steps, for a GPU
     tiny               two minutes on two CPU cores: for tests; objects of one's own are learnt by `mereo learn`
     tiny-autodecoder   the paper's autodecoder, as small and in a modern schedule (docs/design/0009-encoders.md)

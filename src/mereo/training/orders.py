@@ -1,7 +1,7 @@
 """Order in which examples are learnt from: a function of the seed and the step, so that resuming needs no state.
 
 Two of them: ``ShuffledOrder`` permutes all examples of a pass, which asks for all of them to be at hand, and
-``StreamedOrder`` needs few shards at a time (docs/design/0025-streaming.md).
+``StreamedOrder`` needs few shards at a time (docs/learning.md).
 
 Notation: s shards, b examples of a batch.
 """

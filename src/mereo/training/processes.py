@@ -61,7 +61,7 @@ SEPARATE = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
 def _keeps_addresses() -> bool:
     """Whether nodes that torchrun starts again would meet the addresses of processes that have ended.
 
-    It does since 2.5 unless told otherwise, and no restart of several nodes succeeds then (docs/clusters.md).
+    It does since 2.5 unless told otherwise, and no restart of several nodes succeeds then (docs/many-machines.md).
     """
     several = int(os.environ.get("GROUP_WORLD_SIZE", "1")) > 1
     return several and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"

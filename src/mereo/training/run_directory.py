@@ -56,7 +56,7 @@ def _check_autodecoder(config: TrainConfig) -> None:
 def start_network(config: TrainConfig, data: TrainingData) -> Network:
     """Network to train: random from the seed, or with the weights that ``config.init`` names.
 
-    Weights that know other segments give all that is not about segments (docs/design/0002-learning.md). An
+    Weights that know other segments give all that is not about segments (docs/learning.md). An
     autodecoder gets a random code for each example that is not held out. Raises ``ValueError`` when the weights are of
     another architecture.
     """

@@ -2,7 +2,7 @@
 
 Everything random in step t is drawn from (seed, t), and which steps are validated depends on their number alone, so a
 resumed run repeats an uninterrupted one exactly. Under ``torchrun`` each process takes its share of the batches that a
-single one would have taken (docs/clusters.md); process 0 writes.
+single one would have taken (docs/many-machines.md); process 0 writes.
 """
 
 import copy

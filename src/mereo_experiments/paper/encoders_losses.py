@@ -34,7 +34,7 @@ def recipe(scale: ExperimentScale, encoder: Encoder, loss: Loss) -> TrainConfig 
 
 
 def features(config: TrainConfig) -> tuple[str, ...]:
-    """Words for what a recipe adds to the paper's (docs/design/0002-learning.md)."""
+    """Words for what a recipe adds to the paper's (docs/learning.md)."""
     additions, augment = config.network.additions, replace(config.augment, observations=AugmentConfig.observations)
     added = {
         "local features": additions.local_neighbors,

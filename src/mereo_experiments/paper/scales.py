@@ -60,7 +60,7 @@ _TINY, _PAPER = PRESETS["tiny"], PRESETS["paper"]
 # Small, because hours are few and there are dozens of runs: on two cores it learns more in minutes than the wide one.
 # Without alignment and template, so that what is left is the paper's network with local features and lines of sight:
 # each variant of the paper can be switched on its own in it, and it learns in minutes what the paper's network does not
-# learn in hours (docs/design/0002-learning.md).
+# learn in hours (docs/learning.md).
 _SHORT = replace(
     _TINY, network=_TINY.network.changed(points=512, align_points=0, rest_template=False), epochs=8, holdout=32
 )

@@ -56,7 +56,7 @@ class ModesOptimum:
 
     @cached_property
     def terms(self) -> Terms:
-        """Terms under the prior of all states; that of the states near the answer is too sure (design note 22)."""
+        """Terms under the prior of all states; that of states near the answer is too sure (docs/registration.md)."""
         problem, posed, config = self.problem, self.posed, self.problem.config
         nothing = NormalEquations.nothing(POSE + len(posed.z))
         with one_blas_thread():

@@ -7,7 +7,7 @@ Two graphs, because a cloud is encoded once and queried often:
                                                          -> logits [1, q, c], distance [1, q], direction [1, q, 3]
 
 All coordinates are normalized, the cloud in farthest-point order; ``mereo_onnx.py``, which goes beside ONNX graphs,
-does both in numpy. n and q are open: n from the network's own number of points up. See docs/design/0015-export.md.
+does both in numpy. n and q are open: n from the network's own number of points up. See docs/architecture.md.
 """
 
 import io
