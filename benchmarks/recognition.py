@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mereo.api.generate import generate
 from mereo.evaluation.calibrate import (
     VIEWS,
     CalibrationView,
@@ -55,7 +56,6 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.shards import generate
 from mereo.training.config import PRESETS
 from mereo.training.trainer import train
 

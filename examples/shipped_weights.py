@@ -10,18 +10,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from mereo.evaluation.cases import EvaluatedView
-from mereo.evaluation.scoring import evaluate
+from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model
 from mereo.models.weights_place import shipped_names
 from mereo.scenes.scene import AssetUnavailable
-from mereo.scenes.seeds import TEST_SEED_START
 from mereo.visualization.error_maps import error_picture
 
 
 def first_view(name: str, cells: int) -> EvaluatedView:
     """The first test view with its labels, true and predicted; the row says how good this one is."""
-    evaluation = evaluate(load_model(name), examples=1, cells=cells, seed=TEST_SEED_START)
+    evaluation = evaluate(load_model(name), EvaluationConfig(examples=1, cells=cells))
     scores = evaluation.scores
     return replace(evaluation.views[0], name=f"{name}\nIoU {scores.iou:.2f}\nmIoU {scores.miou:.2f}")
 

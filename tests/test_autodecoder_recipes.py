@@ -7,12 +7,12 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from mereo.api.generate import generate
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.models.config import AutodecoderConfig
 from mereo.models.encoders.encoding import Encoding
 from mereo.models.network import Network
 from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.shards import generate
 from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
 from mereo.training.dataset import Dataset
 from mereo.training.run_directory import start_network

@@ -17,13 +17,13 @@ VARIABLE = "OMP_WAIT_POLICY"
 
 WORKERS = f"""
 import os
-from mereo.workers.processes import in_processes
+from mereo.workers.spread import spread
 
-def policy(item, cancelled):
+def policy(item):
     return os.environ.get({VARIABLE!r}), os.getpid()
 
 if __name__ == "__main__":
-    results = [result for _, result in in_processes(policy, [0, 1, 2], 2)]
+    results = [result for _, result in spread(policy, [0, 1, 2], 2)]
     assert all(worker != os.getpid() for _, worker in results)
     print(*(value for value, _ in results))
 """

@@ -10,7 +10,7 @@ import pytest
 from mereo.evaluation.cases import Evaluation, RegistrationErrors, find_candidates, seen_points
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import Scores
-from mereo.evaluation.scoring import evaluate
+from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.evaluation.tables import markdown_table, metrics
 from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.registration.register import Registrar
@@ -83,7 +83,7 @@ def test_a_registration_is_as_far_off_as_its_points_are(model: Model, view: View
 
 @pytest.mark.slow
 def test_an_evaluation_compares_all_who_could_answer(model: Model, tmp_path: Path) -> None:
-    found = evaluate(model, "engine", examples=2, seed=SEED, cells=24)
+    found = evaluate(model, EvaluationConfig("engine", 2, SEED, cells=24))
     values = metrics(found, {})
     assert sum(values["chosen"].values()) == pytest.approx(1.0)
     only = {name for name, share in values["chosen"].items() if share == 1.0}
@@ -96,7 +96,7 @@ def test_an_evaluation_compares_all_who_could_answer(model: Model, tmp_path: Pat
     write_json(tmp_path / "metrics.json", values)
     assert json.loads((tmp_path / "metrics.json").read_text())["chosen"] == values["chosen"]
     assert "modes alone" in markdown_table(found)
-    off = evaluate(model, "engine", examples=2, seed=SEED, cells=24, method="network")
+    off = evaluate(model, EvaluationConfig("engine", 2, SEED, cells=24, method="network"))
     assert (off.scores.iou, off.scores.miou) == (values["network"]["iou"], values["network"]["miou"])
     assert "alone" not in markdown_table(off) and metrics(off, {})["registration_error"] is None
     assert found.known == (True, True) and off.known == ()

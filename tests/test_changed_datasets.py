@@ -11,8 +11,8 @@ from safetensors.numpy import load_file, save_file
 from toy_data import SMALL, make_small_datasets
 from toy_scene import toy_scene
 
+from mereo.api.generate import generate
 from mereo.io.places import sha256
-from mereo.synthesis.shards import generate
 from mereo.training.dataset import Dataset
 
 TOY = toy_scene()
@@ -147,6 +147,6 @@ def test_a_manifest_that_was_changed_does_not_fit_its_files(data: Path) -> None:
 
 
 def test_more_examples_than_the_disk_has_room_for_are_refused_at_once(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"--examples 10000000000 needs .* GB at .* kB each and .* would fit: ask"):
+    with pytest.raises(ValueError, match=r"examples=10000000000 needs .* GB at .* kB each and .* would fit: ask"):
         generate(TOY, tmp_path / "data", SMALL, examples=10**10, seed=3)
     assert not (tmp_path / "data").exists()

@@ -12,9 +12,9 @@ from toy_data import SMALL, make_small_datasets, write_small_dataset, write_toy_
 from toy_scene import toy_scene
 
 from mereo.__main__ import main
+from mereo.api.generate import generate
 from mereo.io.checked_tensors import pack_tensors, unpack_tensors
 from mereo.scenes.seeds import TEST_SEED_START
-from mereo.synthesis.shards import generate
 from mereo.training.dataset import Dataset
 
 TOY = toy_scene()

@@ -14,7 +14,14 @@ from mereo.evaluation.cases import PICTURE_MARGIN, Evaluation, TestCase, grid_co
 from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union
 from mereo.evaluation.sample_views import DEPTH_STEP, load_view, make_view, save_view
-from mereo.evaluation.scoring import evaluate, grid_scores, predict_grid, score_cases, trained_scene
+from mereo.evaluation.scoring import (
+    EvaluationConfig,
+    evaluate,
+    grid_scores,
+    predict_grid,
+    score_cases,
+    trained_scene,
+)
 from mereo.evaluation.tables import markdown_table
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -179,11 +186,11 @@ def rope() -> AnalyticModel:
 
 
 def test_example_i_is_made_from_seed_and_i_alone(rope: AnalyticModel) -> None:
-    three, two = (evaluate(rope, examples=n, seed=1_000_005, cells=16) for n in (3, 2))
+    three, two = (evaluate(rope, EvaluationConfig(None, n, 1_000_005, cells=16)) for n in (3, 2))
     assert list(three.examples) == ["rope 0", "rope 1", "rope 2"]
     for name, scores in two.examples.items():
         np.testing.assert_array_equal(scores.per_segment, three.examples[name].per_segment)
-    other = evaluate(rope, load_scene("rope"), examples=2, seed=1_000_006, cells=16)
+    other = evaluate(rope, EvaluationConfig(load_scene("rope"), 2, 1_000_006, cells=16))
     assert (other.confusion != two.confusion).any()
 
 
@@ -197,19 +204,19 @@ def test_example_i_is_made_from_seed_and_i_alone(rope: AnalyticModel) -> None:
 )
 def test_impossible_evaluations(rope: AnalyticModel, options: dict[str, object], text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        evaluate(rope, **options)  # type: ignore[arg-type]
+        evaluate(rope, EvaluationConfig(**options))  # type: ignore[arg-type]
 
 
 def test_weights_of_another_object() -> None:
     with pytest.raises(ValueError, match="the weights know the segments left, right but the truth has"):
-        evaluate(untrained(NAMES), "rope")
+        evaluate(untrained(NAMES), EvaluationConfig("rope"))
     with pytest.raises(ValueError, match="do not say which scene they were trained on; name it with --scene"):
         trained_scene(AnalyticModel.of(lambda p: p, NAMES))
 
 
 def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_model(untrained(load_scene("rope").rest.names), tmp_path / "w.safetensors")
-    result = evaluate_weights(tmp_path / "w.safetensors", tmp_path / "out", examples=2, cells=12)
+    result = evaluate_weights(tmp_path / "w.safetensors", tmp_path / "out", EvaluationConfig(examples=2, cells=12))
     assert sorted(p.name for p in (tmp_path / "out").glob("[!.]*")) == [
         "errors.png",
         "metrics.json",
@@ -227,7 +234,7 @@ def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert (tmp_path / "out/table.md").read_text() == markdown_table(result)
     assert "whole set" in capsys.readouterr().out
     with pytest.raises(FileExistsError):
-        evaluate_weights(tmp_path / "w.safetensors", tmp_path / "out", examples=1)
+        evaluate_weights(tmp_path / "w.safetensors", tmp_path / "out", EvaluationConfig(examples=1))
 
 
 def test_the_table_agrees_with_the_matrix() -> None:

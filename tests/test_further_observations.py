@@ -11,6 +11,7 @@ from toy_data import SMALL, make_small_datasets
 from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
+from mereo.api.generate import generate
 from mereo.cli import commands
 from mereo.geometry.surface_patches import without_strays
 from mereo.scenes.seeds import example_rng
@@ -18,7 +19,7 @@ from mereo.synthesis import examples
 from mereo.synthesis.config import OBSERVATIONS, SENSORS, GenerateConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import Example, _sample_view, synthesize
-from mereo.synthesis.shards import example_bytes, generate, pack
+from mereo.synthesis.shards import example_bytes, pack
 
 SEEN = replace(SMALL, observations=("all",))
 TOY = toy_scene()

@@ -13,6 +13,7 @@ from safetensors.numpy import load_file
 from toy_data import SMALL
 from toy_scene import toy_scene
 
+from mereo.api.generate import generate
 from mereo.io import progress
 from mereo.io.scratch_folders import LOCK
 from mereo.scenes.registry import load_scene
@@ -21,7 +22,7 @@ from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import Example, synthesize
-from mereo.synthesis.shards import example_bytes, generate
+from mereo.synthesis.shards import example_bytes
 from mereo.training.dataset import Dataset
 
 TOY = toy_scene()
@@ -79,7 +80,7 @@ def test_machines_that_share_the_work_and_the_directory_make_the_same_dataset(wh
     for part in (1, 0):
         generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(part, 2))
     assert contents(whole) == contents(tmp_path / "data")
-    with pytest.raises(FileExistsError, match="holds a dataset; continue it with --resume"):
+    with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume"):
         generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(0, 2))
 
 
@@ -211,15 +212,15 @@ def test_a_broken_manifest_cannot_be_resumed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("resume", [False, True])
 def test_an_existing_directory_is_left_alone(tmp_path: Path, resume: bool) -> None:
     (tmp_path / "notes.txt").write_text("precious")
-    with pytest.raises(FileExistsError, match=r"is not empty and holds no manifest\.json; choose another --output"):
+    with pytest.raises(FileExistsError, match=r"is not empty and holds no manifest\.json; choose another output"):
         generate(TOY, tmp_path, SMALL, examples=4, seed=1, resume=resume)
-    with pytest.raises(FileExistsError, match="is a file; a dataset is a directory: choose another --output"):
+    with pytest.raises(FileExistsError, match="is a file; a dataset is a directory: choose another output"):
         generate(TOY, tmp_path / "notes.txt", SMALL, examples=4, seed=1, resume=resume)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 def test_a_dataset_is_not_overwritten_without_being_asked(whole: Path) -> None:
-    with pytest.raises(FileExistsError, match="holds a dataset; continue it with --resume, or choose another --output"):
+    with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume, or choose another output"):
         generate(TOY, whole, SMALL, examples=10, seed=3)
 
 
@@ -255,9 +256,9 @@ def test_what_a_killed_run_was_writing_is_removed_on_resume(whole: Path, tmp_pat
 @pytest.mark.parametrize(
     "examples, seed, workers, shard, message",
     [
-        (0, 1, 1, (0, 1), "--examples is 0; it must be at least 1"),
-        (4, -1, 1, (0, 1), "--seed is -1; it must not be negative"),
-        (4, 1, 0, (0, 1), "the number of workers is 0; it must be at least 1"),
+        (0, 1, 1, (0, 1), "examples is 0; it must be at least 1"),
+        (4, -1, 1, (0, 1), "seed is -1; it must not be negative"),
+        (4, 1, -1, (0, 1), "the number of workers is -1; it must be at least 1"),
         (4, 1, 1, (2, 2), "the shard is 2/2; i/n needs i from 0 to n - 1"),
     ],
 )

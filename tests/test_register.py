@@ -15,7 +15,7 @@ from mereo import __main__ as command_line
 from mereo.api.objects import Object
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.evaluation.sample_views import SampleView, load_view
-from mereo.evaluation.scoring import evaluate
+from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
@@ -137,8 +137,8 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
         assert Registrar.of(replace(model, provenance={"scene": "mine"}), scene=changed).states_or_none
     for method in ("auto", "modes", "full"):
         with pytest.raises(ValueError, match=f"{said}, so places cannot be compared: .* with --method network"):
-            evaluate(model, changed, examples=1, method=method)
-    assert evaluate(model, changed, examples=1, cells=12, method="network").sources == ("network",)
+            evaluate(model, EvaluationConfig(changed, 1, method=method))
+    assert evaluate(model, EvaluationConfig(changed, 1, cells=12, method="network")).sources == ("network",)
 
 
 def test_auto_plays_the_scene_where_it_is_at_hand(

@@ -15,9 +15,9 @@ from toy_data import SMALL, make_small_datasets
 from toy_scene import toy_scene
 
 from mereo.__main__ import main
+from mereo.api.generate import generate
 from mereo.io.object_storage import ObjectPath, StorageError
 from mereo.io.places import claim, names_in, write_whole
-from mereo.synthesis.shards import generate
 from mereo.training.dataset import Dataset
 
 s3fs = pytest.importorskip("s3fs")

@@ -18,14 +18,14 @@ from mereo.evaluation.registration.icp import moved
 from mereo.evaluation.registration.placement import Start, place, start_from_model
 from mereo.evaluation.registration.truth_file import read_truth
 from mereo.evaluation.scans import BUNNY_SCAN_POSES, SCANS, bunny_posed, bunny_scan
-from mereo.evaluation.scoring import evaluate_scans
+from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.visualization.evaluation_files import evaluate_on_scans
+from mereo.visualization.evaluation_files import evaluate_weights
 
 pytest.importorskip("small_gicp", reason="the extra align is not installed")
 
@@ -70,7 +70,9 @@ def oracle(folder: Path, shift_mm: float) -> Scores:
     truth = read_truth(folder / "truth").truth
     solids, shift = Solids(truth), np.array([shift_mm, 0.0, 0.0])
     model = AnalyticModel.of(lambda points: 5.0 * np.eye(3)[solids.label(points - shift)], truth.names)
-    evaluation = evaluate_on_scans(model, folder / f"test{shift_mm}", truths=[folder / "truth"], cells=20)
+    evaluation = evaluate_weights(
+        model, folder / f"test{shift_mm}", EvaluationConfig(scans=[folder / "truth"], cells=20)
+    )
     assert list(evaluation.examples) == ["truth"]
     written = json.loads((folder / f"test{shift_mm}/metrics.json").read_text())
     assert written["iou"] == evaluation.scores.iou and written["scans"] == ["truth"]
@@ -127,7 +129,7 @@ def test_a_truth_file_never_runs_a_python_scene_that_the_user_has_not_named(
             read_truth(truth)
         assert not (folder / "was-run").exists()
     model = AnalyticModel.of(lambda points: points, ("left", "right"))
-    monkeypatch.setattr("mereo.api.steps.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.visualization.evaluation_files.load_for", lambda *_: model)
     monkeypatch.setattr("mereo.evaluation.scoring.check_names", lambda _, names: named.append(names))
     monkeypatch.setattr("mereo.evaluation.scoring.registrar_for", lambda *_: sys.exit("read"))
     named: list[tuple[str, ...]] = []
@@ -139,13 +141,13 @@ def test_a_truth_file_never_runs_a_python_scene_that_the_user_has_not_named(
 
 def test_a_scene_without_truths_is_refused(bar: tuple[Path, Scene, np.ndarray]) -> None:
     with pytest.raises(ValueError, match="the scene 'bar' is given without truth files; the bunny's own scans"):
-        evaluate_scans(AnalyticModel.of(lambda points: points, ("left", "right")), scene=bar[1])
+        evaluate(AnalyticModel.of(lambda points: points, ("left", "right")), EvaluationConfig(bar[1], scans=()))
 
 
 def test_two_truths_of_one_name(bar: tuple[Path, Scene, np.ndarray]) -> None:
     model = AnalyticModel.of(lambda points: np.zeros((len(points), 3)), ("left", "right"))
     with pytest.raises(ValueError, match="two truths are called 'truth'; results are listed by name"):
-        evaluate_scans(model, truths=[bar[0] / "truth", bar[0] / "truth/truth.json"])
+        evaluate(model, EvaluationConfig(scans=[bar[0] / "truth", bar[0] / "truth/truth.json"]))
 
 
 @pytest.mark.parametrize(
@@ -243,4 +245,4 @@ def test_the_bunnys_scans_remain_what_scans_alone_means(require_asset: Callable[
         require_asset(f"bunny/{name}")
     posed = bunny_posed("bun000")
     model = AnalyticModel.of(lambda points: np.tile([1.0, 0, 0, 0, 0, 0], (len(points), 1)), posed.truth.names)
-    assert list(evaluate_scans(model, cells=6).examples) == list(SCANS)
+    assert list(evaluate(model, EvaluationConfig(scans=(), cells=6)).examples) == list(SCANS)

@@ -10,8 +10,8 @@ from shapes import ball
 from test_scene_file import CODE
 from toy_data import SMALL
 
+from mereo.api.generate import generate
 from mereo.evaluation.scoring import trained_scene
-from mereo.synthesis.shards import generate
 
 
 def made(scene: Path, output: Path, workers: int = 1, examples: int = 2, resume: bool = False) -> dict[str, bytes]:

@@ -10,12 +10,13 @@ import pytest
 from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
+from mereo.api.generate import generate
 from mereo.cli import commands
+from mereo.evaluation.scoring import EvaluationConfig
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud
 from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
-from mereo.synthesis.shards import generate
 from mereo.visualization.evaluation_files import evaluate_weights
 
 SMALL = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
@@ -110,8 +111,9 @@ def test_evaluation_looks_through_the_sensor_and_says_so(tmp_path: Path, monkeyp
 
     encode = Model.encode
     monkeypatch.setattr(Model, "encode", watch)
-    for number, settings in enumerate((None, GenerateConfig(128, 0.5, sensor=SENSORS["structured-light"]))):
-        evaluate_weights("rope", tmp_path / str(number), examples=1, cells=12, settings=settings, method="network")
+    for number, settings in enumerate((GenerateConfig(), GenerateConfig(128, 0.5, sensor=SENSORS["structured-light"]))):
+        config = EvaluationConfig(examples=1, cells=12, settings=settings, method="network")
+        evaluate_weights("rope", tmp_path / str(number), config)
     facts = [json.loads((tmp_path / str(number) / "metrics.json").read_text()) for number in range(2)]
     assert [(fact["image_size"], fact["noise_std"]) for fact in facts] == [(96, 0.1), (128, 0.5)]
     assert [SensorConfig(**fact["sensor"]) for fact in facts] == [SENSORS["paper"], SENSORS["structured-light"]]

@@ -10,16 +10,16 @@ from lattice import SIZE, boxes, lattice, states
 from shapes import ball
 from toy_scene import toy_scene
 
+from mereo.api.generate import generate
 from mereo.deformation.maps import invert, jacobian_determinant
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
-from mereo.evaluation.scoring import evaluate
+from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.io.simulation_states import TetrahedralRecord, read_states
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
-from mereo.synthesis.shards import generate
 
 SHIPPED = Path(__file__).parents[1] / "src/mereo/states/liver.npz"
 
@@ -145,7 +145,7 @@ def test_generation_and_evaluation_take_held_out_states_for_test_seeds_only(
     only_training = Scene("toy", toy.rest, toy.sample_deformations, toy.workspace, held_out=blocked)
     generate(only_test, tmp_path / "test", settings, examples=2, seed=TEST_SEED_START, test=True)
     generate(only_training, tmp_path / "train", settings, examples=2, seed=0)
-    assert len(evaluate(untrained(toy.rest.names), only_test, examples=1, cells=8).examples) == 1
+    assert len(evaluate(untrained(toy.rest.names), EvaluationConfig(only_test, 1, cells=8)).examples) == 1
     for scene, seed in ((only_test, 0), (only_training, TEST_SEED_START)):
         with pytest.raises(AssertionError, match="wrong states"):
             generate(scene, tmp_path / f"{seed}", settings, examples=1, seed=seed, test=seed > 0)

@@ -12,11 +12,11 @@ from toy_scene import toy_scene
 
 import mereo
 from mereo.__main__ import main, parse
+from mereo.api.generate import generate
 from mereo.cli.commands import Generate, Train
 from mereo.io.object_cache import CACHE_VARIABLE
 from mereo.io.object_storage import ObjectPath, StorageError
 from mereo.io.places import names_in, write_whole
-from mereo.synthesis.shards import generate
 from mereo.training import trainer
 from mereo.training.dataset import Dataset
 
@@ -72,7 +72,7 @@ def test_machines_share_a_storage(whole: Path, empty: ObjectPath) -> None:
     for part in (1, 0):
         generate(TOY, empty, SMALL, examples=4, seed=3, shard=(part, 2))
     assert contents(empty) == contents(whole)
-    with pytest.raises(FileExistsError, match=r"memory://datasets/\d+ holds a dataset; continue it with --resume, or"):
+    with pytest.raises(FileExistsError, match=r"memory://datasets/\d+ holds a dataset; continue it with resume, or"):
         generate(TOY, empty, SMALL, examples=4, seed=3, shard=(0, 2))
 
 
@@ -98,11 +98,11 @@ def test_killed_in_the_middle_of_a_put_and_resumed(
 
 def test_another_dataset_or_other_objects_are_left_alone(stored: ObjectPath, empty: ObjectPath) -> None:
     before = contents(stored)
-    with pytest.raises(FileExistsError, match="holds a dataset; continue it with --resume, or choose another --output"):
+    with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume, or choose another output"):
         generate(TOY, stored, SMALL, examples=4, seed=3)
     with pytest.raises(ValueError, match="was made with seed = 3, not 4; resuming needs equal settings"):
         generate(TOY, stored, SMALL, examples=4, seed=4, resume=True)
-    with pytest.raises(FileExistsError, match=r"is not empty and holds no manifest.json; choose another --output"):
+    with pytest.raises(FileExistsError, match=r"is not empty and holds no manifest.json; choose another output"):
         generate(TOY, ObjectPath("memory://datasets"), SMALL, examples=4, seed=3)
     assert contents(stored) == before
 

@@ -8,6 +8,7 @@ import torch
 from shapes import one
 from toy_scene import toy_scene
 
+from mereo.api.generate import generate
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.decoder import RestLookup
 from mereo.models.network import Network
@@ -15,7 +16,6 @@ from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distance
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import synthesize
-from mereo.synthesis.shards import generate
 from mereo.training.config import PRESETS
 from mereo.training.dataset import Dataset
 

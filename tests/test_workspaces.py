@@ -10,7 +10,9 @@ import pytest
 from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
+from mereo.api.generate import generate
 from mereo.cli import commands
+from mereo.evaluation.scoring import EvaluationConfig
 from mereo.evaluation.tables import read_metrics
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
@@ -18,7 +20,6 @@ from mereo.scenes.scene import PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD, Scene, Work
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import sample_view
-from mereo.synthesis.shards import generate
 from mereo.training.model_card import card
 from mereo.visualization.evaluation_files import evaluate_weights
 
@@ -91,7 +92,8 @@ def test_settings_say_nothing_of_the_scenes_own_workspace() -> None:
 def test_evaluation_looks_from_the_workspace_and_says_so(tmp_path: Path) -> None:
     for name in ("own", "sphere"):
         settings = GenerateConfig(workspace=name)  # type: ignore[arg-type]
-        evaluate_weights("rope", tmp_path / name, examples=1, cells=12, settings=settings, method="network")
+        config = EvaluationConfig(examples=1, cells=12, settings=settings, method="network")
+        evaluate_weights("rope", tmp_path / name, config)
     own, sphere = (read_metrics(tmp_path / name / "metrics.json") for name in ("own", "sphere"))
     assert (own["workspace"], sphere["workspace"]) == ("own", "sphere") and own["iou"] != sphere["iou"]
     said = ", cameras all around the object, noise 0.1 units"

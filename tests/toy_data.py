@@ -13,6 +13,7 @@ import pytest
 from safetensors.numpy import save_file
 from toy_scene import toy_scene
 
+from mereo.api.generate import generate
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 from mereo.synthesis import shards
 from mereo.synthesis.config import TEMPLATE, GenerateConfig, SamplingConfig
@@ -34,7 +35,7 @@ def write_small_dataset(output: Path) -> Path:
     """Generate four examples of the toy scene in two shards, by ``SMALL``, and return their directory."""
     with pytest.MonkeyPatch.context() as patch:
         make_small_datasets(patch)
-        shards.generate(toy_scene(), output, SMALL, examples=4, seed=3)
+        generate(toy_scene(), output, SMALL, examples=4, seed=3)
     return output
 
 

@@ -11,8 +11,7 @@ from mereo.io.object_storage import ObjectPath, Place, place_of
 from mereo.scenes.scene import Scene
 from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
-from mereo.workers.cluster import joined_first
-from mereo.workers.config import cluster_of
+from mereo.workers.spread import choose_cluster
 
 
 def generate(
@@ -49,18 +48,13 @@ def generate(
     made = str(scene) if isinstance(scene, Path) else scene
     place = place_of(output)
     processes = workers or os.cpu_count() or 1
-    cluster = cluster_of(ray, processes)
-    with python_words(), joined_first(cluster):
+    with python_words():
         shards.generate(
             made,
             place,
-            settings or GenerateConfig(),
-            examples=examples,
-            seed=seed,
-            workers=processes,
+            shards.DatasetConfig(settings or GenerateConfig(), examples, seed, test),
+            workers=choose_cluster(ray, processes) or processes,
             shard=shard,
             resume=resume,
-            test=test,
-            cluster=cluster,
         )
     return place

@@ -17,27 +17,25 @@ from mereo.api.words import python_words
 from mereo.evaluation import scoring
 from mereo.evaluation.cases import Evaluation
 from mereo.evaluation.metrics import format_score
-from mereo.evaluation.scoring import evaluate_scans
 from mereo.fitting.config import AnswerMethod
 from mereo.io.object_storage import ObjectPath, place_of
 from mereo.learning import learn as learning
 from mereo.learning.object_files import FRAME, scene_for
 from mereo.learning.search_stage import TrainChoice
 from mereo.models.config import EXACT, Device, InferenceConfig
-from mereo.models.elsewhere import for_tasks
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
+from mereo.models.remote import settings_for
 from mereo.models.weights import load_for
 from mereo.models.weights_place import WEIGHTS
-from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
 from mereo.training import trainer
 from mereo.training.config import PRESETS, PresetName, TrainConfig
-from mereo.visualization.evaluation_files import evaluate_on_scans, evaluate_weights
-from mereo.workers.cluster import joined_first
-from mereo.workers.config import Cluster, cluster_of
+from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.workers.config import Cluster
+from mereo.workers.spread import choose_cluster
 
 
 def train(
@@ -107,43 +105,27 @@ def evaluate(
     Raises ``ValueError`` for a training seed, no examples, another object than the model's, and settings with scans,
     which are real; ``FileExistsError`` for an output with content.
     """
-    cluster = ray if isinstance(ray, Cluster) else cluster_of(ray)
-    named = str(scene) if isinstance(scene, Path) else scene
+    if scans is not None and settings is not None:
+        raise ValueError("scans are real and take no simulated camera: leave out the settings")
+    config = scoring.EvaluationConfig(
+        scene=str(scene) if isinstance(scene, Path) else scene,
+        examples=examples,
+        seed=seed,
+        scans=scans,
+        settings=settings or GenerateConfig(),
+        method=method,
+        cells=cells,
+    )
     with python_words():
-        if scans is not None:
-            if settings is not None:
-                raise ValueError("scans are real and take no simulated camera: leave out the settings")
-            if cluster is not None:
-                raise ValueError("--scans are few and are scored here: leave out --ray")
-            loaded = model if isinstance(model, Model) else load_for(model, inference)
-            if output is None:
-                posed = load_scene(named) if isinstance(named, str) else named
-                return evaluate_scans(loaded, truths=scans, scene=posed, cells=cells, method=method)
-            return evaluate_on_scans(
-                loaded,
-                output,
-                truths=scans,
-                scene=named,
-                cells=cells,
-                method=method,
-                force=overwrite,
-                options=options,
-            )
-        views: dict[str, Any] = {
-            "examples": examples,
-            "seed": seed,
-            "cells": cells,
-            "settings": settings,
-            "method": method,
-            "cluster": cluster,
-        }
-        with joined_first(cluster):
-            if output is None:
-                loaded = model if isinstance(model, Model) else load_for(model, for_tasks(inference, cluster))
-                return scoring.evaluate(loaded, named, progress=progress, **views)
-            return evaluate_weights(
-                model, output, scene=named, inference=inference, force=overwrite, options=options, **views
-            )
+        workers = (ray if isinstance(ray, Cluster) else choose_cluster(ray)) or 1
+        if scans is not None and isinstance(workers, Cluster):
+            raise ValueError("--scans are few and are scored here: leave out --ray")
+        if output is None:
+            loaded = model if isinstance(model, Model) else load_for(model, settings_for(inference, workers))
+            return scoring.evaluate(loaded, config, progress=progress, workers=workers)
+        return evaluate_weights(
+            model, output, config, inference=inference, workers=workers, force=overwrite, options=options
+        )
 
 
 def export(

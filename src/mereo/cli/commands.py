@@ -21,7 +21,7 @@ from mereo.io.cores import workers_for
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.training.config import PresetName, TrainConfig
-from mereo.workers.config import ONE_CPU, RayAddress, TaskResources, cluster_of
+from mereo.workers.config import ONE_CPU, RayAddress, TaskResources
 
 
 @dataclass(frozen=True)
@@ -226,6 +226,7 @@ class Evaluate:
         """Write scores and pictures of their errors, and print the table."""
         from mereo.api.steps import evaluate
         from mereo.evaluation.tables import read_metrics
+        from mereo.workers.spread import choose_cluster
 
         settings = GenerateConfig(
             image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms, workspace=self.workspace
@@ -245,7 +246,7 @@ class Evaluate:
             settings=None if self.scans is not None else settings,
             method=self.method,
             inference=self.inference,
-            ray=cluster_of(self.ray, self.threads, self.task),
+            ray=choose_cluster(self.ray, self.threads, self.task),
             overwrite=self.force,
             options=options_of(self, "evaluate"),
         )

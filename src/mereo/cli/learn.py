@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from mereo.cli.config_file import ConfigFile
 from mereo.cli.positionals import ObjectFiles
 from mereo.io.bounds import Count, NotNegative, Positive, Threads, Workers
 from mereo.io.cores import workers_for
-from mereo.workers.config import RayAddress, TaskResources, cluster_of
+from mereo.workers.config import ONE_CPU, RayAddress, TaskResources
 
 
 @dataclass(frozen=True)
@@ -57,33 +57,23 @@ class LearnCommand:
     def run(self) -> None:
         """Learn, and print the scores and how to use the object."""
         from mereo.api.steps import learn
-        from mereo.learning.object_folders import is_folder_of_objects, learn_objects
-        from mereo.workers.cluster import joined_first
+        from mereo.learning.object_folders import learn_objects
+        from mereo.workers.spread import choose_cluster
 
-        workers = workers_for(self.workers, self.threads)
-        if not is_folder_of_objects(self.object):
-            if self.ray is not None:
-                raise ValueError("--ray is for a folder of objects, each of which is a task: name one, or leave it out")
-            learn(
-                self.object,
-                self.output,
-                minutes=self.minutes,
-                init=self.init,
-                units=self.units,
-                workers=workers,
-                train=self.train,
-            )
-            return
-        task = TaskResources(self.cpus_per_object, self.gpus_per_object)
-        cluster = None if self.ray is None else cluster_of(self.ray, self.threads, task)
-        with joined_first(cluster):
-            learn_objects(
-                self.object[0],
-                self.output,
-                minutes=self.minutes,
-                init=self.init,
-                units=self.units,
-                workers=workers,
-                train=self.train,
-                cluster=cluster,
-            )
+        settings: dict[str, Any] = {
+            "minutes": self.minutes,
+            "init": self.init,
+            "units": self.units,
+            "workers": workers_for(self.workers, self.threads),
+            "train": self.train,
+        }
+        if len(self.object) == 1 and self.object[0].is_dir():
+            task = ONE_CPU if self.ray is None else TaskResources(self.cpus_per_object, self.gpus_per_object)
+            cluster = choose_cluster(self.ray, self.threads, task)
+            if cluster is not None:
+                settings["workers"] = cluster.cpus
+            learn_objects(self.object[0], self.output, settings, cluster)
+        elif self.ray is not None:
+            raise ValueError("--ray is for a folder of objects, each of which is a task: name one, or leave it out")
+        else:
+            learn(self.object, self.output, **settings)

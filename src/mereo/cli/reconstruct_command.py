@@ -15,7 +15,7 @@ from mereo.io.bounds import Cells, Threads
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
-from mereo.workers.config import ONE_CPU, RayAddress, TaskResources, cluster_of
+from mereo.workers.config import ONE_CPU, RayAddress, TaskResources
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,14 @@ class ReconstructCommand:
         from mereo.api.result import free_folder
         from mereo.cli.reconstruct import FrameJob
         from mereo.cli.reconstruct_many import reconstruct_inputs
-        from mereo.workers.cluster import joined_first
+        from mereo.workers.spread import choose_cluster
 
-        cluster = cluster_of(self.ray, self.threads, self.task)
+        cluster = choose_cluster(self.ray, self.threads, self.task)
         inference = self.inference
         if cluster is not None and self.weights is not None:
-            from mereo.models.elsewhere import for_tasks
+            from mereo.models.remote import settings_for
 
-            inference = for_tasks(inference, cluster)
+            inference = settings_for(inference, cluster)
         job = FrameJob(
             self.weights,
             self.resolution,
@@ -115,5 +115,4 @@ class ReconstructCommand:
             looked_for=self.object,
             units=self.units,
         )
-        with joined_first(cluster):
-            return reconstruct_inputs(self.inputs, self.output or free_folder(), job, cluster)
+        return reconstruct_inputs(self.inputs, self.output or free_folder(), job, cluster)

@@ -1,30 +1,79 @@
-"""``mereo reconstruct`` for several frames and folders of them: one model, a folder of results for each frame."""
+"""``mereo reconstruct`` for several frames and folders of them: one model, a folder of results for each frame.
 
+On a cluster each frame is a task: it is read here and its files come back as bytes, so nodes need to see neither.
+"""
+
+import io
 import os
 import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, redirect_stdout
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from mereo.api.words import option_words
 from mereo.cli import outcome as command
-from mereo.cli.reconstruct import FrameJob, outcome_of, reconstruct_file
-from mereo.cli.reconstruct_tasks import answer_in_tasks
-from mereo.cli.reconstruct_told import KNOWN, Told
+from mereo.cli.reconstruct import FrameJob, answer_frame, outcome_of, print_segments, reconstruct_file, written
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.recognition import Known
 from mereo.io.config import InputConfig
-from mereo.io.output_folders import MARKER
+from mereo.io.output_folders import MARKER, check_new_directory, new_directory
 from mereo.io.progress import duration
 from mereo.io.ros_recordings import is_recording
 from mereo.io.scratch_folders import check_place
+from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.reconstruction.observation import FrameWarning
 from mereo.reconstruction.stream import frame_error
 from mereo.reconstruction.stream_sources import frames_in
+from mereo.visualization.result_files import summary_of
 from mereo.workers.config import Cluster
+from mereo.workers.spread import spread
+
+KNOWN: Mapping[Known, str] = {True: "yes", False: "no", "unsure": "unsure"}
+"""Words of a table for whether a frame shows the object."""
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """Row of the table about a frame, but for its name and folder.
+
+    Attributes:
+        answer: who answers.
+        explained: share of the cloud that the registered model explains; "" without one.
+        known: whether it shows the object.
+        segments: how many of them were found.
+        seconds: that the answer took.
+        summary: content of its summary.json.
+    """
+
+    answer: str
+    explained: str
+    known: str
+    segments: str
+    seconds: float
+    summary: Mapping[str, Any] = field(compare=False, repr=False)
+
+    @classmethod
+    def of(cls, found: Answer) -> "FrameRow":
+        """Row about an answer."""
+        registration, segments = found.registration, found.reconstruction.segments
+        return cls(
+            answer="registered model" if found.taken else "network",
+            explained="" if registration is None else f"{registration.explained:.1%}",
+            known=KNOWN[found.recognition.known],
+            segments=f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}",
+            seconds=found.reconstruction.seconds,
+            summary=summary_of(found),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +83,12 @@ class Outcome:
     Attributes:
         path: its file.
         folder: of its results.
-        told: what it is in a table; None for a frame that could not be answered.
+        row: what the table says of it; None for a frame that could not be answered.
     """
 
     path: Path
     folder: Path
-    told: Told | None
+    row: FrameRow | None
 
 
 def reconstruct_inputs(
@@ -58,8 +107,8 @@ def reconstruct_inputs(
             raise ValueError("--ray is for several frames, each of which is a task: name more, or leave it out")
         return outcome_of(reconstruct_file(inputs[0], output, job), output)
     found = reconstruct_frames(list_frames(inputs, job.reading), output, job, cluster)
-    frames = [{"output": str(one.folder), **one.told.summary} for one in found if one.told is not None]
-    unknown = any(one.told is not None and one.told.known == KNOWN[False] for one in found)
+    frames = [{"output": str(one.folder), **one.row.summary} for one in found if one.row is not None]
+    unknown = any(one.row is not None and one.row.known == KNOWN[False] for one in found)
     return command.Outcome({"output": str(output), "frames": frames}, command.NOT_RECOGNIZED if unknown else 0)
 
 
@@ -112,50 +161,48 @@ def reconstruct_frames(
     job.check()
     _ = job.object, job.placed  # what is wrong with them is no frame's fault
     folders = [output / name for name in names]
-    found: dict[Path, Told | None] = {}
+    rows: list[FrameRow | None] = []
+    outcomes: dict[Path, Outcome] = {}
     started = time.monotonic()
-
-    def heading(file: Path) -> None:
-        left = _left([*found.values()], len(files), time.monotonic() - started)
-        print(f"\n[{len(found) + 1}/{len(files)}] {file}{left}", flush=True)
-
+    frames = zip(files, folders, strict=True)
+    finishing: Iterator[_Finishing] = (
+        ((file, folder, partial(_answer_here, file, folder, job)) for file, folder in frames)
+        if cluster is None
+        else _answer_in_tasks(frames, job, cluster)
+    )
     with warnings.catch_warnings():
         warnings.filterwarnings("always", category=FrameWarning)  # for each frame, also in the same words
-        for file, told in (
-            _answer_here(files, folders, job, heading)
-            if cluster is None
-            else answer_in_tasks(files, folders, job, cluster, heading, _say)
-        ):
-            found[file] = told
-    outcomes = [Outcome(file, folder, found[file]) for file, folder in zip(files, folders, strict=True)]
-    _show(outcomes, output)
-    failed = sum(outcome.told is None for outcome in outcomes)
+        for file, folder, finish in finishing:
+            left = _left(rows, len(files), time.monotonic() - started)
+            print(f"\n[{len(rows) + 1}/{len(files)}] {file}{left}", flush=True)
+            try:
+                rows.append(finish())
+            except Exception as problem:
+                _say(file, problem)
+                rows.append(None)
+            outcomes[file] = Outcome(file, folder, rows[-1])
+    ordered = [outcomes[file] for file in files]
+    _show(ordered, output)
+    failed = rows.count(None)
     if failed:
         raise ValueError(
             f"{failed} of {len(files)} frames could not be reconstructed, each for the reason given with it; the "
             "others are written: correct them, and name only those again"
         )
-    return outcomes
+    return ordered
 
 
-def _answer_here(
-    files: Sequence[Path], folders: Sequence[Path], job: FrameJob, heading: Callable[[Path], None]
-) -> Iterator[tuple[Path, Told | None]]:
-    """Answer frames one after the other; None for a bad one, which is said."""
-    for file, folder in zip(files, folders, strict=True):
-        heading(file)
-        try:
-            told = Told.of(reconstruct_file(file, folder, job))
-        except Exception as problem:
-            _say(file, problem)
-            yield file, None
-        else:
-            yield file, told
+_Finishing = tuple[Path, Path, Callable[[], FrameRow]]
+"""A frame's file, its folder of results, and what writes that, or raises why not."""
 
 
-def _left(done: Sequence[Told | None], count: int, seconds: float) -> str:
+def _answer_here(file: Path, folder: Path, job: FrameJob) -> FrameRow:
+    return FrameRow.of(reconstruct_file(file, folder, job))
+
+
+def _left(done: Sequence[FrameRow | None], count: int, seconds: float) -> str:
     """Words on the time that is left of ``count`` frames, where something is known of it; bad frames take none."""
-    answered = sum(told is not None for told in done)
+    answered = sum(row is not None for row in done)
     return f", {duration(seconds / answered * (count - len(done)))} left" if answered else ""
 
 
@@ -182,7 +229,101 @@ def _show(outcomes: Sequence[Outcome], output: Path) -> None:
 
 
 def _row(outcome: Outcome) -> tuple[str, ...]:
-    told = outcome.told
-    if told is None:
+    row = outcome.row
+    if row is None:
         return "none", "", "", "", "", ""
-    return told.answer, told.explained, told.known, told.segments, f"{told.seconds:.1f}", outcome.folder.name
+    return row.answer, row.explained, row.known, row.segments, f"{row.seconds:.1f}", outcome.folder.name
+
+
+# --- a cluster --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """Frame on its way to a task: its file, the folder of its results, and its content, or why it has none."""
+
+    path: Path
+    folder: Path
+    content: SensorFrame | Exception
+
+
+@dataclass(frozen=True, eq=False)
+class _Answered:
+    """What a task sends back: the frame's row, its files by their path in the folder, what it printed and warned of."""
+
+    row: FrameRow
+    files: dict[str, bytes]
+    printed: str
+    warned: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Answering:
+    """Answers frames in a task, with the weights on a GPU of its own or none; ``job`` has all that they share."""
+
+    job: FrameJob
+    gpu: bool
+
+    @cached_property
+    def moved(self) -> FrameJob:
+        """The job with its weights on the task's device, moved there once."""
+        if self.job.object.network is None or not self.gpu:
+            return self.job
+        from mereo.models.remote import to_gpu
+
+        return self.job.asking(to_gpu(self.job.object.network))
+
+    def __call__(self, frame: _Frame) -> _Answered | Exception:
+        if isinstance(frame.content, Exception):
+            return frame.content
+        with (
+            option_words(),
+            TemporaryDirectory() as name,
+            redirect_stdout(io.StringIO()) as printed,
+            warnings.catch_warnings(record=True) as warned,
+        ):
+            warnings.simplefilter("always", FrameWarning)
+            folder = Path(name)
+            found = answer_frame(frame.content, folder, self.moved, frame.path.absolute())
+            print_segments(found)
+            files = {
+                file.relative_to(folder).as_posix(): file.read_bytes() for file in folder.rglob("*") if file.is_file()
+            }
+        texts = [str(one.message) for one in warned if issubclass(one.category, FrameWarning)]
+        return _Answered(FrameRow.of(found), files, printed.getvalue(), texts)
+
+
+def _answer_in_tasks(frames: Iterable[tuple[Path, Path]], job: FrameJob, cluster: Cluster) -> Iterator[_Finishing]:
+    """Answer frames in tasks of a cluster; yields each as it is there, in any order."""
+    if job.object.network is not None:
+        from mereo.models.remote import to_cpu
+
+        job = job.asking(to_cpu(job.object.network, cluster))
+    if job.registrar is not None:
+        job.registrar.prepare()  # once, here, and not in every task
+
+    def read(path: Path, folder: Path) -> _Frame:
+        try:
+            check_new_directory(folder, job.force, [path, *job.read])
+            return _Frame(path, folder, read_frame(path, job.reading))
+        except Exception as problem:
+            return _Frame(path, folder, problem)
+
+    work, sent = _Answering(job, cluster.gpus > 0), (read(*frame) for frame in frames)
+    with closing(spread(work, sent, cluster, lambda _, error: error)) as answers:
+        for frame, found in answers:
+            yield frame.path, frame.folder, partial(_write_answer, frame, found, job)
+
+
+def _write_answer(frame: _Frame, found: _Answered | Exception, job: FrameJob) -> FrameRow:
+    if isinstance(found, Exception):
+        raise found
+    print(found.printed, end="")
+    for text in found.warned:
+        warnings.warn(text, FrameWarning, stacklevel=2)
+    with new_directory(frame.folder, job.force, [frame.path, *job.read]) as directory:
+        for name, content in found.files.items():
+            (directory / name).parent.mkdir(parents=True, exist_ok=True)
+            (directory / name).write_bytes(content)
+    print(written(frame.folder, found.row.seconds), flush=True)
+    return found.row

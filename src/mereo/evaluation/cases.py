@@ -599,16 +599,18 @@ class Scoring:
     gpu: bool = False
 
     @cached_property
-    def here(self) -> tuple[Trained, Registrar | None]:
-        """Model and registrar where this is called, moved there once."""
-        from mereo.models.elsewhere import arrived  # needs torch, and results do not
+    def moved(self) -> tuple[Trained, Registrar | None]:
+        """Model and registrar on the device of whoever scores, moved there once."""
+        if not self.gpu:
+            return self.model, self.registrar
+        from mereo.models.remote import to_gpu  # needs torch, and results do not
 
-        model = arrived(self.model, self.gpu)
+        model = to_gpu(self.model)
         return model, None if self.registrar is None else self.registrar.asking(model)
 
-    def __call__(self, index: int, cancelled: Callable[[], bool]) -> ScoredCase:
-        """Score a case; as one takes seconds, nothing asks whether to give up."""
-        one, (model, registrar) = self.case(index), self.here
+    def __call__(self, index: int) -> ScoredCase:
+        """Score a case."""
+        one, (model, registrar) = self.case(index), self.moved
         found = find_candidates(model, one.cloud, one.truth.grid, registrar, one.scene_unit)
         names, colors = segment_names(model)
         reliability = Reliability()

@@ -7,7 +7,7 @@ IoU and mIoU come from it, and the mean over single examples is reported beside 
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from jaxtyping import Float, UInt8
 from mereo.evaluation.cases import (
     Evaluation,
     EvaluationTally,
+    ScoredCase,
     Scoring,
     TestCase,
     grid_confusion,
@@ -33,8 +34,8 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.progress import progress as stage
-from mereo.models.elsewhere import sent
 from mereo.models.model import Model
+from mereo.models.remote import to_cpu
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.random_states import state_points
@@ -45,13 +46,38 @@ from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
 from mereo.workers.config import Cluster
-from mereo.workers.spread import in_order, spread
+from mereo.workers.spread import spread
 
 KEPT_VIEWS = 4
 """Number of examples, the first ones, that keep their labels and are drawn with their errors."""
 
 CELLS = 100
 """Cells of the paper's grid along each axis."""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """What a model is scored on: synthetic views of a scene, seen as in training through a noisy depth image, or scans.
+
+    Attributes:
+        scene: a scene, its name or its file; by default the built-in one that the model was trained on, of scans each
+            truth file's own, which must be built in or YAML: a data file never has a Python scene run.
+        examples: number of views; example i is made from (seed, i) alone.
+        seed: at least ``TEST_SEED_START``: smaller ones are for training.
+        scans: truth files, or their folders, of ``mereo align``; none of them means the four range scans of the bunny;
+            None scores views.
+        settings: the camera of the views (image size, noise, sensor); by default the paper's.
+        method: which answer is scored: by default what a user gets, and beside it all others that can be had.
+        cells: cells of the grid along each axis.
+    """
+
+    scene: Scene | str | None = None
+    examples: int = 128
+    seed: int = TEST_SEED_START
+    scans: Sequence[str | Path] | None = None
+    settings: GenerateConfig = field(default_factory=GenerateConfig)
+    method: AnswerMethod = "auto"
+    cells: int = CELLS
 
 
 # --- one cloud -------------------------------------------------------------------------------------------------------
@@ -87,40 +113,30 @@ def check_names(model: Trained, names: Sequence[str]) -> None:
 
 
 def evaluate(
-    model: Model,
-    scene: Scene | str | None = None,
-    *,
-    examples: int = 128,
-    seed: int = TEST_SEED_START,
-    cells: int = CELLS,
-    progress: bool = False,
-    settings: GenerateConfig | None = None,
-    method: AnswerMethod = "auto",
-    cluster: Cluster | None = None,
+    model: Model, config: EvaluationConfig, *, progress: bool = False, workers: int | Cluster = 1
 ) -> Evaluation:
-    """Scores of a model on synthetic views of a scene, seen as in training: through a noisy depth image.
+    """Scores of a model on synthetic views of a scene, or on real scans.
 
     Args:
         model: the trained model.
-        scene: a scene, its name or its file; by default the built-in one that the model was trained on.
-        examples: number of views; example i is made from (seed, i) alone.
-        seed: at least ``TEST_SEED_START``: smaller ones are for training.
-        cells: cells of the grid along each axis.
+        config: what it is scored on.
         progress: whether to show a bar with the time left.
-        settings: the camera (image size, noise, sensor); by default the paper's.
-        method: which answer is scored: by default what a user gets, and beside it all others that can be had.
-        cluster: where each view is a task; without one they are scored here, in order.
+        workers: a cluster, where each view is a task; with 1 they are scored here, in order.
 
-    Raises ``ValueError`` for a training seed, no examples, another object than the model's, and, where a registration
-    is asked for, other meshes than those of the model's own statistical model.
+    Raises ``ValueError`` for a training seed, no examples, another object than the model's, where a registration is
+    wanted for other meshes than those of the model's own statistical model, and for two scans of one name;
+    ``FileNotFoundError`` for a missing file, and ``AssetUnavailable`` where a scan of the bunny cannot be had.
     """
+    if config.scans is not None:
+        return _evaluate_scans(model, config, config.scans, progress)
+    seed, method = config.seed, config.method
     if seed < TEST_SEED_START:
         raise ValueError(f"the seed is {seed}; training may have seen it: take a test seed, {TEST_SEED_START} or more")
-    if examples < 1:
-        raise ValueError(f"{examples} examples are asked for; at least 1 is needed: the paper takes 128")
-    model = model if cluster is None else sent(model, cluster)
-    if scene is None or isinstance(scene, str):
-        scene = load_scene(scene or trained_scene(model))
+    if config.examples < 1:
+        raise ValueError(f"{config.examples} examples are asked for; at least 1 is needed: the paper takes 128")
+    if isinstance(workers, Cluster):
+        model = to_cpu(model, workers)
+    scene = config.scene if isinstance(config.scene, Scene) else load_scene(config.scene or trained_scene(model))
     check_names(model, scene.rest.names)
     if method != "network" and model.statistical_model is not None:
         fault = other_mesh(scene, model.statistical_model)
@@ -128,10 +144,11 @@ def evaluate(
             raise ValueError(
                 f"{fault}, so places cannot be compared: {CURE}, or score the network with --method network"
             )
-    case = partial(scene_case, scene, settings or GenerateConfig(), seed, cells)
+    case = partial(scene_case, scene, config.settings, seed, config.cells)
     unit_mm = None if scene.unit_m is None else 1000 * scene.unit_m
     registrar = registrar_for(model, method, scene)
-    return replace(score_cases(model, case, examples, progress, registrar, cluster=cluster), unit_mm=unit_mm)
+    found = score_cases(model, case, config.examples, progress, registrar, workers=workers)
+    return replace(found, unit_mm=unit_mm)
 
 
 def trained_scene(model: Model) -> str:
@@ -167,7 +184,7 @@ def score_cases(
     progress: bool,
     registrar: Registrar | None = None,
     kept: int = KEPT_VIEWS,
-    cluster: Cluster | None = None,
+    workers: int | Cluster = 1,
 ) -> Evaluation:
     """Scores on ``case(0) ... case(count - 1)``, which are made one at a time, as they may be large.
 
@@ -178,18 +195,21 @@ def score_cases(
         progress: whether to show a bar with the time left.
         registrar: of the model's object; None scores the network alone.
         kept: how many cases, the first ones, keep their labels for pictures.
-        cluster: where each case is a task; without one they are scored here, in order.
+        workers: a cluster, where each case is a task; with 1 they are scored here, in order.
     """
-    gpu = cluster is not None and cluster.gpus > 0
+    gpu = isinstance(workers, Cluster) and workers.gpus > 0
     # asking which answers there are draws the states in which a fit begins: once, here, and not in every task
     scoring, tally = Scoring(model, registrar, case, kept, gpu), EvaluationTally(model, names_for(registrar))
+    scored: dict[int, ScoredCase] = {}
     with (
-        closing(spread(scoring, range(count), cluster=cluster)) as found,
+        closing(spread(scoring, range(count), workers)) as found,
         stage("evaluate", count, "views", quiet=not progress) as shown,
     ):
-        for one in in_order(found):
-            tally.add(one)
+        for number, one in found:
+            scored[number] = one
             shown.advance()
+    for number in range(count):
+        tally.add(scored[number])
     return tally.evaluation()
 
 
@@ -198,27 +218,8 @@ def score_cases(
 # Scores on real scans (paper, section 4.3): the four of the bunny, or those with a truth from ``mereo align``.
 
 
-def evaluate_scans(
-    model: Model,
-    *,
-    truths: Sequence[str | Path] = (),
-    scene: Scene | None = None,
-    cells: int = CELLS,
-    method: AnswerMethod = "auto",
-) -> Evaluation:
-    """Scores of a model on real scans.
-
-    Args:
-        model: the trained model.
-        truths: truth files, or their folders, of ``mereo align``; none means the four scans of the bunny.
-        scene: the scene that the scans were aligned with; by default each truth file's own, which must be built in or
-            YAML: a data file never has a Python scene run.
-        cells: cells of the grid along each axis.
-        method: which answer is scored: by default what a user gets, and beside it all others that can be had.
-
-    Raises ``ValueError`` for another object's model, two scans of one name and a scene without truths,
-    ``FileNotFoundError`` for a missing file, and ``AssetUnavailable`` where a scan of the bunny cannot be had.
-    """
+def _evaluate_scans(model: Model, config: EvaluationConfig, truths: Sequence[str | Path], progress: bool) -> Evaluation:
+    scene = load_scene(config.scene) if isinstance(config.scene, str) else config.scene
     if scene is not None and not truths:
         raise ValueError(
             f"the scene {scene.name!r} is given without truth files; the bunny's own scans have their scene: name "
@@ -232,9 +233,11 @@ def evaluate_scans(
         )
     for scan in scans:
         check_names(model, scan.truth.names)
-    registrar = registrar_for(model, method, scene)
+    registrar = registrar_for(model, config.method, scene)
     # every scan keeps its labels: there are few, and the paper shows all of its own (appendix D)
-    return score_cases(model, lambda index: _case(scans[index], cells), len(scans), True, registrar, kept=len(scans))
+    return score_cases(
+        model, lambda index: _case(scans[index], config.cells), len(scans), progress, registrar, kept=len(scans)
+    )
 
 
 def _case(scan: PosedScan, cells: int) -> TestCase:

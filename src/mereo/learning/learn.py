@@ -20,7 +20,7 @@ from typing import Any
 
 from mereo.evaluation.calibrate import LEAST_VIEWS, VIEWS, calibrate
 from mereo.evaluation.metrics import format_score
-from mereo.evaluation.scoring import evaluate
+from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.evaluation.tables import read_metrics
 from mereo.io.atomic_files import atomic_file, write_json
 from mereo.io.config import CONFIG
@@ -54,9 +54,8 @@ from mereo.models.weights import load_model, with_calibration
 from mereo.models.weights_place import WEIGHTS, find_weights
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES
-from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
-from mereo.synthesis.shards import generate
+from mereo.synthesis.shards import DatasetConfig, generate
 from mereo.training.config import PRESETS, TrainConfig
 from mereo.training.steps_shown import VALIDATIONS
 from mereo.training.trainer import train as train_network
@@ -294,7 +293,7 @@ def _train(scene: str, output: Path, clock: Clock, init: str, workers: int, sear
         clock.stage(3, "measure this machine, and choose weights to start from")
         plan = _measured(scene, output, recipe, clock, init, workers)
     clock.stage(4, f"generate {plan.examples} examples, about {_duration(plan.generation_s)}")
-    generate(scene, output / DATA, MADE_AS, examples=plan.examples, seed=SEED, workers=workers, resume=True)
+    generate(scene, output / DATA, DatasetConfig(MADE_AS, plan.examples, SEED), workers=workers, resume=True)
     if fresh:
         plan = _revised(output, plan, clock, recipe.batch)
     clock.stage(
@@ -309,7 +308,7 @@ def _train(scene: str, output: Path, clock: Clock, init: str, workers: int, sear
         if not evaluated:
             left_s = max(clock.left_s, (1 - CALIBRATION_SHARE) * plan.evaluation_s)
             examples = views_for(left_s, each_s + search_s)
-            evaluate_weights(output / WEIGHTS, output / TEST, examples=examples, scene=scene)
+            evaluate_weights(output / WEIGHTS, output / TEST, EvaluationConfig(scene, examples))
 
 
 def recipe_for(minutes: float) -> TrainConfig:
@@ -378,7 +377,7 @@ def _revised(output: Path, plan: Plan, clock: Clock, batch: int) -> Plan:
 def _calibrated(weights: Path, output: Path, scene: str, left_s: float) -> float:
     """Put the weights of the run, calibrated, into the folder; returns the seconds that a test view takes."""
     started = time.monotonic()
-    evaluate(load_model(weights), scene, examples=TIMED, seed=TEST_SEED_START)
+    evaluate(load_model(weights), EvaluationConfig(scene, TIMED))
     each_s = (time.monotonic() - started) / TIMED
     views = min(max(views_for(CALIBRATION_SHARE * left_s, each_s), LEAST_VIEWS), VIEWS)
     # other things than the object would take as long again, and only place the second limit of recognition
@@ -421,7 +420,7 @@ def measure(scene: str, folder: Path, recipe: TrainConfig, *, init: str, seed: i
     """
     started = time.monotonic()
     with redirect_stdout(StringIO()):  # nobody waits for these few
-        generate(scene, folder / "data", MADE_AS, examples=EXAMPLES, seed=seed, workers=1)
+        generate(scene, folder / "data", DatasetConfig(MADE_AS, EXAMPLES, seed))
     # with the template and 100 states, so a little too long
     generate_s = (time.monotonic() - started) / EXAMPLES / (1 + PARALLEL * (workers - 1))
     data = small_dataset(folder / "data")

@@ -23,7 +23,6 @@ nothing half-written.
 import hashlib
 import json
 import platform
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -59,6 +58,40 @@ NOT_COMPARED = ("libraries", "bytes", FILES)
 """Manifest entries that may differ when a dataset is resumed."""
 
 
+@dataclass(frozen=True)
+class DatasetConfig:
+    """Which examples of a scene a dataset holds.
+
+    Attributes:
+        settings: how one example is made.
+        examples: how many, in all shards together.
+        seed: seeds from ``TEST_SEED_START`` up are for testing and need ``test``, which refuses smaller ones.
+        test: whether it is a test set, whose seed training refuses.
+    """
+
+    settings: GenerateConfig
+    examples: int
+    seed: int
+    test: bool = False
+
+    def check(self) -> None:
+        """Raise ``ValueError`` for a number out of its range, and for a seed of the wrong kind."""
+        if self.examples < 1:
+            raise ValueError(f"--examples is {self.examples}; it must be at least 1: ask for some")
+        if self.seed < 0:
+            raise ValueError(f"--seed is {self.seed}; it must not be negative: choose from 0 to {TEST_SEED_START - 1}")
+        if self.seed >= TEST_SEED_START and not self.test:
+            raise ValueError(
+                f"--seed is {self.seed}; seeds from {TEST_SEED_START} up are for testing and never for training: "
+                "choose a smaller one, or pass --test to make a test set"
+            )
+        if self.test and self.seed < TEST_SEED_START:
+            raise ValueError(
+                f"--seed is {self.seed}; a test set needs one from {TEST_SEED_START} up, which training never uses: "
+                "choose one"
+            )
+
+
 @dataclass(frozen=True, eq=False)
 class _Work:
     """What all shards of a dataset have in common; a scene made by code is sent to workers by its name or file."""
@@ -81,31 +114,24 @@ class _Shard:
 def generate(
     scene: str | Scene,
     output: Place,
-    settings: GenerateConfig,
+    config: DatasetConfig,
     *,
-    examples: int,
-    seed: int,
-    workers: int = 1,
+    workers: int | Cluster = 1,
     shard: tuple[int, int] = (0, 1),
     resume: bool = False,
-    test: bool = False,
-    cluster: Cluster | None = None,
 ) -> None:
-    """Make ``examples`` labelled examples of a scene in the folder ``output``, local or of an object storage.
+    """Make labelled examples of a scene in the folder ``output``, local or of an object storage.
 
     Args:
         scene: a built-in scene's name, a scene file, or a scene (which workers must be able to unpickle).
         output: created; with ``resume`` its complete shards are kept and the missing ones made.
-        settings: how one example is made.
-        examples: how many, in all shards together.
-        seed: seeds from ``TEST_SEED_START`` up are for testing and need ``test``, which refuses smaller ones.
-        workers: processes; the files do not depend on their number. More than one needs a main module that can be
-            imported (``if __name__ == "__main__":``).
+        config: which examples.
+        workers: processes, or a cluster whose tasks make the files' content; they are written here all the same, and
+            depend on neither. More than one process needs a main module that can be imported (``if __name__ ==
+            "__main__":``).
         shard: ``(i, n)`` makes every n-th file from the i-th on, to share the work between machines; they may all
             write to one directory.
         resume: go on with a dataset of the same settings that is there; without it that is an error.
-        test: make a test set, whose seed training refuses.
-        cluster: whose tasks make the files' content, instead of workers; they are written here all the same.
 
     Raises:
         ValueError: a number out of its range, a seed of the wrong kind, ``resume`` with other settings.
@@ -116,7 +142,9 @@ def generate(
     """
     if isinstance(output, Path):
         check_place(output, may_be_link=True)
-    _check_request(examples, seed, workers, shard, test)
+    config.check()
+    _check_sharing(workers, shard)
+    settings, examples, seed = config.settings, config.examples, config.seed
     loaded = load_scene(scene) if isinstance(scene, str) else scene
     manifest = make_manifest(loaded, settings, examples, seed)
     check_space(output, examples, manifest["bytes"] // examples, shard[1])
@@ -129,7 +157,7 @@ def generate(
     if not contents.keeps(TEMPLATE):
         contents.write(TEMPLATE, pack_tensors({"distance": rest_distances(loaded.rest)}, {"dataset": key}))
     # nothing is trained on a test set
-    if not test and not contents.keeps(STATISTICAL_MODEL):
+    if not config.test and not contents.keeps(STATISTICAL_MODEL):
         states = states_for(examples)
         print(f"modes of {states} random states, for registration", flush=True)
         contents.write(STATISTICAL_MODEL, statistical_model_bytes(scene_model(loaded, states, quiet=False), key))
@@ -137,32 +165,20 @@ def generate(
     total = sum(item.end - item.first for item in missing)
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile; other
     # machines have neither file nor assets
-    work = partial(_make_shard, _Work(loaded if cluster or is_yaml(scene) else scene, settings, seed, key))
-    with closing(spread(work, missing, workers, cluster)) as made, progress("generate", total) as shown:
+    sent = loaded if isinstance(workers, Cluster) or is_yaml(scene) else scene
+    work = partial(_make_shard, _Work(sent, settings, seed, key))
+    with closing(spread(work, missing, workers)) as made, progress("generate", total) as shown:
         for item, data in made:
             contents.write(item.name, data)
             shown.advance(item.end - item.first)
     contents.finish()
 
 
-def _check_request(examples: int, seed: int, workers: int, shard: tuple[int, int], test: bool) -> None:
-    if examples < 1:
-        raise ValueError(f"--examples is {examples}; it must be at least 1: ask for some")
-    if workers < 1:
+def _check_sharing(workers: int | Cluster, shard: tuple[int, int]) -> None:
+    if isinstance(workers, int) and workers < 1:
         raise ValueError(f"the number of workers is {workers}; it must be at least 1: pass 1, or one per core")
     if not 0 <= shard[0] < shard[1]:
         raise ValueError(f"the shard is {shard[0]}/{shard[1]}; i/n needs i from 0 to n - 1: pass for example 0/4")
-    if seed < 0:
-        raise ValueError(f"--seed is {seed}; it must not be negative: choose from 0 to {TEST_SEED_START - 1}")
-    if seed >= TEST_SEED_START and not test:
-        raise ValueError(
-            f"--seed is {seed}; seeds from {TEST_SEED_START} up are for testing and never for training: "
-            "choose a smaller one, or pass --test to make a test set"
-        )
-    if test and seed < TEST_SEED_START:
-        raise ValueError(
-            f"--seed is {seed}; a test set needs one from {TEST_SEED_START} up, which training never uses: choose one"
-        )
 
 
 # --- the directory ----------------------------------------------------------------------------------------------------
@@ -235,15 +251,14 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 # --- the work ---------------------------------------------------------------------------------------------------------
 
 
-def _make_shard(work: _Work, shard: _Shard, cancelled: Callable[[], bool]) -> bytes:
-    """Content of the shard's file; nothing when cancelled, which is asked before every example."""
+def _make_shard(work: _Work, shard: _Shard) -> bytes:
+    """Content of the shard's file."""
     loaded = load_scene(work.scene) if isinstance(work.scene, str) else work.scene
     scene = loaded.for_seed(work.seed)
-    rows = []
-    for index in range(shard.first, shard.end):
-        if cancelled():
-            return b""
-        rows.append(pack(synthesize(scene, work.settings, example_rng(work.seed, index)), work.settings.points))
+    rows = [
+        pack(synthesize(scene, work.settings, example_rng(work.seed, index)), work.settings.points)
+        for index in range(shard.first, shard.end)
+    ]
     tensors = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
     return pack_tensors(tensors, {"dataset": work.dataset, "first": shard.first})
 

@@ -51,14 +51,3 @@ class Cluster:
     def device(self) -> str:
         """Kind of device on which a task computes: "cuda" or "cpu"."""
         return "cuda" if self.gpus else "cpu"
-
-
-def cluster_of(address: str | None, local_cpus: int = 0, task: TaskResources = ONE_CPU) -> Cluster | None:
-    """Cluster that options name; None where they name none. Raises ``ValueError`` for resources without a cluster."""
-    if address is not None:
-        return Cluster(address, task.cpus_per_task, task.gpus_per_task, local_cpus)
-    if task != ONE_CPU:
-        raise ValueError(
-            "--cpus-per-task and --gpus-per-task are for tasks of a cluster: give --ray local, or its address"
-        )
-    return None

@@ -1,77 +1,42 @@
-"""Work in several processes that stop at once when asked to, whoever asks: a function applied to many items.
-
-Ctrl-C, an error in the consumer, a killed worker, a killed parent: in every case no process is left behind.
-"""
+"""Several processes of this machine that work, and stop at once when this one stops or is killed."""
 
 import multiprocessing
 import os
 import pickle
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from itertools import islice
 from multiprocessing import connection, resource_tracker
-from multiprocessing.synchronize import Event
-from typing import Any, TypeVar
+from multiprocessing.connection import Connection
+from typing import Any
 
 from mereo.io.cores import THREAD_VARIABLES
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
-Function = Callable[[Item, Callable[[], bool]], Result]
-"""Takes an item, and a function that tells whether to give up (then what it returns is thrown away)."""
+Function = Callable[[Any], Any]
+"""Work on an item."""
 
 
-def in_processes(
-    function: Function[Item, Result], items: Sequence[Item], workers: int
-) -> Generator[tuple[Item, Result], None, None]:
-    """Apply ``function`` to every item in several processes; yields each item with its result, in any order.
+@contextmanager
+def process_pool(function: Function, workers: int) -> Iterator[Callable[[Any], Future[Any]]]:
+    """Open a pool of processes, each with one thread; yields what submits an item to ``function`` there.
 
-    With one worker, or one item, everything happens in this process, in order. Close the generator to stop early.
-
-    Args:
-        function: what to do; sent once to every worker.
-        items: also sent; twice as many as workers are on their way at a time.
-        workers: number of processes. Each computes in one thread.
-
-    Raises:
-        ValueError: ``function`` cannot be pickled.
-        ChildProcessError: a worker was killed.
-        Exception: what ``function`` raises; work in progress is given up.
+    An exception in the block ends the processes at once. Raises ``ValueError`` where ``function``, which is sent once
+    to every process, cannot be pickled.
     """
-    if min(workers, len(items)) <= 1:
-        yield from ((item, function(item, lambda: False)) for item in items)
-        return
-    _check_can_be_sent(function)
+    pickled(function, pickle.dumps)
     # spawned, not forked: threads of libraries that this process has used do not survive a fork
     context = multiprocessing.get_context("spawn")
     start_resource_tracker()
-    stop = context.Event()
-    waiting, running = iter(items), dict[Future[Result], Item]()
-    with (
-        one_thread_each(),
-        ProcessPoolExecutor(min(workers, len(items)), context, _start_worker, (function, stop)) as pool,
-    ):
+    end, here = context.Pipe(duplex=False)
+    executor = ProcessPoolExecutor(workers, context, _start_worker, (function, end))
+    with end, here, one_thread_each(), executor as pool:
         try:
-            while True:
-                for item in islice(waiting, 2 * workers - len(running)):
-                    running[pool.submit(_apply, item)] = item
-                if not running:
-                    break
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    yield running.pop(future), future.result()
-        except BrokenProcessPool:
-            raise ChildProcessError(
-                "a worker process was killed, most often for memory; what is complete is kept: continue with fewer "
-                "--workers and --resume"
-            ) from None
-        finally:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
+            yield lambda item: pool.submit(_apply, item)
+        except BaseException:
+            here.close()  # which every worker sees at the other end
+            raise
 
 
 def start_resource_tracker() -> None:
@@ -88,40 +53,44 @@ def start_resource_tracker() -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-_in_worker: tuple[Function[Any, Any], Event] | None = None
-"""Set once when a worker starts: an event can only be inherited, and the function need not be sent with every item."""
+_in_worker: Function | None = None
+"""Set once when a worker starts: it need not be sent with every item."""
 
 
-def _start_worker(function: Function[Any, Any], stop: Event) -> None:
+def _start_worker(function: Function, end: Connection) -> None:
     global _in_worker
-    # Ctrl-C and a closed terminal are the parent's business, which sets `stop`; TERM is how the pool ends its processes
+    # Ctrl-C and a closed terminal are the parent's business, which ends its workers; TERM is how the pool ends them
     for number in (signal.SIGINT, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ())):
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=exit_with_parent, daemon=True).start()
-    _in_worker = function, stop
+    threading.Thread(target=exit_with_parent, args=(end,), daemon=True).start()
+    _in_worker = function
 
 
-def exit_with_parent() -> None:
-    """End this process when its parent does; one that was killed cannot stop its workers. Blocks, for a thread."""
+def exit_with_parent(*ends: Connection) -> None:
+    """End this process when its parent ends, as one that was killed cannot stop its workers, or closes a pipe.
+
+    Blocks, for a thread.
+    """
     parent = multiprocessing.parent_process()
     if parent is not None:
-        connection.wait([parent.sentinel])
+        connection.wait([parent.sentinel, *ends])
         os._exit(1)
 
 
 def _apply(item: Any) -> Any:
     assert _in_worker is not None, "only called in a worker, which sets it first"
-    function, stop = _in_worker
-    return function(item, stop.is_set)
+    return _in_worker(item)
 
 
-def _check_can_be_sent(function: Function[Any, Any]) -> None:
+def pickled(function: Function, dumps: Callable[[Function], bytes]) -> bytes:
+    """Pickle a function, by ``pickle.dumps`` or one like it; ``ValueError`` where it cannot be."""
     try:
-        pickle.dumps(function)
+        return dumps(function)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ValueError(
-            f"the work cannot be sent to worker processes ({error}); functions in it must be defined at the top level "
-            "of a module: move them there, or use one worker"
+            f"the work cannot be sent to other processes ({' '.join(str(error).split())}); functions in it must be "
+            "defined at the top level of a module, and what they hold must be picklable: change that, or use one "
+            "worker and no --ray"
         ) from None
 
 

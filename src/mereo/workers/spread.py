@@ -1,33 +1,272 @@
-"""Whether work is done here, in processes or on a cluster: the one place that chooses."""
+"""One function over many items: in this process, in several of this machine, or in tasks of a Ray cluster.
 
-from collections.abc import Callable, Generator, Iterable
+The result of an item depends on the item alone, so it is the same wherever it is computed; a task whose worker or node
+died is done again by another.
+"""
 
-from mereo.workers.config import Cluster
-from mereo.workers.processes import Function, Item, Result, in_processes
-from mereo.workers.tasks import in_tasks
+import logging
+import math
+import os
+import pickle
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import islice
+from tempfile import TemporaryDirectory
+from types import ModuleType
+from typing import Any, TypeVar
+
+from mereo.io.cores import cores, use_threads
+from mereo.workers.config import LOCAL, ONE_CPU, Cluster, TaskResources
+from mereo.workers.processes import pickled, process_pool
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+AHEAD = 2
+"""Items on their way for each that can be computed at a time: no worker waits for its next one."""
+
+DEATHS = 20
+"""Workers and nodes that may die of one item: then it is the item that kills them."""
+
+ANSWER_S = 5.0
+"""Seconds in which an address must take a connection; Ray itself would try for a minute."""
 
 
 def spread(
-    function: Function[Item, Result],
+    function: Callable[[Item], Result],
     items: Iterable[Item],
-    workers: int = 1,
-    cluster: Cluster | None = None,
-    lost: Callable[[Item, ChildProcessError], Result] | None = None,
+    workers: int | Cluster = 1,
+    failed: Callable[[Item, Exception], Result] | None = None,
 ) -> Generator[tuple[Item, Result], None, None]:
-    """Apply ``function`` to every item; yields each with its result, in any order. Close the generator to stop early.
+    """Apply ``function`` to every item; yields each with its result, as soon as that is there.
 
-    Without a cluster as ``in_processes`` does, and with one as ``in_tasks``, whatever ``workers`` is; only there are
-    ``items`` taken as they are needed.
+    With one worker, or one item and no cluster, everything happens in this process, in order. Close the generator to
+    stop early: then, and after an error or Ctrl-C, work in progress is ended.
+
+    Args:
+        function: what to do; sent once to every worker.
+        items: also sent; ``AHEAD`` times as many as can be computed at a time are on their way, and for a cluster no
+            more are taken.
+        workers: number of processes, each with one thread; or a cluster.
+        failed: result of an item for which ``function`` raises, or whose workers died; without it that ends all.
+
+    Raises:
+        ValueError: ``function`` cannot be pickled, or this machine has less than a task needs.
+        ConnectionError: there is no such cluster.
+        ChildProcessError: a worker was killed; in a cluster ``DEATHS`` workers or nodes, one after the other.
+        Exception: what ``function`` raises.
     """
-    return in_processes(function, list(items), workers) if cluster is None else in_tasks(function, items, cluster, lost)
+
+    def attempt(item: Item, call: Callable[[Any], Result], argument: Any) -> Result:
+        try:
+            return call(argument)
+        except Exception as error:
+            if failed is None:
+                raise
+            return failed(item, error)
+
+    if not isinstance(workers, Cluster):
+        items = list(items)
+        if min(workers, len(items)) <= 1:
+            yield from ((item, attempt(item, function, item)) for item in items)
+            return
+    waiting, running = iter(items), dict[Future[Result], Item]()
+    with _ray_pool(function, workers) if isinstance(workers, Cluster) else process_pool(function, workers) as submit:
+        while True:
+            slots = max(1, task_slots(workers)) if isinstance(workers, Cluster) else workers  # a cluster may grow
+            for item in islice(waiting, max(0, AHEAD * slots - len(running))):
+                running[submit(item)] = item
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                item = running.pop(future)
+                yield item, attempt(item, _result, future)
 
 
-def in_order(found: Generator[tuple[int, Result], None, None]) -> Generator[Result, None, None]:
-    """Results of the items 0, 1, 2, ... in this order, each as soon as those before it are there."""
-    early: dict[int, Result] = {}
-    following = 0
-    for number, result in found:
-        early[number] = result
-        while following in early:
-            yield early.pop(following)
-            following += 1
+def _result(future: Future[Result]) -> Result:
+    """Result of work that is done; raises what the function raised, and ``ChildProcessError`` for killed workers."""
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        raise ChildProcessError(
+            "a worker process was killed, most often for memory; what is complete is kept: continue with fewer "
+            "--workers and --resume"
+        ) from None
+    except Exception as error:
+        if not type(error).__module__.startswith("ray."):
+            raise
+        cause = getattr(error, "cause", None)
+        if isinstance(cause, Exception):
+            raise cause from error
+        raise ChildProcessError(
+            f"{DEATHS + 1} workers or nodes died of one task ({type(error).__name__}), most often for memory; what is "
+            "complete is kept: let fewer run at a time, by more CPUs for each or fewer workers, and run it again"
+        ) from error
+
+
+# --- Ray --------------------------------------------------------------------------------------------------------------
+
+
+def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources = ONE_CPU) -> Cluster | None:
+    """Cluster that options name, None where they name none; a wrong address is an error before any work.
+
+    Raises:
+        ImportError: Ray is not installed.
+        ValueError: resources of tasks without a cluster, or something that is no address.
+        ConnectionError: nothing answers at the address.
+    """
+    if address is None:
+        if task != ONE_CPU:
+            raise ValueError(
+                "--cpus-per-task and --gpus-per-task are for tasks of a cluster: give --ray local, or its address"
+            )
+        return None
+    import_ray()
+    if address not in (LOCAL, "auto"):
+        _check_reachable(address)
+    return Cluster(address, task.cpus_per_task, task.gpus_per_task, local_cpus)
+
+
+def import_ray() -> ModuleType:
+    """Import Ray, which then sends no statistics; ``ImportError`` where it is not installed."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError:
+        raise ImportError("Ray, which --ray needs, is not installed: run pip install 'mereo[cluster]'") from None
+    library: ModuleType = ray
+    return library
+
+
+def _check_reachable(address: str) -> None:
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or "/" in host:
+        raise ValueError(
+            f"--ray is {address!r}; it must be local, auto, or the HOST:PORT that `ray start --head` prints: correct it"
+        )
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
+    except (OSError, OverflowError) as error:
+        raise ConnectionError(
+            f"there is no Ray cluster at {address} ({getattr(error, 'strerror', None) or error}): correct the address, "
+            "start one there with `ray start --head`, or use --ray local"
+        ) from None
+
+
+def task_slots(cluster: Cluster) -> int:
+    """Number of tasks that the connected cluster can run at a time."""
+    has = import_ray().cluster_resources()
+    gpus = has.get("GPU", 0.0) / cluster.gpus if cluster.gpus else math.inf
+    return int(min(has.get("CPU", 0.0) / cluster.cpus, gpus))
+
+
+@contextmanager
+def connect(cluster: Cluster) -> Iterator[None]:
+    """Connect this process to a cluster while the block runs; where its caller has done so already, that stays.
+
+    Raises ``ConnectionError`` where there is no such cluster, ``ValueError`` where a local one has less than a task
+    needs.
+    """
+    ray = import_ray()
+    if ray.is_initialized():
+        yield
+        return
+    quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+    handler = signal.getsignal(signal.SIGTERM)
+    # in /tmp, as paths of sockets must be shorter than some systems' folders for temporary files allow
+    with TemporaryDirectory(prefix="mereo-ray-", dir="/tmp" if os.name == "posix" else None) as folder:
+        try:
+            if cluster.address == LOCAL:
+                count = cluster.local_cpus or cores()
+                ray.init("local", num_cpus=count, include_dashboard=False, _temp_dir=folder, **quiet)
+                if not task_slots(cluster):
+                    raise ValueError(
+                        f"a task needs {cluster.cpus} CPUs and {cluster.gpus:g} GPUs, and this machine has less: "
+                        "give tasks less, or join a cluster that has it with --ray HOST:PORT"
+                    )
+            else:
+                ray.init(cluster.address, **quiet)
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGTERM, handler)  # which Ray has taken for itself
+            yield
+        except (ConnectionError, RuntimeError) as error:
+            if ray.is_initialized():  # it is the work's
+                raise
+            raise ConnectionError(
+                f"the Ray cluster at {cluster.address} cannot be joined ({' '.join(str(error).split())[:300]}): this "
+                "machine must be one of its nodes (`ray start`), with the same Ray and Python; or use --ray local"
+            ) from error
+        finally:
+            ray.shutdown()
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What all tasks have in common.
+
+    Attributes:
+        function: pickled, as libraries that it imports must find the number of threads set.
+        threads: in which a task computes.
+        gpu: whether tasks have a GPU, or a share of one.
+        folder: working directory of this process, and of tasks where it exists.
+        path: where this process finds modules.
+    """
+
+    function: bytes
+    threads: int
+    gpu: bool
+    folder: str
+    path: tuple[str, ...]
+
+
+@contextmanager
+def _ray_pool(function: Callable[[Any], Any], cluster: Cluster) -> Iterator[Callable[[Any], Future[Any]]]:
+    """Connect to a cluster; yields what submits an item to ``function`` there."""
+    ray = import_ray()
+    from ray import cloudpickle
+
+    with connect(cluster):
+        path = tuple(map(os.path.abspath, sys.path))
+        content = pickled(function, cloudpickle.dumps)
+        shared, running = ray.put(_Work(content, cluster.cpus, cluster.gpus > 0, os.getcwd(), path)), set[Any]()
+        task = ray.remote(_apply).options(num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=DEATHS)
+
+        def submit(item: Any) -> Future[Any]:
+            reference = task.remote([shared], item)
+            running.add(reference)
+            future: Future[Any] = reference.future()
+            future.add_done_callback(lambda _: running.discard(reference))
+            return future
+
+        try:
+            yield submit
+        finally:
+            for reference in tuple(running):
+                ray.cancel(reference, force=True)
+
+
+_loaded: tuple[str, Callable[[Any], Any]] | None = None
+"""The function of this worker process, unpickled once: a model takes longer for that than a view to be rendered."""
+
+
+def _apply(shared: list[Any], item: Any) -> Any:
+    """Task: the result for an item. ``shared`` holds a reference, as Ray would unpickle a value for each task."""
+    global _loaded
+    (reference,) = shared
+    if _loaded is None or _loaded[0] != reference.hex():
+        work: _Work = import_ray().get(reference)
+        use_threads(work.threads)
+        if not work.gpu:  # Ray shows all of a node's GPUs to a task without any
+            os.environ["CUDA_VISIBLE_DEVICES"] = ""
+        with suppress(OSError):
+            os.chdir(work.folder)
+        sys.path.extend(place for place in work.path if place not in sys.path)
+        _loaded = reference.hex(), pickle.loads(work.function)
+    return _loaded[1](item)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mereo.evaluation.cases import EvaluatedView
-from mereo.evaluation.scoring import evaluate, evaluate_scans
+from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.evaluation.tables import read_metrics
 from mereo.fitting.config import AnswerMethod
 from mereo.io.atomic_files import write_json
@@ -21,7 +21,7 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.dataset_contents import MANIFEST
-from mereo.synthesis.shards import NOT_COMPARED, generate, make_manifest
+from mereo.synthesis.shards import NOT_COMPARED, DatasetConfig, generate, make_manifest
 from mereo.training.config import TrainConfig
 from mereo.training.trainer import train
 from mereo.visualization.evaluation_files import evaluate_weights
@@ -72,7 +72,7 @@ class Store:
         path = self.root / "datasets" / f"{scene}-{content_key(decisive)}"
         _say("dataset", path)
         started = (path / MANIFEST).exists()
-        generate(scene, path, settings, examples=examples, seed=TRAINING_SEED, workers=self.workers, resume=started)
+        generate(scene, path, DatasetConfig(settings, examples, TRAINING_SEED), workers=self.workers, resume=started)
         return path
 
     def run(self, dataset: Path, config: TrainConfig) -> Path:
@@ -92,16 +92,19 @@ class Store:
         path = self.root / "scores" / f"{scene}-{key}"
         _say("score", path)
         if not path.exists():
-            evaluate_weights(weights, path, examples=examples, cells=cells, settings=settings, method=NETWORK)
+            config = EvaluationConfig(examples=examples, cells=cells, settings=settings, method=NETWORK)
+            evaluate_weights(weights, path, config)
         return read_score(path / "metrics.json")
 
     def view(self, weights: Path, settings: GenerateConfig, cells: int) -> EvaluatedView:
         """First test view of a run's network with its labels, for pictures."""
-        return evaluate(load_model(weights), examples=1, cells=cells, settings=settings, method=NETWORK).views[0]
+        config = EvaluationConfig(examples=1, cells=cells, settings=settings, method=NETWORK)
+        return evaluate(load_model(weights), config).views[0]
 
     def scans(self, weights: Path, cells: int) -> tuple[Score, tuple[EvaluatedView, ...]]:
         """Score of a run's network on the real scans of the bunny, and each of them with its labels."""
-        evaluation = evaluate_scans(load_model(weights), cells=cells, method=NETWORK)
+        config = EvaluationConfig(scans=(), cells=cells, method=NETWORK)
+        evaluation = evaluate(load_model(weights), config, progress=True)
         scores, mean = evaluation.scores, evaluation.example_mean
         per_segment = dict(zip(evaluation.names, map(float, scores.per_segment), strict=True))
         return Score(scores.iou, scores.miou, *mean, per_segment), evaluation.views

@@ -42,3 +42,5 @@ def _run(path: Path) -> object:
             f"{path} fails with {type(error).__name__}: {error}; it must run and define a function scene(): correct it "
             "(MEREO_TRACEBACK=1 shows where)"
         ) from error
+    finally:
+        del sys.modules[name]  # nobody else finds it by its name, and Ray sends the code of what it does not find
