@@ -32,8 +32,8 @@ from mereo.models.network import Network
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import save_statistical_model
-from mereo.training.checkpoint import Checkpoint
 from mereo.training.config import PRESETS
+from mereo.training.run_directory import Checkpoint
 
 POINTS = np.random.default_rng(0).normal((0, 0, 2), 0.2, (40, 3)).round(3)
 DEPTH = np.random.default_rng(0).integers(500, 900, (12, 16)).astype(np.uint16)

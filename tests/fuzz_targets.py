@@ -68,8 +68,8 @@ from mereo.io.writers.ply import write_points_ply, write_segments_ply
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import load_statistical_model, save_statistical_model
-from mereo.training.checkpoint import load_checkpoint, save_checkpoint
 from mereo.training.dataset import Dataset
+from mereo.training.run_directory import load_checkpoint, save_checkpoint
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import torch
 from answers import reconstruct
 from safetensors.torch import load_file
 from shapes import ball
-from toy_data import write_toy_dataset
+from toy_data import read_all, write_toy_dataset
 from training_runs import assert_resumes_exactly, train_in_two_processes
 
 from mereo.evaluation.cases import TestCase
@@ -125,29 +125,31 @@ def truth(dataset: Path, number: int) -> SegmentedMesh:
 
 def error(network: Network, data: Dataset, code: Code) -> float:
     with torch.inference_mode():
-        return float((network.query(code, data.positions).distance - data.distances).abs().mean())
+        stored = read_all(data)
+        return float((network.query(code, stored.positions).distance - stored.distances).abs().mean())
 
 
 def prepare(network: Network, data: Dataset, latent: torch.Tensor) -> Code:
-    return network.decoder.prepare(Encoding(latent, ()), data.cloud, data.viewpoint)
+    stored = read_all(data)
+    return network.decoder.prepare(Encoding(latent, ()), stored.cloud, stored.viewpoint)
 
 
 def test_a_code_found_from_the_cloud_explains_the_shape(run: Path, model: Model, data: Dataset) -> None:
     """From the visible half alone: far better than the mean code, short of the code trained with the whole shape."""
-    network = model.network
+    network, stored = model.network, read_all(data)
     codes = load_file(run / "checkpoint.safetensors")["network/encoder.codes"]
     trained = error(network, data, prepare(network, data, codes))
     average = error(network, data, prepare(network, data, codes.mean(dim=0).repeat(len(data), 1)))
-    found = error(network, data, network.encode(data.cloud, data.viewpoint))
+    found = error(network, data, network.encode(stored.cloud, stored.viewpoint))
     assert trained < 0.02 and trained < found < 0.8 * average
 
 
 def test_the_search_is_deterministic_and_by_cloud(model: Model, data: Dataset) -> None:
-    network = model.network
-    together = network.encode(data.cloud, data.viewpoint).latent1
+    network, stored = model.network, read_all(data)
+    together = network.encode(stored.cloud, stored.viewpoint).latent1
     with torch.inference_mode():
-        again = network.encode(data.cloud.clone(), data.viewpoint.clone()).latent1
-        alone = network.encode(data.cloud[3:4].clone(), data.viewpoint[3:4].clone()).latent1
+        again = network.encode(stored.cloud.clone(), stored.viewpoint.clone()).latent1
+        alone = network.encode(stored.cloud[3:4].clone(), stored.viewpoint[3:4].clone()).latent1
     assert torch.equal(together, again)
     assert torch.allclose(together[3:4], alone, atol=1e-2)  # 75 steps along signs let rounding grow
     assert not together.requires_grad and all(p.grad is None for p in network.parameters())
@@ -189,7 +191,8 @@ def test_only_the_codes_of_a_batch_move_and_at_their_own_rate(dataset: Path, dat
 def test_gradient_reaches_every_parameter(data: Dataset) -> None:
     network = start_network(SMALL, data).train()
     index = torch.arange(12)
-    prediction, coarse = network(data.cloud, data.viewpoint, data.positions, index)
+    stored = read_all(data)
+    prediction, coarse = network(stored.cloud, stored.viewpoint, stored.positions, index)
     sum(output.square().sum() for output in (*prediction, coarse) if output is not None).backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None, name

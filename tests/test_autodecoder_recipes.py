@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
+from toy_data import read_all
 
 from mereo.api.generate import generate
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
@@ -42,6 +43,7 @@ def test_the_small_recipe_learns_what_the_published_one_has_not_begun_with(tmp_p
     folder = tmp_path / "data"
     generate("rope", folder, GenerateConfig(), examples=16, seed=710_000, workers=1)
     data = Dataset.load(folder)
+    stored = read_all(data)
     paper = PRESETS["paper-autodecoder"]
     published = replace(paper, network=paper.network.changed(width=128, mlp_global=(128, 256), points=256), queries=64)
     found = []
@@ -49,10 +51,10 @@ def test_the_small_recipe_learns_what_the_published_one_has_not_begun_with(tmp_p
         config = replace(recipe, epochs=200, batch=16, holdout=0, precision="float32", compile="off")
         train(folder, tmp_path / name, config)
         network = trained_with_codes(tmp_path / name, data, config)
-        code = network.decoder.prepare(Encoding(network.encoder.codes.detach(), ()), data.cloud, data.viewpoint)
+        code = network.decoder.prepare(Encoding(network.encoder.codes.detach(), ()), stored.cloud, stored.viewpoint)
         with torch.inference_mode():
-            guess = network.query(code, data.positions).logits.argmax(dim=-1)
-        matrix = confusion_matrix(data.labels.numpy(), guess.numpy(), network.segments + 1)
+            guess = network.query(code, stored.positions).logits.argmax(dim=-1)
+        matrix = confusion_matrix(stored.labels.numpy(), guess.numpy(), network.segments + 1)
         found.append(intersection_over_union(matrix, True).iou)
     assert found[0] > 0.5 > 0.1 > found[1]
 

@@ -11,8 +11,7 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
-from mereo.training.batch_normalization import SharedBatchNorm, adapt_momentum, share_statistics
-from mereo.training.processes import Process
+from mereo.training.processes import Process, SharedBatchNorm, adapt_momentum, share_statistics
 
 CPU = torch.device("cpu")
 

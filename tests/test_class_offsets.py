@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
-from mereo.training.logit_adjustment import class_offsets
+from mereo.training.validation import class_offsets
 
 
 def noisy_world(count: int, share: tuple[float, ...], seed: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -5,11 +5,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
+from test_training_on_observations import observed
 from toy_data import write_toy_dataset
 
 from mereo.training.batches import Draws, augment_batch, choose_points
 from mereo.training.config import AugmentConfig
-from mereo.training.dataset import Dataset
+from mereo.training.dataset import Dataset, ShuffledOrder
 
 NONE = AugmentConfig()
 FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.01, roll=True)
@@ -36,11 +38,36 @@ def rng(seed: int = 0) -> Draws:
 
 
 def test_without_augmentation_a_batch_is_the_stored_data(data: Dataset) -> None:
-    batch = data.batch(torch.arange(4), 96, 0, NONE, rng())
-    assert torch.allclose(batch.cloud, data.cloud[:4], atol=1e-5)
-    assert torch.allclose(batch.positions, data.positions[:4], atol=1e-5)
-    assert torch.allclose(batch.viewpoint, data.viewpoint[:4], atol=1e-4)
-    assert torch.equal(batch.labels, data.labels[:4].long())
+    batch, stored = data.batch(torch.arange(4), 96, 0, NONE, rng()), data.read(torch.arange(4))
+    assert torch.allclose(batch.cloud, stored["cloud"], atol=1e-5)
+    assert torch.allclose(batch.positions, stored["positions"], atol=1e-5)
+    viewpoint = -stored["center"] * stored["scale"][:, None]
+    assert torch.allclose(batch.viewpoint, viewpoint.float(), atol=1e-4)
+    assert torch.equal(batch.labels, stored["labels"].long())
+
+
+def test_examples_are_read_in_any_order_from_shards_of_other_sizes(tmp_path: Path) -> None:
+    directory = write_toy_dataset(tmp_path / "data", examples=70, example=observed)
+    files = [load_file(path) for path in sorted(directory.glob("shard-*"))]
+    index = torch.tensor([69, 0, 33, 31, 32, 5])
+    for name, values in Dataset.load(directory).read(index).items():
+        assert torch.equal(values.nan_to_num(), torch.cat([file[name] for file in files])[index].nan_to_num()), name
+
+
+def test_a_shuffled_order_is_one_pass_after_another() -> None:
+    seen = torch.cat([ShuffledOrder(10, 4, 0).index(step) for step in range(5)])
+    assert torch.equal(seen[:10].sort().values, torch.arange(10)) and torch.equal(seen.bincount(), torch.full((10,), 2))
+    assert not torch.equal(seen[:10], seen[10:])
+    assert torch.equal(ShuffledOrder(10, 4, 0).index(3), seen[12:16]), "by the step alone"
+
+
+def test_a_share_of_a_batch_meets_the_changes_of_the_whole(data: Dataset) -> None:
+    index = torch.arange(12)
+    whole = data.batch(index, 48, 32, FULL, Draws.of(5))
+    for rows in (slice(0, 4), slice(4, 12)):
+        share = data.batch(index[rows], 48, 32, FULL, Draws.of(5, 12, rows))
+        assert torch.allclose(share.cloud, whole.cloud[rows], atol=1e-6)
+        assert torch.equal(share.labels, whole.labels[rows]) and torch.equal(share.index, index[rows])
 
 
 def test_same_generator_same_batch(data: Dataset) -> None:
@@ -51,12 +78,13 @@ def test_same_generator_same_batch(data: Dataset) -> None:
 
 
 def test_query_subset_keeps_labels_with_positions(data: Dataset) -> None:
-    batch = data.batch(torch.tensor([2, 5]), 96, 16, NONE, rng())
+    index = torch.tensor([2, 5])
+    batch, stored = data.batch(index, 96, 16, NONE, rng()), data.read(index)
     assert batch.positions.shape == (2, 16, 3)
-    for row, example in enumerate((2, 5)):
+    for row in range(2):
         for position, label in zip(batch.positions[row], batch.labels[row], strict=True):
-            match = (data.positions[example] - position).norm(dim=-1).argmin()
-            assert data.labels[example, match] == label
+            match = (stored["positions"][row] - position).norm(dim=-1).argmin()
+            assert stored["labels"][row, match] == label
 
 
 def test_augmented_cloud_fills_the_unit_box_and_camera_stays_in_front(data: Dataset) -> None:
@@ -130,14 +158,24 @@ def test_truncated_shard_is_named(tmp_path: Path) -> None:
         Dataset.load(directory)
 
 
+def test_shards_that_differ_are_refused(tmp_path: Path) -> None:
+    directory = write_toy_dataset(tmp_path / "data")
+    path = directory / "shard-00001.safetensors"
+    queries = ("positions", "labels", "distances", "directions", "rest")
+    save_file({k: v[:, :9].contiguous() if k in queries else v for k, v in load_file(path).items()}, path)
+    with pytest.raises(ValueError, match=r"00001.* has the shape \(9.*in an example, the first shard \(128"):
+        Dataset.load(directory)
+
+
 def test_a_directory_without_manifest_is_not_a_dataset(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"has no manifest\.json; a dataset is a directory made by"):
         Dataset.load(tmp_path)
 
 
 def test_domain_holds_every_segment_point_with_a_margin(data: Dataset) -> None:
-    low, high = (torch.tensor(corner) for corner in data.domain(margin=0.15))
-    occupied = data.positions[data.labels > 0]
+    low, high = (torch.tensor(corner) for corner in data.domain)
+    stored = data.read(torch.arange(len(data)))
+    occupied = stored["positions"][stored["labels"] > 0]
     extent = occupied.amax(dim=0) - occupied.amin(dim=0)
     assert torch.allclose(occupied.amin(dim=0) - low, 0.15 * extent, atol=1e-5)
     assert torch.allclose(high - occupied.amax(dim=0), 0.15 * extent, atol=1e-5)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-from toy_data import SMALL
+from toy_data import SMALL, read_all
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
@@ -118,9 +118,10 @@ def test_two_workers_equal_one(whole: Path, tmp_path: Path) -> None:
 
 def test_training_reads_what_generation_writes(whole: Path) -> None:
     data = Dataset.load(whole)
-    assert len(data) == 10 and data.cloud.shape == (10, 128, 3)
-    assert data.positions.shape == (10, SMALL.sampling.total(4), 3)
-    assert (data.viewpoint[:, 2] < data.cloud[..., 2].amin(dim=1)).all()
+    stored = read_all(data)
+    assert len(data) == 10 and stored.cloud.shape == (10, 128, 3)
+    assert stored.positions.shape == (10, SMALL.sampling.total(4), 3)
+    assert (stored.viewpoint[:, 2] < stored.cloud[..., 2].amin(dim=1)).all()
 
 
 def test_tensors_are_as_documented(whole: Path) -> None:

@@ -106,7 +106,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", ["--data memory", "--data stream", "--data stream --accumulate 2"])
+@pytest.mark.parametrize("options", ["", "--accumulate 2"])
 def test_two_nodes_train_what_one_process_does(folder: Path, options: str) -> None:
     name = options.replace(" ", "").replace("-", "")
     train_alone(folder, f"alone{name}", f"{options} --epochs 2")
@@ -118,7 +118,7 @@ def test_two_nodes_train_what_one_process_does(folder: Path, options: str) -> No
 @pytest.mark.slow
 def test_a_killed_worker_is_started_again_and_ends_with_the_same_result(folder: Path) -> None:
     """All processes start again, from the latest checkpoint; the first ones end with one sentence."""
-    options = "--data stream --epochs 1"
+    options = "--epochs 1"
     train_on_nodes(folder, "whole", options)
     said = train_on_nodes(folder, "parts", options, VICTIM="3")
     assert (folder / "fallen").is_file(), "one was killed"

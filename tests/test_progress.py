@@ -10,8 +10,6 @@ from rich.console import Console
 
 from mereo.io import progress as module
 from mereo.io.progress import duration, progress, tracked
-from mereo.training.config import PRESETS
-from mereo.training.steps_shown import StepsShown, steps_between
 
 
 @pytest.fixture
@@ -113,25 +111,3 @@ def test_a_terminal_gets_a_bar_and_what_is_printed_stays_above_it(
 )
 def test_durations(seconds: float, text: str) -> None:
     assert duration(seconds) == text
-
-
-# --- training ---------------------------------------------------------------------------------------------------------
-
-
-def test_time_left_of_a_training_has_all_that_is_to_be_scored(
-    wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Steps of 2 s, 20 validations of 32 answers and 1000 for the offsets, 0.1 s each as the first ones took."""
-    config, total = PRESETS["tiny"], 200
-    shown = StepsShown(config, total, 32)
-    with shown.showing(0):
-        for step in range(1, 31):
-            wait(2.0)
-            shown.took(step, 1.0)
-            if step % steps_between(total) == 0:
-                with shown.apart(32):
-                    wait(3.2)
-    lines = capsys.readouterr().err.splitlines()
-    # before the first scores: half of a step's time for an example
-    assert lines[0].endswith(f", {duration(199 * 2 + (20 * 32 + 1000) * 2 / 32 / 2)} left, loss 1.0000")
-    assert lines[-2].endswith(f", {duration(170 * 2 + (18 * 32 + 1000) * 0.1)} left, loss 1.0000"), "one is just due"

@@ -271,3 +271,36 @@ def test_a_chain_of_trainings_adds_up_and_only_a_learned_box_limits_it(dataset: 
     assert [model.domain is None for model in models] == [True, False, False]
     old = {key: value for key, value in models[2].provenance.items() if key != "examples_before"}
     assert seen_before(old) is None and "which do not say how many" in told(old)
+
+
+# --- batches in parts -------------------------------------------------------------------------------------------------
+
+
+def gradients(data: Dataset, config: TrainConfig, folder: Path) -> torch.Tensor:
+    """All gradients of the first step side by side, and its loss, with the statistics of normalization held fixed."""
+    loop = trainer.Trainer(config, data, trainer.start_network(config, data), folder, trainer.Process(), torch.device("cpu"))
+    loop.network.train()
+    for module in loop.network.modules():
+        if isinstance(module, torch.nn.BatchNorm1d):
+            module.eval()
+    loss = loop._gradients(next(loop.batches()))["loss"]
+    return torch.cat([p.grad.flatten() for p in loop.network.parameters() if p.grad is not None] + [loss[None]])
+
+
+@pytest.mark.parametrize("parts", [2, 4])
+def test_a_batch_in_parts_has_the_gradient_of_the_whole(dataset: Path, tmp_path: Path, parts: int) -> None:
+    """To rounding, but for batch normalization, which sees each part by itself: it is held fixed for this.
+
+    Sums of other lengths round otherwise, most where the network is steep: 7e-5 on a processor with SSE alone.
+    """
+    data = Dataset.load(dataset)
+    config = replace(SMALL, precision="float32", compile="off")
+    whole, found = (gradients(data, replace(config, accumulate=count), tmp_path) for count in (1, parts))
+    assert (found - whole).abs().max() < 1e-3 * whole.abs().max()
+
+
+def test_a_batch_that_has_no_equal_parts_is_refused() -> None:
+    with pytest.raises(ValueError, match="accumulate is 3 and batch 8; a batch is learnt in equal parts"):
+        replace(SMALL, accumulate=3)
+    with pytest.raises(ValueError, match="a part of a batch has one query"):
+        replace(SMALL, accumulate=8, queries=1)

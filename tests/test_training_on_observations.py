@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 from test_training import SMALL
-from toy_data import half_balls, write_toy_dataset
+from toy_data import half_balls, read_all, write_toy_dataset
 from training_runs import assert_resumes_exactly
 
 from mereo.models.weights import load_model
@@ -94,9 +94,8 @@ def test_a_batch_depends_on_its_generator_alone(data: tuple[Dataset, Dataset]) -
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_queries_and_cloud_stay_in_one_frame(data: tuple[Dataset, Dataset], number: int) -> None:
     """The box is normalized anew, so distances between queries, cloud and camera keep their ratios to the stored."""
-    seen = data[1]
-    assert seen.seen is not None and seen.seen_count is not None
-    found = seen.batch(torch.arange(8), 96, 0, AugmentConfig(), rng(), FIRST + number)
+    seen = read_all(data[1])
+    found = data[1].batch(torch.arange(8), 96, 0, AugmentConfig(), rng(), FIRST + number)
     assert torch.allclose((found.cloud.amax(dim=1) - found.cloud.amin(dim=1)).amax(dim=1), torch.full((8,), 2.0))
     count = int(seen.seen_count[0, number - 1])
     stored = seen.seen[:8, number - 1, :count].float()

@@ -7,9 +7,11 @@ needs no renderer and no sampler, so the tests of learning stand on their own.
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import save_file
 from toy_scene import toy_scene
 
@@ -17,6 +19,7 @@ from mereo.api.generate import generate
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 from mereo.synthesis import shards
 from mereo.synthesis.config import TEMPLATE, GenerateConfig, SamplingConfig
+from mereo.training.dataset import Dataset
 
 NAMES = ("left", "right")
 SHARD = 32
@@ -37,6 +40,12 @@ def write_small_dataset(output: Path) -> Path:
         make_small_datasets(patch)
         generate(toy_scene(), output, SMALL, examples=4, seed=3)
     return output
+
+
+def read_all(data: Dataset) -> SimpleNamespace:
+    """All examples of a dataset as they are stored, and the viewpoint in each."""
+    stored = data.read(torch.arange(len(data)))
+    return SimpleNamespace(**stored, viewpoint=(-stored["center"] * stored["scale"][:, None]).float())
 
 
 def write_toy_dataset(

@@ -57,7 +57,7 @@ from mereo.scenes.scene import SCENES
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.shards import DatasetConfig, generate
 from mereo.training.config import PRESETS, TrainConfig
-from mereo.training.steps_shown import VALIDATIONS
+from mereo.training.trainer import VALIDATIONS
 from mereo.training.trainer import train as train_network
 from mereo.training.trial import STEPS, nearest, small_dataset, timed, trial_steps
 from mereo.visualization.evaluation_files import evaluate_weights

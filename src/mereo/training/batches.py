@@ -8,12 +8,18 @@ Notation: e examples, b of them in a batch, p stored points, n points that the n
 
 from dataclasses import dataclass, field, fields, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.training.config import AugmentConfig
+
+
+def seed_of(*numbers: int) -> int:
+    """One 63-bit seed from several numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 @dataclass(frozen=True)

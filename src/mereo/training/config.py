@@ -54,10 +54,6 @@ class AugmentConfig:
             )
 
 
-DataPlace = Literal["auto", "memory", "stream"]
-"""Where examples are while a network learns from them."""
-
-
 @dataclass(frozen=True)
 class TrainConfig:
     """Settings of a training, its recipe; defaults are the paper's.
@@ -71,8 +67,6 @@ class TrainConfig:
         batch: examples per step, over all processes together.
         accumulate: parts in which each process takes its share of a batch, one after another, for batches that do not
             fit into memory at once; only batch normalization sees the parts (docs/many-machines.md).
-        data: hold all examples in memory, or read their shards while learning; auto streams what would take more than
-            half of the memory that is free. Both learn from the same examples, in another order.
         queries: query points per example and step, a random subset; 0 means all of them.
         epochs: passes over the dataset.
         learning_rate: peak rate.
@@ -100,7 +94,6 @@ class TrainConfig:
     l1_weight: NotNegative = 100.0
     batch: Batch = 40
     accumulate: Count = 1
-    data: DataPlace = "auto"
     queries: CountOrNone = 0
     epochs: Positive = 300.0
     learning_rate: Positive = 5e-4
@@ -145,8 +138,6 @@ class TrainConfig:
             del settings["code_length"]
         if self.accumulate == 1:
             del settings["accumulate"]
-        if self.data != "stream":  # in memory as ever
-            del settings["data"]
         return settings
 
 

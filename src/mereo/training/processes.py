@@ -5,10 +5,12 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from mereo.models.device import pick_device
 
@@ -96,25 +98,6 @@ def meeting(process: Process) -> Iterator[None]:
         raise SystemExit(USER_ERROR)
 
 
-@contextmanager
-def together(process: Process) -> Iterator[None]:
-    """Block in which all processes work; all meet at its end, and where one has failed there, all end.
-
-    The first one that failed raises its own error, the others leave by ``SystemExit`` without a word.
-    """
-    if process.world == 1:
-        yield
-        return
-    first = torch.full((1,), process.rank, device=collective_device(process))
-    try:
-        yield
-        first.fill_(process.world)
-    finally:
-        dist.all_reduce(first, dist.ReduceOp.MIN)
-        if first.item() < process.world and first.item() != process.rank:
-            raise SystemExit(USER_ERROR)
-
-
 def agreed(process: Process, wish: bool) -> bool:
     """Wish of process 0, which decides for all: clocks differ, and validation is collective."""
     if process.world == 1:
@@ -124,15 +107,15 @@ def agreed(process: Process, wish: bool) -> bool:
     return bool(flag.item())
 
 
-def told(process: Process, find: Callable[[], T]) -> T:
-    """What process 0 finds, in all processes; where that fails, all end as in ``meeting``."""
-    found: list[T | None] = [None]
+def broadcast_result(process: Process, compute: Callable[[], T]) -> T:
+    """Result that process 0 computes, in all processes; where that fails, all end as in ``meeting``."""
+    result: list[T | None] = [None]
     with meeting(process):
         if process.is_main:
-            found[0] = find()
+            result[0] = compute()
     if process.world > 1:
-        dist.broadcast_object_list(found, src=0, device=collective_device(process))
-    return found[0]  # type: ignore[return-value]
+        dist.broadcast_object_list(result, src=0, device=collective_device(process))
+    return result[0]  # type: ignore[return-value]
 
 
 LOST = ("gloo", "connection closed", "connection reset", "broken pipe", "nccl", "socket")
@@ -154,3 +137,93 @@ def connected(process: Process) -> Iterator[None]:
             f"process {process.rank} of {process.world} has lost another one, which has ended or is out of reach; its "
             "own message says why: torchrun --max-restarts N starts all of them again, from the latest checkpoint"
         ) from error
+
+
+# --- batch_normalization ----------------------------------------------------------------------------------------------
+
+# Batch normalization of a batch that several processes share, or one process takes in parts.
+#
+# Notation: n rows, c channels.
+
+
+def share_statistics(network: nn.Module, process: Process, device: torch.device) -> nn.Module:
+    """Network whose batch normalization has the statistics of all processes' rows together, as one process would.
+
+    The network is changed in place. Its parameters and buffers keep their names. torch's own does it on CUDA only.
+    """
+    if process.world == 1:
+        return network
+    if device.type != "cpu":
+        return nn.SyncBatchNorm.convert_sync_batchnorm(network)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm1d):
+            module.__class__ = SharedBatchNorm
+    return network
+
+
+def adapt_momentum(network: nn.Module, parts: int) -> None:
+    """Let the running statistics move as far in ``parts`` updates of a step as they would in one."""
+    if parts == 1:
+        return
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm1d | nn.SyncBatchNorm) and module.momentum is not None:
+            module.momentum = 1 - (1 - module.momentum) ** (1 / parts)
+
+
+class SharedBatchNorm(nn.BatchNorm1d):
+    """Batch normalization with the statistics of all processes' rows, of which each has equally many."""
+
+    @torch.compiler.disable  # type: ignore[untyped-decorator]
+    def forward(self, rows: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+        """Rows, normalized: in training by their own statistics, else by the running ones."""
+        if not self.training:
+            return super().forward(rows)
+        assert self.momentum is not None and self.running_mean is not None and self.running_var is not None
+        normalized, mean, variance = _Normalize.apply(rows, self.weight, self.bias, self.eps)
+        count = len(rows) * dist.get_world_size()
+        with torch.no_grad():
+            self.running_mean.lerp_(mean, self.momentum)
+            self.running_var.lerp_(variance * (count / (count - 1)), self.momentum)
+            if self.num_batches_tracked is not None:
+                self.num_batches_tracked.add_(1)
+        return normalized
+
+
+class _Normalize(torch.autograd.Function):
+    """Normalization of Ioffe and Szegedy (2015), whose sums run over the rows of all processes."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rows: Float[Tensor, "n c"],
+        weight: Float[Tensor, " c"],
+        bias: Float[Tensor, " c"],
+        eps: float,
+    ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " c"], Float[Tensor, " c"]]:
+        exact = rows.float()
+        variance, mean = torch.var_mean(exact, dim=0, correction=0)
+        own = torch.stack([mean, variance])
+        every = [torch.empty_like(own) for _ in range(dist.get_world_size())]
+        dist.all_gather(every, own)
+        means, variances = torch.stack(every).unbind(1)
+        mean = means.mean(dim=0)
+        # by differences of means, not of squares: a mean may be hundreds of spreads
+        variance = (variances + (means - mean).square()).mean(dim=0)
+        inverse = (variance + eps).rsqrt()
+        standard = (exact - mean) * inverse
+        ctx.save_for_backward(standard, inverse, weight)
+        ctx.mark_non_differentiable(mean, variance)
+        return (standard * weight + bias).to(rows.dtype), mean, variance
+
+    @staticmethod
+    def backward(
+        ctx: Any, gradient: Float[Tensor, "n c"], *_: Tensor
+    ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " c"], Float[Tensor, " c"], None]:
+        standard, inverse, weight = ctx.saved_tensors
+        exact = gradient.float()
+        own = torch.stack([exact.sum(dim=0), (exact * standard).sum(dim=0)])  # of bias and weight, which DDP averages
+        every = own.clone()
+        dist.all_reduce(every)
+        shift, slope = every / (len(standard) * dist.get_world_size())
+        rows = (exact - shift - standard * slope) * (inverse * weight)
+        return rows.to(gradient.dtype), own[1], own[0], None

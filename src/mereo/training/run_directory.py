@@ -1,15 +1,19 @@
-"""Settings and directory of a training run, the network it starts from and the model it ends with."""
+"""Directory of a training run: its settings and checkpoint, the network it starts from and the model it ends with."""
 
 import copy
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
 
+from mereo.io.atomic_files import atomic_file
+from mereo.io.errors import reason
 from mereo.io.output_folders import claim_directory
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders.encoding import Autodecoder
@@ -18,11 +22,11 @@ from mereo.models.network import Network
 from mereo.models.weights import load_model
 from mereo.synthesis.config import TEMPLATE
 from mereo.training.config import AugmentConfig, TrainConfig
-from mereo.training.data_source import TrainingData
-from mereo.training.processes import Process, meeting
+from mereo.training.dataset import Dataset
+from mereo.training.processes import Process, broadcast_result, meeting
 
 
-def fit_config(config: TrainConfig, data: TrainingData) -> TrainConfig:
+def fit_config(config: TrainConfig, data: Dataset) -> TrainConfig:
     """Recipe with what the dataset decides: what can be held out, whether a roll is plausible, what else is observed.
 
     Raises ``ValueError`` for settings with which an autodecoder cannot be trained.
@@ -53,7 +57,7 @@ def _check_autodecoder(config: TrainConfig) -> None:
         )
 
 
-def start_network(config: TrainConfig, data: TrainingData) -> Network:
+def start_network(config: TrainConfig, data: Dataset) -> Network:
     """Network to train: random from the seed, or with the weights that ``config.init`` names.
 
     Weights that know other segments give all that is not about segments (docs/learning.md). An
@@ -85,7 +89,7 @@ def start_network(config: TrainConfig, data: TrainingData) -> Network:
 
 def trained_model(
     average: Network,
-    data: TrainingData,
+    data: Dataset,
     config: TrainConfig,
     step: int,
     offsets: Float[Tensor, " c"] | None,
@@ -120,7 +124,7 @@ def trained_model(
         colors=tuple(tuple(s["color"]) for s in manifest["segments"]),
         loss=config.loss,
         provenance=provenance,
-        domain=data.domain() if config.learned_box else None,
+        domain=data.domain if config.learned_box else None,
         nested=tuple((inner, outer) for inner, outer in manifest.get("nested", ())),
         statistical_model=data.statistical_model,
     )
@@ -156,7 +160,7 @@ def _without_segments(given: dict[str, Tensor], network: Network) -> dict[str, T
     return kept
 
 
-def claim_run(run_dir: Path, config: TrainConfig, data: TrainingData, process: Process) -> None:
+def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Process) -> None:
     """Create the run directory, or check that it belongs to the same settings and dataset.
 
     Process 0 does so alone: another one would find the directory that it is just creating, without its settings yet.
@@ -174,7 +178,7 @@ def claim_run(run_dir: Path, config: TrainConfig, data: TrainingData, process: P
             _claim(run_dir, json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()})))
 
 
-NOT_WRITTEN = {"accumulate": 1, "data": "memory"}
+NOT_WRITTEN = {"accumulate": 1}
 """Settings that files do not hold where they are so."""
 
 
@@ -204,3 +208,75 @@ def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:
             if before.get(group, {}).get(key) != value:
                 return f"{group} setting {key} ({before.get(group, {}).get(key)!r:.80} instead of {value!r})"
     return "format"
+
+
+# --- checkpoint -------------------------------------------------------------------------------------------------------
+
+# Checkpoints of a training run as safetensors: network, averaged network, optimizer and step. No pickles.
+
+CHECKPOINT = "checkpoint.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Objects whose state makes a run resumable; loading fills them in place."""
+
+    step: int
+    network: nn.Module
+    average: nn.Module
+    optimizer: torch.optim.Optimizer
+
+
+def save_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint atomically, so that a killed run keeps its previous one."""
+    tensors: dict[str, Tensor] = {}
+    for prefix, module in (("network", checkpoint.network), ("average", checkpoint.average)):
+        tensors |= {f"{prefix}/{name}": value.contiguous() for name, value in module.state_dict().items()}
+    for index, state in checkpoint.optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer/{index}/{name}": value.contiguous() for name, value in state.items()}
+    with atomic_file(run_dir / CHECKPOINT) as partial:
+        partial.write_bytes(save(tensors, metadata={"step": str(checkpoint.step)}))
+
+
+def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, process: Process | None = None) -> int | None:
+    """Fill network, average and optimizer; returns the step, or None when there is no checkpoint yet.
+
+    Process 0 reads the file and sends it to the others: machines that share a folder may see an older file for a while.
+    """
+    path = run_dir / CHECKPOINT
+    content = broadcast_result(process or Process(), lambda: path.read_bytes() if path.is_file() else None)
+    if content is None:
+        return None
+    try:
+        tensors = load(content)
+        step = int(json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]["step"])
+        _fill(checkpoint, tensors)
+    except (SafetensorError, OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise ValueError(f"{path} cannot be read ({reason(error)}); delete it to train from the start") from None
+    return step
+
+
+def _fill(checkpoint: Checkpoint, tensors: dict[str, Tensor]) -> None:
+    """Give a checkpoint's objects their state; raises whatever torch does for one that is not theirs."""
+    for prefix, module in (("network", checkpoint.network), ("average", checkpoint.average)):
+        module.load_state_dict(_below(tensors, prefix + "/"))
+    states: dict[int, dict[str, Tensor]] = {}
+    for name, value in _below(tensors, "optimizer/").items():
+        index, key = name.split("/")
+        states.setdefault(int(index), {})[key] = value
+    _check_optimizer(checkpoint.optimizer, states)
+    groups = checkpoint.optimizer.state_dict()["param_groups"]
+    checkpoint.optimizer.load_state_dict({"state": states, "param_groups": groups})
+
+
+def _check_optimizer(optimizer: torch.optim.Optimizer, states: dict[int, dict[str, Tensor]]) -> None:
+    """Raise ``ValueError`` for states that the optimizer would take now and fail over at its next step."""
+    parameters = [value for group in optimizer.param_groups for value in group["params"]]
+    for index, state in states.items():
+        shapes = {"step": torch.Size(()), "exp_avg": parameters[index].shape, "exp_avg_sq": parameters[index].shape}
+        if {name: value.shape for name, value in state.items()} != shapes:
+            raise ValueError(f"the optimizer's state {index} is of another network")
+
+
+def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

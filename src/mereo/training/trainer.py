@@ -8,37 +8,49 @@ single one would have taken (docs/many-machines.md); process 0 writes.
 import copy
 import math
 import time
-from collections.abc import Generator
-from contextlib import closing, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
 import torch
 import torch.distributed as dist
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from mereo.io.object_storage import Place
+from mereo.io.progress import Progress, progress
 from mereo.io.scratch_folders import check_place
 from mereo.models.config import Device
 from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
-from mereo.models.encoders.encoding import Autodecoder
+from mereo.models.encoders.encoding import CODES, Autodecoder
 from mereo.models.network import Network
 from mereo.models.weights import save_model, trained_steps
 from mereo.models.weights_place import WEIGHTS
-from mereo.training.batch_normalization import adapt_momentum, share_statistics
-from mereo.training.batches import Batch, Draws
-from mereo.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mereo.training.batches import Batch, Draws, seed_of
 from mereo.training.config import TrainConfig
-from mereo.training.data_source import TrainingData, open_data
+from mereo.training.dataset import Dataset, ShuffledOrder
 from mereo.training.examples_seen import seen_by
-from mereo.training.going_nowhere import EXAMPLES, ConstantAnswer, Judge
 from mereo.training.losses import supervised_loss, with_known
 from mereo.training.metrics_log import MetricsLog
-from mereo.training.optimization import clip_gradients, parameter_groups, rate_share, update_average
-from mereo.training.orders import seed_of
-from mereo.training.processes import Process, agreed, connected, join_processes, leave_processes, meeting
-from mereo.training.run_directory import claim_run, fit_config, start_network, trained_model
-from mereo.training.steps_shown import StepsShown, steps_between
-from mereo.training.streaming import StreamingDataset
+from mereo.training.processes import (
+    Process,
+    adapt_momentum,
+    agreed,
+    connected,
+    join_processes,
+    leave_processes,
+    meeting,
+    share_statistics,
+)
+from mereo.training.run_directory import (
+    Checkpoint,
+    claim_run,
+    fit_config,
+    load_checkpoint,
+    save_checkpoint,
+    start_network,
+    trained_model,
+)
 from mereo.training.validation import choose_offsets, held_out, validate
 
 
@@ -52,10 +64,10 @@ def train(
 ) -> Path:
     """Train on a generated dataset; returns the path of the weights (``run_dir/weights.safetensors``).
 
-    ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors, and
-    survey.json where examples are streamed. If it holds a checkpoint of the same settings, training continues from it,
-    and what is missing of a finished run is written. Raises ``ValueError`` for other settings, and at the first step
-    whose loss or gradient is not finite: what was saved before stays. ``ConnectionError`` where a process is lost.
+    ``run_dir`` receives config.json, metrics.csv, curves.png, checkpoint.safetensors and weights.safetensors. If it
+    holds a checkpoint of the same settings, training continues from it, and what is missing of a finished run is
+    written. Raises ``ValueError`` for other settings, and at the first step whose loss or gradient is not finite: what
+    was saved before stays. ``ConnectionError`` where a process is lost.
     """
     check_place(run_dir, may_be_link=True)
     process = join_processes()
@@ -67,12 +79,10 @@ def train(
 def _train(
     dataset_dir: Place, run_dir: Path, config: TrainConfig, place: torch.device, save_every_s: float, process: Process
 ) -> None:
-    config, data = open_data(dataset_dir, run_dir, config, place, process)
+    data = Dataset.load(dataset_dir, place)
     config = fit_config(config, data)
     network = start_network(config, data)  # before anything is written: the weights it starts from may be unusable
     claim_run(run_dir, config, data, process)
-    if isinstance(data, StreamingDataset):
-        data = data.surveyed(run_dir, process)
     keep_freed_memory()
     trainer = Trainer(config, data, network, run_dir, process, place)
     if isinstance(network.encoder, Autodecoder):
@@ -81,19 +91,26 @@ def _train(
     if trainer.resume():
         trainer.say(f"continuing from step {trainer.step} of {trainer.total}")
     last_save = time.monotonic()
-    with trainer.shown.showing(trainer.step) if process.is_main else nullcontext(), connected(process):
-        with closing(trainer.batches()) as batches:
-            for batch in batches:
-                trainer.train_step(batch)
-                trainer.validate()
-                if trainer.step < trainer.total and agreed(process, time.monotonic() - last_save > save_every_s):
-                    trainer.save()
-                    last_save = time.monotonic()
+    with trainer.showing() if process.is_main else nullcontext(), connected(process):
+        for batch in trainer.batches():
+            trainer.train_step(batch)
+            trainer.validate()
+            if trainer.step < trainer.total and agreed(process, time.monotonic() - last_save > save_every_s):
+                trainer.save()
+                last_save = time.monotonic()
         trainer.finish()
 
 
+VALIDATIONS = 20
+"""Held-out scores of a run, evenly over its steps: by the clock, a resumed run would have others."""
+
 READ_EVERY = 20
 """Steps after which losses are read on a device where reading waits."""
+
+
+def steps_between(total: int) -> int:
+    """Steps from one held-out score to the next, in a run of ``total``."""
+    return math.ceil(total / VALIDATIONS)
 
 
 class Trainer:
@@ -102,7 +119,7 @@ class Trainer:
     def __init__(
         self,
         config: TrainConfig,
-        data: TrainingData,
+        data: Dataset,
         network: Network,
         run_dir: Path,
         process: Process,
@@ -114,7 +131,7 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(parameter_groups(self.network, config), lr=config.learning_rate, fused=True)
         self.examples = len(data) - config.holdout
         self.before = seen_by(config.init)  # now: the file may be gone when the weights are saved
-        self.order = data.order(self.examples, config.batch, config.seed, process.world)
+        self.order = ShuffledOrder(self.examples, config.batch, config.seed)
         share = config.batch // process.world
         self.rows = slice(process.rank * share, (process.rank + 1) * share)
         self.total = max(1, math.ceil(config.epochs * self.examples / config.batch))
@@ -128,22 +145,43 @@ class Trainer:
             self.module = nn.parallel.DistributedDataParallel(self.network)
         if config.compile == "on" or (config.compile == "auto" and compiling_pays(device, self.total)):
             self.module = torch.compile(self.module)  # type: ignore[assignment]
-        constant = ConstantAnswer.of(*data.first_queries(EXAMPLES), config.supervision.labels)
-        self.judge = Judge(constant, self.total)
-        self.first_step = 0
-        self.shown = StepsShown(config, self.total, len(held_out(data, config)) * (2 if data.further else 1))
+        self.first_step = self.shown_step = 0
+        self.shown: Progress | None = None
 
     def say(self, text: str) -> None:
         """Print a line, in process 0 only."""
         if self.process.is_main:
             print(text, flush=True)
 
-    def batches(self) -> Generator[Batch, None, None]:
+    @contextmanager
+    def showing(self) -> Iterator[None]:
+        """Block in which the steps from here are shown."""
+        self.shown_step = self.step
+        with progress("train", self.total - self.step, "steps", each=self.config.batch) as self.shown:
+            yield
+        self.shown = None
+
+    def _no_step(self) -> AbstractContextManager[None]:
+        """Block whose time is no step's."""
+        return nullcontext() if self.shown is None else self.shown.paused()
+
+    def _scoring_s(self, shown: Progress) -> float:
+        """Seconds of the scores to come, of held-out examples and for the class offsets.
+
+        To answer an example is taken to cost half of what learning from it does.
+        """
+        between = steps_between(self.total)
+        validations = -(-self.total // between) - self.step // between
+        scored = validations * len(held_out(self.data, self.config)) * (2 if self.data.further else 1)
+        return shown.unit_s / self.config.batch / 2 * (scored + self.config.offset_examples)
+
+    def batches(self) -> Iterator[Batch]:
         """Share of this process in every remaining batch."""
         config = self.config
-        for data, index in self.data.pieces(self.order, range(self.step, self.total), self.rows):
-            draws = Draws.of(seed_of(config.seed, self.step, 0), config.batch, self.rows)
-            batch = data.batch(index, config.network.points, config.queries, config.augment, draws)
+        for step in range(self.step, self.total):
+            index = self.order.index(step)[self.rows]
+            draws = Draws.of(seed_of(config.seed, step, 0), config.batch, self.rows)
+            batch = self.data.batch(index, config.network.points, config.queries, config.augment, draws)
             yield with_known(batch, self.process, config.accumulate)
 
     def train_step(self, batch: Batch) -> None:
@@ -211,7 +249,9 @@ class Trainer:
             if self.log is not None:
                 self.log.add_step(step, rate, losses)
         self.unread.clear()
-        self.shown.took(self.step, losses["loss"])
+        if self.shown is not None:
+            self.shown.advance(self.step - self.shown_step, f"loss {losses['loss']:.4f}", self._scoring_s(self.shown))
+            self.shown_step = self.step
 
     def _divergence(self, step: int, loss: float, norm: float) -> str:
         """Sentence about a step that is not finite: where it is, what is left, and what may help."""
@@ -234,7 +274,7 @@ class Trainer:
         if not (due and self.config.holdout):
             return
         self._read_losses()
-        with self.shown.apart(self.shown.scored), meeting(self.process):
+        with self._no_step(), meeting(self.process):
             if self.log is not None:
                 self._validate(self.log)
 
@@ -245,7 +285,7 @@ class Trainer:
         if self.data.further:
             scores = validate(self.average, self.data, self.config, further=True)
             log.add_validation(self.step, scores.iou, scores.miou, "sensor")
-        self.say(f"held-out examples at step {self.step}: {log.summary()}{self.judge.doubt(log.rows)}")
+        self.say(f"held-out examples at step {self.step}: {log.summary()}")
 
     def save(self, finished: bool = False) -> None:
         """Write metrics, curves, the weights and the checkpoint; every file atomically.
@@ -253,7 +293,7 @@ class Trainer:
         The checkpoint is the last, so whatever stops this leaves one from which the others are written again.
         """
         self._read_losses()
-        with self.shown.apart(), meeting(self.process):
+        with self._no_step(), meeting(self.process):
             if self.log is not None:
                 self._save(self.log, finished)
         self.saved_step = self.step
@@ -265,7 +305,7 @@ class Trainer:
         model = trained_model(self.average, self.data, self.config, self.step, offsets, self.before)
         save_model(model, self.run_dir / WEIGHTS)
         save_checkpoint(self.run_dir, Checkpoint(self.step, self.network, self.average, self.optimizer))
-        self.say(f"saved at step {self.step}: {log.summary()}{self.judge.doubt(log.rows)}")
+        self.say(f"saved at step {self.step}: {log.summary()}")
 
     def finish(self) -> None:
         """Write all that a run leaves at its end, unless an earlier process has, which may have been killed before."""
@@ -295,3 +335,56 @@ class Trainer:
             if self.log is not None:
                 self.log.read_until(step)
         return True
+
+
+# --- optimization -----------------------------------------------------------------------------------------------------
+
+# Optimization of a network in training: parameter groups, learning rates, gradient norm, averaged weights.
+
+
+def parameter_groups(network: nn.Module, config: TrainConfig) -> list[dict[str, object]]:
+    """Groups for the optimizer, each with its "peak" rate: weight decay acts on matrices only.
+
+    It would only slow biases and norms. An autodecoder's codes have a rate of their own.
+    """
+    named = dict(network.named_parameters())
+    codes = [named.pop(CODES)] if CODES in named else []
+    matrices = [p for p in named.values() if p.ndim >= 2]
+    others = [p for p in named.values() if p.ndim < 2]
+    peak = config.learning_rate
+    groups: list[dict[str, object]] = [
+        {"params": matrices, "weight_decay": config.weight_decay, "peak": peak},
+        {"params": others, "weight_decay": 0.0, "peak": peak},
+    ]
+    if codes:
+        groups.append({"params": codes, "weight_decay": 0.0, "peak": config.code_rate})
+    return groups
+
+
+def rate_share(config: TrainConfig, step: int, total: int) -> float:
+    """Share of its peak, in [0, 1], that each learning rate has in a step, counted from 0, of ``total`` steps."""
+    progress = step / total
+    if progress < config.warmup:
+        return (step + 1) / math.ceil(config.warmup * total)
+    if config.schedule == "constant":
+        return 1.0
+    return 0.5 * (1 + math.cos(math.pi * (progress - config.warmup) / (1 - config.warmup)))
+
+
+def clip_gradients(network: nn.Module, most: float) -> Float[Tensor, ""]:
+    """Norm of all gradients together, which are then shortened to the norm ``most``; 0 leaves them as they are."""
+    if most:
+        return nn.utils.clip_grad_norm_(network.parameters(), most).float()
+    return nn.utils.get_total_norm([p.grad for p in network.parameters() if p.grad is not None]).float()
+
+
+@torch.no_grad()
+def update_average(average: nn.Module, network: nn.Module, step: int, decay: float) -> None:
+    """Move the exponential moving average of a network's weights, in place, to what they are after ``step`` steps."""
+    # a young average follows closely, so that the random initialization is forgotten
+    decay = min(decay, (1 + step) / (10 + step)) if decay else 0.0
+    for mean, value in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
+        if mean.is_floating_point():
+            mean.lerp_(value, 1 - decay)
+        else:
+            mean.copy_(value)
