@@ -278,7 +278,8 @@ def test_a_chain_of_trainings_adds_up_and_only_a_learned_box_limits_it(dataset: 
 
 def gradients(data: Dataset, config: TrainConfig, folder: Path) -> torch.Tensor:
     """All gradients of the first step side by side, and its loss, with the statistics of normalization held fixed."""
-    loop = trainer.Trainer(config, data, trainer.start_network(config, data), folder, trainer.Process(), torch.device("cpu"))
+    network, process = trainer.start_network(config, data), trainer.Process()
+    loop = trainer.Trainer(config, data, network, folder, process, torch.device("cpu"))
     loop.network.train()
     for module in loop.network.modules():
         if isinstance(module, torch.nn.BatchNorm1d):
