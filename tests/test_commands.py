@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import mereo.__main__ as command_line
-from mereo.cli.outcome import Outcome
+from mereo.cli.options import Outcome
 from mereo.cli.reconstruct import FrameJob
 from mereo.io.config import InputConfig
 from mereo.training.config import PRESETS

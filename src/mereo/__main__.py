@@ -23,7 +23,7 @@ from mereo.cli.calibrate import CalibrateCommand
 from mereo.cli.config_file import GivenOptions, defaults_from, read_options
 from mereo.cli.last_resort import sentence
 from mereo.cli.learn import LearnCommand
-from mereo.cli.outcome import Outcome
+from mereo.cli.options import Outcome
 from mereo.cli.reconstruct_command import ReconstructCommand
 from mereo.cli.serve_command import ServeCommand
 from mereo.cli.stop_signals import Stopped, stop_signals

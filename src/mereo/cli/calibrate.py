@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from mereo.cli.positionals import WeightsName
+from mereo.cli.options import WeightsName
 from mereo.io.bounds import Count, CountOrNone, Threads
 
 

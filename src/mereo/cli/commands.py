@@ -10,9 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import arg
 
 from mereo.cli.config_file import ConfigFile, options_of
-from mereo.cli.outcome import Outcome
-from mereo.cli.place_option import PlaceOption
-from mereo.cli.positionals import AssetNames, DatasetFolder, SceneName, WeightsName
+from mereo.cli.options import AssetNames, DatasetFolder, Outcome, PlaceOption, SceneName, WeightsName
 from mereo.fitting.config import AnswerMethod
 from mereo.geometry.conventions import WorkspaceName
 from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Threads, Workers

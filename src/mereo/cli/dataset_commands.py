@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mereo.cli.positionals import DatasetFolder
+from mereo.cli.options import DatasetFolder
 
 
 @dataclass(frozen=True)

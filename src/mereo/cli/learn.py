@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from mereo.cli.config_file import ConfigFile
-from mereo.cli.positionals import ObjectFiles
+from mereo.cli.options import ObjectFiles
 from mereo.io.bounds import Count, NotNegative, Positive, Threads, Workers
 from mereo.io.cores import workers_for
 from mereo.workers.config import RayAddress, TaskResources, cluster_of

@@ -15,8 +15,7 @@ from mereo.api.objects import Object
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Result, registration_of
 from mereo.cli.explain import explain, print_sure, wish_of
-from mereo.cli.object_option import MeshUnits, check_named, files_read, loaded_object
-from mereo.cli.outcome import NOT_RECOGNIZED, Outcome
+from mereo.cli.options import NOT_RECOGNIZED, MeshUnits, Outcome, check_named, files_read, loaded_object
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried, Placed, place

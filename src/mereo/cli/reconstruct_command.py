@@ -7,9 +7,7 @@ from typing import Annotated
 from tyro.conf import UseAppendAction, arg
 
 from mereo.cli.config_file import ConfigFile, options_of
-from mereo.cli.object_option import MeshUnits
-from mereo.cli.outcome import Outcome
-from mereo.cli.positionals import Inputs
+from mereo.cli.options import Inputs, MeshUnits, Outcome
 from mereo.fitting.config import AnswerMethod
 from mereo.io.bounds import Cells, Threads
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
-from mereo.cli.positionals import ObjectFiles, SceneName, SceneNameOrNone
+from mereo.cli.options import ObjectFiles, SceneName, SceneNameOrNone
 from mereo.io.bounds import CountOrNone, States
 from mereo.synthesis.config import SENSORS, Sensor
 from mereo.synthesis.sequence_config import SequenceConfig

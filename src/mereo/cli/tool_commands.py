@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mereo.cli.object_option import MeshUnits
-from mereo.cli.positionals import InputName, ScanCloud, WeightsName
+from mereo.cli.options import InputName, MeshUnits, ScanCloud, WeightsName
 from mereo.fitting.tracking.config import StreamMethod
 from mereo.io.bounds import Cells, Count, CountOrNone, Positive, PositiveOrUnknown, Threads, Workers
 from mereo.io.config import InputConfig

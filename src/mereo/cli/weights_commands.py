@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mereo.cli.positionals import WeightsFiles, WeightsName
+from mereo.cli.options import WeightsFiles, WeightsName
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from mereo.cli.positionals import RepositoryName, WeightsName
+from mereo.cli.options import RepositoryName, WeightsName
 
 
 @dataclass(frozen=True)
