@@ -216,6 +216,31 @@ def test_closed_pipe_is_quiet() -> None:
     assert result.returncode == 128 + signal.SIGPIPE
 
 
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ("recontruct a.ply", ("recontruct", "reconstruct")),
+        ("assets", ("Missing subcommand", "{list, get}")),
+        ("learn lamp.stl", ("Missing from mereo learn", "--output")),
+        ("reconstruct a.ply --resoluton 64", ("--resoluton", "--resolution")),
+        ("train data --output run --batch x", ("--batch", "'x'")),
+        ("reconstruct a.ply --method mods", ("'mods'", "'modes'")),
+    ],
+)
+def test_arguments_that_mean_no_command_are_explained_in_a_box(
+    arguments: str, parts: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="^2$"):
+        command_line.main(arguments.split())
+    printed = capsys.readouterr()
+    assert not printed.out and all(part in printed.err for part in parts), printed.err
+
+
+def test_a_terminal_without_these_characters_is_no_error() -> None:
+    result = mereo("assets", "--help", PYTHONIOENCODING="ascii")
+    assert result.returncode == 0 and "? list" in result.stdout and result.stderr == ""
+
+
 # --- commands that need no weights ------------------------------------------------------------------------------------
 
 

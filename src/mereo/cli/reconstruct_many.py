@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from mereo.cli import outcome as command
+from mereo.cli import options as command
 from mereo.cli.reconstruct import FrameJob, outcome_of, reconstruct_file
 from mereo.cli.reconstruct_tasks import answer_in_tasks
 from mereo.cli.reconstruct_told import KNOWN, Told
