@@ -20,13 +20,9 @@ import tyro
 from tyro.conf import subcommand
 
 from mereo.api.words import option_words
-from mereo.cli import commands, dataset_commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
-from mereo.cli.calibrate import CalibrateCommand
+from mereo.cli import answers, scenes, tools, training, weights_group
 from mereo.cli.config_file import read_options, with_options
-from mereo.cli.learn import LearnCommand
 from mereo.cli.options import Outcome
-from mereo.cli.reconstruct_command import ReconstructCommand
-from mereo.cli.serve_command import ServeCommand
 from mereo.cli.view_command import ViewCommand
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import FreeCores, use_free_cores, use_threads
@@ -43,51 +39,51 @@ TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 """Environment variable that shows where an error comes from."""
 
 COMMANDS: dict[str, Any] = {
-    "demo": commands.Demo,
-    "doctor": commands.Doctor,
-    "learn": LearnCommand,
+    "demo": tools.Demo,
+    "doctor": tools.Doctor,
+    "learn": training.LearnCommand,
     "scene": (
         "List, write, check, draw, record or export scenes.",
         {
-            "list": scene_commands.SceneList,
-            "new": scene_commands.SceneNew,
-            "check": scene_commands.SceneCheck,
-            "preview": scene_commands.ScenePreview,
-            "modes": scene_commands.SceneModes,
-            "export": scene_commands.SceneExport,
-            "record": scene_commands.SceneRecord,
+            "list": scenes.SceneList,
+            "new": scenes.SceneNew,
+            "check": scenes.SceneCheck,
+            "preview": scenes.ScenePreview,
+            "modes": scenes.SceneModes,
+            "export": scenes.SceneExport,
+            "record": scenes.SceneRecord,
         },
     ),
     "assets": (
         "List or fetch downloadable meshes and scans.",
-        {"list": commands.AssetsList, "get": commands.AssetsGet},
+        {"list": scenes.AssetsList, "get": scenes.AssetsGet},
     ),
     "weights": (
         "List, show, publish or fetch weights.",
         {
-            "list": weights_commands.WeightsList,
-            "show": weights_commands.WeightsShow,
-            "push": weights_hub_commands.WeightsPush,
-            "pull": weights_hub_commands.WeightsPull,
+            "list": weights_group.WeightsList,
+            "show": weights_group.WeightsShow,
+            "push": weights_group.WeightsPush,
+            "pull": weights_group.WeightsPull,
         },
     ),
-    "generate": commands.Generate,
+    "generate": training.Generate,
     "dataset": (
         "Check or describe generated examples.",
-        {"check": dataset_commands.DatasetCheck, "show": dataset_commands.DatasetShow},
+        {"check": training.DatasetCheck, "show": training.DatasetShow},
     ),
-    "train": commands.Train,
-    "evaluate": commands.Evaluate,
-    "calibrate": CalibrateCommand,
-    "reconstruct": ReconstructCommand,
-    "align": tool_commands.Align,
+    "train": training.Train,
+    "evaluate": training.Evaluate,
+    "calibrate": weights_group.CalibrateCommand,
+    "reconstruct": answers.ReconstructCommand,
+    "align": tools.Align,
     "view": ViewCommand,
-    "stream": tool_commands.StreamCommand,
-    "serve": ServeCommand,
-    "export": commands.Export,
-    "experiment": tool_commands.Experiment,
-    "bench": tool_commands.BenchCommand,
-    "release": tool_commands.Release,
+    "stream": answers.StreamCommand,
+    "serve": answers.ServeCommand,
+    "export": training.Export,
+    "experiment": tools.Experiment,
+    "bench": tools.BenchCommand,
+    "release": weights_group.Release,
 }
 """Class of each command; a group of commands has a description and its own."""
 
@@ -95,18 +91,18 @@ CONFIGURABLE = ("generate", "train", "evaluate", "reconstruct", "learn")
 """Commands with the option --config."""
 
 ANSWERING = (
-    commands.Demo,
-    commands.Evaluate,
-    ReconstructCommand,
-    tool_commands.Align,
-    tool_commands.BenchCommand,
-    tool_commands.StreamCommand,
+    tools.Demo,
+    training.Evaluate,
+    answers.ReconstructCommand,
+    tools.Align,
+    tools.BenchCommand,
+    answers.StreamCommand,
     ViewCommand,
 )
 """Commands that compute on the cores that are free. Not what trains: it outlives what is busy as it starts, and the
 same command gives the same weights."""
 
-AS_JSON = (commands.Demo, commands.Evaluate, ReconstructCommand)
+AS_JSON = (tools.Demo, training.Evaluate, answers.ReconstructCommand)
 """Commands that leave an outcome, which ``--json`` prints; others print their own."""
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "bad_alloc")
@@ -121,7 +117,10 @@ USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 
 @runtime_checkable
 class Command(Protocol):
-    """Command that arguments are read into: a class of ``commands``, ``scene_commands`` or ``tool_commands``."""
+    """Command that arguments are read into: a dataclass, its fields the options.
+
+    ``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
+    """
 
     def run(self) -> Outcome | None:
         """Do the work, and print what a person wants to know of it."""
@@ -283,11 +282,11 @@ def parse(arguments: list[str]) -> Command:
     recipe = _chosen(PRESETS, "base", _option(arguments, "--preset"), options.get("preset"))
     sensor = _chosen(SENSORS, "paper", _option(arguments, "--sensor"), options.get("sensor"))
     starts = {
-        "generate": _start(commands.Generate, settings=GenerateConfig(sensor=sensor)),
-        "train": _start(commands.Train, config=recipe),
-        "evaluate": _start(commands.Evaluate, terms=sensor),
-        "reconstruct": _start(ReconstructCommand),
-        "learn": _start(LearnCommand),
+        "generate": _start(training.Generate, settings=GenerateConfig(sensor=sensor)),
+        "train": _start(training.Train, config=recipe),
+        "evaluate": _start(training.Evaluate, terms=sensor),
+        "reconstruct": _start(answers.ReconstructCommand),
+        "learn": _start(training.LearnCommand),
     }
     if options:
         starts[arguments[0]] = with_options(starts[arguments[0]], options, Path(path or ""))

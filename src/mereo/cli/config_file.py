@@ -51,14 +51,15 @@ def read_options(path: Path, command: str) -> dict[str, Any]:
     of = values.pop("command", command)
     if of != command:
         raise ValueError(f"{path} has options of `mereo {of}`, not of `mereo {command}`: use them with that command")
-    return dict(_flat(values))
+    return dict(flat_options(values))
 
 
-def _flat(values: dict[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat_options(values: dict[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Each option of nested groups with its value, its name like ``network.width``."""
     for key, value in values.items():
         name = prefix + str(key).removeprefix("--").replace("-", "_")
         if isinstance(value, dict):
-            yield from _flat(value, f"{name}.")
+            yield from flat_options(value, f"{name}.")
         else:
             yield name, value
 

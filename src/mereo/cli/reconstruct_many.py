@@ -13,9 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.cli import options as command
-from mereo.cli.reconstruct import FrameJob, outcome_of, reconstruct_file
+from mereo.cli.reconstruct import KNOWN, FrameJob, Told, outcome_of, reconstruct_file
 from mereo.cli.reconstruct_tasks import answer_in_tasks
-from mereo.cli.reconstruct_told import KNOWN, Told
 from mereo.io.config import InputConfig
 from mereo.io.output_folders import MARKER
 from mereo.io.progress import duration

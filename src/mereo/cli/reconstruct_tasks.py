@@ -15,8 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mereo.api.words import option_words
-from mereo.cli.reconstruct import FrameJob, answer_frame, print_segments, written
-from mereo.cli.reconstruct_told import Told
+from mereo.cli.reconstruct import FrameJob, Told, answer_frame, print_segments, written
 from mereo.io.output_folders import check_new_directory, new_directory
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.reconstruction.observation import FrameWarning
