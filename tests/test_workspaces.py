@@ -94,9 +94,9 @@ def test_evaluation_looks_from_the_workspace_and_says_so(tmp_path: Path) -> None
         evaluate_weights("rope", tmp_path / name, examples=1, cells=12, settings=settings, method="network")
     own, sphere = (read_metrics(tmp_path / name / "metrics.json") for name in ("own", "sphere"))
     assert (own["workspace"], sphere["workspace"]) == ("own", "sphere") and own["iou"] != sphere["iou"]
-    said = ", cameras all around the object, noise 0.1 units"
+    said = ", workspace sphere, noise 0.1 units"
     assert said in card("rope", load_model("rope"), [sphere], b"")
-    assert "cameras" not in card("rope", load_model("rope"), [own], b"").split("## Results")[-1]
+    assert "workspace sphere" not in card("rope", load_model("rope"), [own], b"").split("## Results")[-1]
 
 
 def test_the_command_line_names_workspaces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,7 @@ import tyro
 from tyro.conf import subcommand
 
 from mereo.api.words import option_words
-from mereo.cli import answers, scenes, tools, training, weights_group
+from mereo.cli import answers, scenes, tools, training, weights
 from mereo.cli.config_file import read_options, with_options
 from mereo.cli.options import Outcome
 from mereo.cli.view_command import ViewCommand
@@ -61,10 +61,10 @@ COMMANDS: dict[str, Any] = {
     "weights": (
         "List, show, publish or fetch weights.",
         {
-            "list": weights_group.WeightsList,
-            "show": weights_group.WeightsShow,
-            "push": weights_group.WeightsPush,
-            "pull": weights_group.WeightsPull,
+            "list": weights.WeightsList,
+            "show": weights.WeightsShow,
+            "push": weights.WeightsPush,
+            "pull": weights.WeightsPull,
         },
     ),
     "generate": training.Generate,
@@ -74,7 +74,7 @@ COMMANDS: dict[str, Any] = {
     ),
     "train": training.Train,
     "evaluate": training.Evaluate,
-    "calibrate": weights_group.CalibrateCommand,
+    "calibrate": weights.CalibrateCommand,
     "reconstruct": answers.ReconstructCommand,
     "align": tools.Align,
     "view": ViewCommand,
@@ -83,7 +83,7 @@ COMMANDS: dict[str, Any] = {
     "export": training.Export,
     "experiment": tools.Experiment,
     "bench": tools.BenchCommand,
-    "release": weights_group.Release,
+    "release": weights.Release,
 }
 """Class of each command; a group of commands has a description and its own."""
 
@@ -101,9 +101,6 @@ ANSWERING = (
 )
 """Commands that compute on the cores that are free. Not what trains: it outlives what is busy as it starts, and the
 same command gives the same weights."""
-
-AS_JSON = (tools.Demo, training.Evaluate, answers.ReconstructCommand)
-"""Commands that leave an outcome, which ``--json`` prints; others print their own."""
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "bad_alloc")
 """What torch and compiled libraries say where Python has a ``MemoryError``."""
@@ -164,7 +161,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run(command: Command) -> int:
     """Run a command, and return its exit status; with ``--json`` standard output gets one object and nothing else."""
-    as_json = isinstance(command, AS_JSON) and command.json
+    as_json = getattr(command, "json", False)
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         outcome = command.run()
     if outcome is None:
