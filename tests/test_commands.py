@@ -44,7 +44,6 @@ from mereo.training.config import PRESETS
                 "job": FrameJob("rope", reading=InputConfig(Path("k.json"), 5000.0, Path("m.png")), force=True),
             },
         ),
-        ("demo --output out", "mereo.cli.demo", "main", {"output": Path("out")}),
     ],
 )
 def test_command_calls_the_library_with_its_options(
@@ -59,7 +58,7 @@ def test_command_calls_the_library_with_its_options(
     library = import_module(module)
     signature = inspect.signature(getattr(library, function))
     calls: list[dict[str, object]] = []
-    returned = {"main": {}, "reconstruct_inputs": Outcome({})}.get(function)
+    returned = {"reconstruct_inputs": Outcome({})}.get(function)
 
     def called(*given: object, **named: object) -> object:
         calls.append(signature.bind(*given, **named).arguments)

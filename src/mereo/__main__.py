@@ -22,6 +22,8 @@ from tyro.conf import subcommand
 from mereo.api.words import option_words
 from mereo.cli import answers, scenes, tools, training, weights
 from mereo.cli.config_file import read_options, with_options
+from mereo.cli.demo import Demo
+from mereo.cli.doctor import Doctor
 from mereo.cli.options import Outcome
 from mereo.cli.view_command import ViewCommand
 from mereo.io.bounds import check_bounds
@@ -39,8 +41,8 @@ TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 """Environment variable that shows where an error comes from."""
 
 COMMANDS: dict[str, Any] = {
-    "demo": tools.Demo,
-    "doctor": tools.Doctor,
+    "demo": Demo,
+    "doctor": Doctor,
     "learn": training.LearnCommand,
     "scene": (
         "List, write, check, draw, record or export scenes.",
@@ -91,7 +93,7 @@ CONFIGURABLE = ("generate", "train", "evaluate", "reconstruct", "learn")
 """Commands with the option --config."""
 
 ANSWERING = (
-    tools.Demo,
+    Demo,
     training.Evaluate,
     answers.ReconstructCommand,
     tools.Align,

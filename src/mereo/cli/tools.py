@@ -1,4 +1,4 @@
-"""The commands for one tool each: align, experiment, bench, demo, doctor."""
+"""The commands for one tool each: align, experiment, bench."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from mereo.cli.options import Outcome, ScanCloud
+from mereo.cli.options import ScanCloud
 from mereo.io.bounds import Count, CountOrNone, PositiveOrUnknown, Threads, Workers
 from mereo.io.cores import workers_for
 from mereo.models.config import Device, Precision
@@ -215,33 +215,3 @@ class BenchCommand:
             self.output,
             self.force,
         )
-
-
-@dataclass(frozen=True)
-class Demo:
-    """Find an object in a real scan by its meshes; with the extra `network` also shipped frames, by network and fit.
-
-    Attributes:
-        output: folder for meshes, pictures and reports.
-        json: print one JSON object on standard output, of the scores, and all else on standard error.
-    """
-
-    output: Path = Path("out/demo")
-    json: bool = False
-
-    def run(self) -> Outcome:
-        """Reconstruct and print every input of the demo."""
-        from mereo.cli.demo import main
-
-        return Outcome(main(self.output))
-
-
-@dataclass(frozen=True)
-class Doctor:
-    """Show versions, device, CPU features and extras, and how to install what is missing."""
-
-    def run(self) -> None:
-        """Print what is installed and what this machine offers."""
-        from mereo.cli.doctor import diagnose
-
-        diagnose()
