@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 
 import mereo.__main__ as command_line
+from mereo.cli.answers import ReconstructCommand
 from mereo.cli.options import Outcome
 from mereo.cli.reconstruct import FrameJob
 from mereo.io.config import InputConfig
+from mereo.models.config import InferenceConfig
 from mereo.training.config import PRESETS
 
 
@@ -41,7 +43,16 @@ from mereo.training.config import PRESETS
             {
                 "inputs": (Path("a.png"),),
                 "output": Path("out"),
-                "job": FrameJob("rope", reading=InputConfig(Path("k.json"), 5000.0, Path("m.png")), force=True),
+                "job": FrameJob(
+                    ReconstructCommand(
+                        (Path("a.png"),),
+                        weights="rope",
+                        output=Path("out"),
+                        reading=InputConfig(Path("k.json"), 5000.0, Path("m.png")),
+                        force=True,
+                    ),
+                    InferenceConfig(),
+                ),
             },
         ),
     ],

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
-from mereo.cli.config_file import ConfigFile, options_of
+from mereo.cli.config_file import ConfigFile
 from mereo.cli.options import InputName, Inputs, MeshUnits, Outcome
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.tracking.config import StreamMethod
@@ -97,29 +97,12 @@ class ReconstructCommand:
         from mereo.cli.reconstruct_many import reconstruct_inputs
         from mereo.workers.cluster import joined_first
 
-        cluster = cluster_of(self.ray, self.threads, self.task)
-        inference = self.inference
+        cluster, inference = cluster_of(self.ray, self.threads, self.task), self.inference
         if cluster is not None and self.weights is not None:
             from mereo.models.elsewhere import for_tasks
 
             inference = for_tasks(inference, cluster)
-        job = FrameJob(
-            self.weights,
-            self.resolution,
-            self.reading,
-            self.isolation,
-            inference,
-            self.files,
-            self.method,
-            self.scene,
-            self.carry,
-            self.carry_frame,
-            self.force,
-            self.explain,
-            options_of(self, "reconstruct"),
-            looked_for=self.object,
-            units=self.units,
-        )
+        job = FrameJob(self, inference)
         with joined_first(cluster):
             return reconstruct_inputs(self.inputs, self.output or free_folder(), job, cluster)
 

@@ -56,7 +56,7 @@ def reconstruct_inputs(
         if cluster is not None:
             raise ValueError("--ray is for several frames, each of which is a task: name more, or leave it out")
         return outcome_of(reconstruct_file(inputs[0], output, job), output)
-    found = reconstruct_frames(list_frames(inputs, job.reading), output, job, cluster)
+    found = reconstruct_frames(list_frames(inputs, job.command.reading), output, job, cluster)
     frames = [{"output": str(one.folder), **one.told.summary} for one in found if one.told is not None]
     unknown = any(one.told is not None and one.told.known == KNOWN[False] for one in found)
     return command.Outcome({"output": str(output), "frames": frames}, command.NOT_RECOGNIZED if unknown else 0)

@@ -123,8 +123,8 @@ def answer_in_tasks(
     def frames() -> Iterator[Frame]:
         for path, folder in zip(files, folders, strict=True):
             try:
-                check_new_directory(folder, job.force, [path, *job.read])
-                yield Frame(path, path.absolute(), folder, read_frame(path, job.reading))
+                check_new_directory(folder, job.command.force, [path, *job.read])
+                yield Frame(path, path.absolute(), folder, read_frame(path, job.command.reading))
             except Exception as problem:
                 failed(path, problem)
                 lost.append(path)
@@ -154,7 +154,7 @@ def _written(frame: Frame, found: _Answered | Exception, job: FrameJob, failed: 
     for text in found.warned:
         warnings.warn(text, FrameWarning, stacklevel=2)
     try:
-        with new_directory(frame.folder, job.force, [frame.path, *job.read]) as directory:
+        with new_directory(frame.folder, job.command.force, [frame.path, *job.read]) as directory:
             for name, content in found.files.items():
                 (directory / name).parent.mkdir(parents=True, exist_ok=True)
                 (directory / name).write_bytes(content)

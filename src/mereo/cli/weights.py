@@ -73,7 +73,7 @@ class WeightsShow:
         from hashlib import sha256
 
         from mereo.models.weights_place import read_facts
-        from mereo.scenes.source_frame import SourceFrame
+        from mereo.scenes.scene import SourceFrame
 
         path, header = read_facts(self.weights)
         content, card = path.read_bytes(), path.with_suffix(".md")
