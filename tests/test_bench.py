@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mereo.cli import tool_commands
+from mereo.cli import tools
 from mereo.evaluation.sample_views import load_view
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.models.weights import load_model
@@ -155,7 +155,7 @@ def test_busy_processes_run_meanwhile_and_end() -> None:
 def test_bad_options_are_refused() -> None:
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match="torch sees no CUDA device"):
-            tool_commands.BenchCommand(device="cuda").run()
+            tools.BenchCommand(device="cuda").run()
 
 
 @pytest.mark.slow

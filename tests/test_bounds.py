@@ -8,7 +8,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import pytest
 
 import mereo.__main__ as command_line
-from mereo.cli import commands, scene_commands, tool_commands
+from mereo.cli import answers, scenes, tools, training
 from mereo.io.bounds import Bounds, check_values
 from mereo.io.config import InputConfig
 from mereo.models.config import PARTS, NetworkConfig
@@ -22,7 +22,7 @@ SETTINGS = (
 )
 COMMANDS = [
     found
-    for module in (commands, tool_commands, scene_commands)
+    for module in (answers, scenes, tools, training)
     for found in vars(module).values()
     if is_dataclass(found) and found.__module__ == module.__name__
 ]

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from mereo.cli import doctor
 from mereo.io import busy_machine
 from mereo.io.busy_machine import BusyWatch, describe_waiting
 
@@ -94,56 +93,6 @@ def extras_of_check(checkout: Path) -> str:
     """What ./check asks .ci/setup to install."""
     line = next(line for line in (checkout / "check").read_text().splitlines() if line.startswith("source .ci/setup"))
     return line.split("'")[1]
-
-
-def test_doctor_shows_policy_and_load(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv(VARIABLE, "passive")
-    monkeypatch.setattr(os, "getloadavg", lambda: (3.25, 0.0, 0.0), raising=False)
-    monkeypatch.setattr(os, "cpu_count", lambda: 4)
-    monkeypatch.setattr("torch.get_num_threads", lambda: 4)
-    doctor.diagnose()
-    report = capsys.readouterr().out.splitlines()
-    assert "wait policy    passive" in report
-    (load,) = (line for line in report if line.startswith("load "))
-    assert load.endswith(
-        " 3.2 on 4 cores, which is busy: commands that answer take 2 threads while it is so; "
-        + "OMP_NUM_THREADS=2 would help others, as all threads wait for the one that shares a core"
-    )
-
-
-def test_doctor_knows_no_load_where_the_system_has_none(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.delenv(VARIABLE, raising=False)
-    monkeypatch.delattr(os, "getloadavg", raising=False)
-    doctor.diagnose()
-    report = capsys.readouterr().out.splitlines()
-    assert "wait policy    not set" in report
-    assert not any(line.startswith("load ") for line in report)
-
-
-@pytest.mark.parametrize(
-    "load, there, threads, advised",
-    [
-        (0.9, 2, 2, None),  # more than half of the machine is free
-        (1.0, 2, 2, 1),
-        (2.9, 2, 2, 1),
-        (2.9, 2, 1, None),  # that many already
-        (3.0, 2, 2, 1),
-        (9.0, 2, 1, None),
-        (7.9, 16, 16, None),
-        (12.0, 16, 16, 8),  # fewer would give away more than the waiting costs
-        (12.0, 16, 4, None),
-    ],
-)
-def test_advice_is_as_many_threads_as_cores_are_free_but_half_of_them_at_least(
-    load: float, there: int, threads: int, advised: int | None
-) -> None:
-    said = doctor.describe_load(load, there, threads)
-    assert said.startswith(f"{load:.1f} on {there} cores")
-    assert ("OMP_NUM_THREADS" in said) == (advised is not None)
-    assert advised is None or f"OMP_NUM_THREADS={advised} would help" in said
-    assert ("crowded" in said) == (load == 9.0)
 
 
 # --- while it works ---------------------------------------------------------------------------------------------------

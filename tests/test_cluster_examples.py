@@ -18,7 +18,7 @@ import yaml
 from torch.distributed.run import get_args_parser
 
 import mereo.__main__ as command_line
-from mereo.cli.commands import Generate, Train
+from mereo.cli.training import Generate, Train
 from mereo.training.processes import SEPARATE
 
 FOLDER = Path(__file__).parents[1] / "examples" / "cluster"

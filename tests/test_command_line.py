@@ -11,8 +11,8 @@ from typing import get_args
 import pytest
 
 import mereo.__main__ as command_line
-from mereo.cli import commands
-from mereo.cli.reconstruct_command import ReconstructCommand
+from mereo.cli import training
+from mereo.cli.answers import ReconstructCommand
 from mereo.io.config import InputConfig
 from mereo.scenes.scene import SCENES
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
@@ -92,7 +92,7 @@ def test_generate_options_reach_the_settings() -> None:
         "--noise-std 0.2 --points 512 --sampler nested-sort-sample --oversample 2"
     )
     command = command_line.parse(text.split())
-    expected = commands.Generate(
+    expected = training.Generate(
         scene="rope",
         examples=7,
         output=Path("out"),
@@ -105,7 +105,7 @@ def test_generate_options_reach_the_settings() -> None:
             noise_std=0.2, points=512, sampling=SamplingConfig(sampler="nested-sort-sample", oversample=2)
         ),
     )
-    assert isinstance(command, commands.Generate) and vars(command) == vars(expected)
+    assert isinstance(command, training.Generate) and vars(command) == vars(expected)
     assert command_line.parse(["generate", "rope", "--examples", "7", "--output", "out"]).settings == GenerateConfig()  # type: ignore[union-attr]
 
 
@@ -113,7 +113,7 @@ def test_generate_options_reach_the_settings() -> None:
 @pytest.mark.parametrize("form", ["--preset {}", "--preset={}"])
 def test_preset_sets_every_default_of_train(preset: str, form: str) -> None:
     command = command_line.parse(f"train data --output run {form.format(preset)}".split())
-    assert isinstance(command, commands.Train)
+    assert isinstance(command, training.Train)
     assert command.config == PRESETS[preset]
 
 
@@ -126,7 +126,7 @@ def test_train_options_override_the_preset() -> None:
         "train data --epochs 2 --preset paper --network.width 64 --loss ce --network.no-encode-positions --output run"
     )
     command = command_line.parse(text.split())
-    assert isinstance(command, commands.Train)
+    assert isinstance(command, training.Train)
     assert (command.config.epochs, command.config.loss, command.config.network.decoder.width) == (2, "ce", 64)
     assert not command.config.network.decoder.encode_positions
     assert command.config.learning_rate == PRESETS["paper"].learning_rate
@@ -146,14 +146,14 @@ def test_reconstruct_options() -> None:
 
 
 def test_shard_text() -> None:
-    assert commands.part_of("0/1") == (0, 1)
-    assert commands.part_of("3/12") == (3, 12)
+    assert training.part_of("0/1") == (0, 1)
+    assert training.part_of("3/12") == (3, 12)
 
 
 @pytest.mark.parametrize("shard", ["4/4", "1", "/2", "-1/2", "a/b", "1/2/3", "0/0", ""])
 def test_wrong_shard_is_explained(shard: str) -> None:
     with pytest.raises(ValueError, match="it must be i/n with i from 0 to n - 1"):
-        commands.part_of(shard)
+        training.part_of(shard)
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
@@ -214,6 +214,31 @@ def test_closed_pipe_is_quiet() -> None:
     os.close(write)
     assert result.stderr == ""
     assert result.returncode == 128 + signal.SIGPIPE
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ("recontruct a.ply", ("recontruct", "reconstruct")),
+        ("assets", ("Missing subcommand", "{list, get}")),
+        ("learn lamp.stl", ("Missing from mereo learn", "--output")),
+        ("reconstruct a.ply --resoluton 64", ("--resoluton", "--resolution")),
+        ("train data --output run --batch x", ("--batch", "'x'")),
+        ("reconstruct a.ply --method mods", ("'mods'", "'modes'")),
+    ],
+)
+def test_arguments_that_mean_no_command_are_explained_in_a_box(
+    arguments: str, parts: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="^2$"):
+        command_line.main(arguments.split())
+    printed = capsys.readouterr()
+    assert not printed.out and all(part in printed.err for part in parts), printed.err
+
+
+def test_a_terminal_without_these_characters_is_no_error() -> None:
+    result = mereo("assets", "--help", PYTHONIOENCODING="ascii")
+    assert result.returncode == 0 and "? list" in result.stdout and result.stderr == ""
 
 
 # --- commands that need no weights ------------------------------------------------------------------------------------

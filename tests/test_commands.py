@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 
 import mereo.__main__ as command_line
-from mereo.cli.outcome import Outcome
+from mereo.cli.answers import ReconstructCommand
+from mereo.cli.options import Outcome
 from mereo.cli.reconstruct import FrameJob
 from mereo.io.config import InputConfig
+from mereo.models.config import InferenceConfig
 from mereo.training.config import PRESETS
 
 
@@ -41,10 +43,18 @@ from mereo.training.config import PRESETS
             {
                 "inputs": (Path("a.png"),),
                 "output": Path("out"),
-                "job": FrameJob("rope", reading=InputConfig(Path("k.json"), 5000.0, Path("m.png")), force=True),
+                "job": FrameJob(
+                    ReconstructCommand(
+                        (Path("a.png"),),
+                        weights="rope",
+                        output=Path("out"),
+                        reading=InputConfig(Path("k.json"), 5000.0, Path("m.png")),
+                        force=True,
+                    ),
+                    InferenceConfig(),
+                ),
             },
         ),
-        ("demo --output out", "mereo.cli.demo", "main", {"output": Path("out")}),
     ],
 )
 def test_command_calls_the_library_with_its_options(
@@ -59,7 +69,7 @@ def test_command_calls_the_library_with_its_options(
     library = import_module(module)
     signature = inspect.signature(getattr(library, function))
     calls: list[dict[str, object]] = []
-    returned = {"main": {}, "reconstruct_inputs": Outcome({})}.get(function)
+    returned = {"reconstruct_inputs": Outcome({})}.get(function)
 
     def called(*given: object, **named: object) -> object:
         calls.append(signature.bind(*given, **named).arguments)

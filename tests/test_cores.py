@@ -10,7 +10,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from mereo import __main__ as command_line
-from mereo.cli import commands
+from mereo.cli import training
 from mereo.io import cores
 from mereo.io.cores import THREAD_VARIABLES, FreeCores, one_blas_thread, threads_for, use_free_cores, workers_for
 
@@ -90,7 +90,7 @@ def test_commands_that_answer_take_free_cores_and_those_that_train_do_not(monkey
     chosen: list[object] = []
     monkeypatch.setattr(command_line, "use_free_cores", chosen.append)
     monkeypatch.setattr(command_line, "use_threads", chosen.append)
-    for command in (commands.Evaluate, commands.Train):
+    for command in (training.Evaluate, training.Train):
         monkeypatch.setattr(command, "run", lambda self: None)
     assert command_line.main(["train", "data", "--output", "out"]) == 0 and chosen == []
     assert command_line.main(["evaluate", "rope", "--output", "out"]) == 0
@@ -101,7 +101,7 @@ def test_commands_that_answer_take_free_cores_and_those_that_train_do_not(monkey
 THREADS = """
 import os, sys
 from mereo import __main__ as command_line
-from mereo.cli.commands import Train
+from mereo.cli.training import Train
 
 def show(self):
     import torch, threadpoolctl

@@ -11,7 +11,7 @@ from mereo.api.frames import load_frame
 from mereo.api.objects import Object
 from mereo.cli import demo
 from mereo.evaluation.cases import PICTURE_MARGIN, Evaluation, TestCase, grid_confusion
-from mereo.evaluation.ground_truth import TruthGrid, truth_grid
+from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union
 from mereo.evaluation.sample_views import DEPTH_STEP, load_view, make_view, save_view
 from mereo.evaluation.scoring import (
@@ -276,20 +276,18 @@ def test_the_demo_reconstructs_and_scores(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mesh = two_cuboids()
-
-    def case() -> demo.Case:
-        truth: TruthGrid = truth_grid(mesh, 20)
-        return demo.Case("cuboids", "two cuboids", Object(oracle(mesh)), load_frame(cloud()), truth)
-
+    case = "cuboids", "two cuboids", Object(oracle(mesh)), load_frame(cloud()), truth_grid(mesh, 20)
     monkeypatch.setattr(demo, "_inputs", lambda _: iter([case]))
     monkeypatch.setattr(demo, "RESOLUTION", 64)
-    demo.main(tmp_path)
+    scores = demo.Demo(tmp_path).run().facts["cuboids"]
+    assert min(scores["iou"], scores["miou"]) > 0.97, "but for the steps of the surfaces"
     out = capsys.readouterr().out
-    rows = [line.split("│") for line in out.splitlines() if line.count("│") > 2]
-    scores = [float(row[2]) for row in rows if "seconds" not in row[1]]
-    assert len(scores) == 4 and min(scores) > 0.97, "each segment, IoU and mIoU, but for the steps of the surfaces"
+    assert "mean of segments (mIoU)" in out and f"look at {tmp_path / 'cuboids/report.html'}" in out
     assert "mereo reconstruct cloud.ply --object PART.stl PART.stl --output result" in out
     assert (tmp_path / "cuboids/report.html").is_file()
+    (tmp_path / "cuboids/notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="notes.txt"):
+        demo.Demo(tmp_path).run()
 
 
 @pytest.mark.slow
@@ -300,7 +298,7 @@ def test_the_demo_itself_needs_no_assets(
         raise AssetUnavailable(f"{name} is not here")
 
     monkeypatch.setattr(assets, "get", missing)
-    demo.main(tmp_path)
+    demo.Demo(tmp_path).run()
     out = capsys.readouterr().out
     assert out.count("mIoU") >= 3 and "real range scan" in out
-    assert {path.parent.name for path in tmp_path.rglob("segments.glb")} == {"bun000", "liver", "rope"}
+    assert {path.parent.name for path in tmp_path.rglob("segments.glb")} == {"bun000-meshes", "bun000", "liver", "rope"}

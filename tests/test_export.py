@@ -15,7 +15,7 @@ import torch
 from exported import CASES, NAMES, model_of, seen
 
 from mereo.__main__ import parse
-from mereo.cli.commands import Export
+from mereo.cli.training import Export
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import PALETTE
 from mereo.models.export.mereo_onnx import main, prepare

@@ -12,7 +12,7 @@ from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
 from mereo.api.generate import generate
-from mereo.cli import commands
+from mereo.cli import training
 from mereo.geometry.surface_patches import without_strays
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis import examples
@@ -63,7 +63,7 @@ def test_all_are_those_that_differ_from_the_examples_own_sensor() -> None:
 
 def test_one_option_adds_them() -> None:
     command = command_line.parse(["generate", "rope", "--examples", "2", "--output", "out", "--observations", "all"])
-    assert isinstance(command, commands.Generate) and command.settings == GenerateConfig(observations=("all",))
+    assert isinstance(command, training.Generate) and command.settings == GenerateConfig(observations=("all",))
 
 
 def test_an_unknown_one_is_answered_with_the_known_ones() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mereo import __main__ as command_line
-from mereo.cli.positionals import METAVARS
+from mereo.cli.options import METAVARS
 
 QUICKSTART = Path(__file__).parents[1] / "docs/quickstart.md"
 FREE = ("{encoder-loss,",)

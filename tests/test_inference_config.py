@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from mereo import __main__ as command_line
+from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.device import BFLOAT16_PAYS, bfloat16_gain, find_device
@@ -44,7 +45,8 @@ def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None
 
 
 def test_results_say_where_they_were_computed(tmp_path: Path) -> None:
-    reconstruct_file(cloud_file(tmp_path), tmp_path / "out", FrameJob("bunny", 12, inference=CPU, method="network"))
+    options = ReconstructCommand((), weights="bunny", resolution=12, inference=CPU, method="network")
+    reconstruct_file(cloud_file(tmp_path), tmp_path / "out", FrameJob(options))
     facts = json.loads((tmp_path / "out/summary.json").read_text())
     assert (facts["device"], facts["precision"]) == ("cpu", "bfloat16")
 

@@ -9,7 +9,7 @@ from analytic import untrained
 from PIL import Image
 
 from mereo import __main__ as command_line
-from mereo.cli.modes import show_modes
+from mereo.cli.scenes import SceneModes
 from mereo.models.weights import save_model
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
@@ -46,15 +46,15 @@ def test_weights_show_the_model_that_they_carry(
 ) -> None:
     network = replace(untrained(model.rest.names), provenance={"scene": "rope"})
     save_model(replace(network, statistical_model=model), tmp_path / "with.safetensors")
-    show_modes(str(tmp_path / "with.safetensors"), None, 100)
+    SceneModes(str(tmp_path / "with.safetensors"), states=100).run()
     assert f"{model.count} modes" in capsys.readouterr().out
     save_model(network, tmp_path / "without.safetensors")
     with pytest.raises(ValueError, match="carries no statistical model: name the scene"):
-        show_modes(str(tmp_path / "without.safetensors"), None, 100)
+        SceneModes(str(tmp_path / "without.safetensors"), states=100).run()
 
 
 def test_bad_wishes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="fewer than 100 say little"):
-        show_modes("rope", None, 5)
+        SceneModes("rope", states=5).run()
     with pytest.raises(ValueError, match="the picture is a PNG file"):
-        show_modes("rope", tmp_path / "modes.jpg", 100)
+        SceneModes("rope", tmp_path / "modes.jpg", 100).run()

@@ -7,7 +7,7 @@ from typing import Any, get_args
 import pytest
 
 import mereo.__main__ as command_line
-from mereo.cli.commands import Train
+from mereo.cli.training import Train
 from mereo.models.config import PARTS, Encoder, NetworkConfig
 from mereo.training.config import PRESETS, TrainConfig
 

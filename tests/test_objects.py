@@ -12,7 +12,7 @@ from shapes import box
 
 import mereo
 from mereo import __main__ as command_line
-from mereo.cli.object_option import loaded_object
+from mereo.cli.options import loaded_object
 from mereo.evaluation.cases import grid_confusion, labels_on
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import intersection_over_union

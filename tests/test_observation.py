@@ -10,7 +10,7 @@ from camera_files import write_camera
 from PIL import Image
 
 from mereo import __main__ as command_line
-from mereo.cli.reconstruct_command import ReconstructCommand
+from mereo.cli.answers import ReconstructCommand
 from mereo.geometry.camera import Camera
 from mereo.io.config import InputConfig
 from mereo.io.readers import read_point_cloud

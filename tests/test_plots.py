@@ -9,7 +9,7 @@ from PIL import Image
 
 import mereo
 from mereo import __main__ as command_line
-from mereo.cli.modes import show_modes
+from mereo.cli.scenes import SceneModes
 from mereo.training.metrics_log import MetricsLog
 from mereo.visualization.viridis import TABLE, viridis
 
@@ -68,10 +68,10 @@ def test_modes_are_drawn_with_and_without_their_plot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
 ) -> None:
     weights = str(Path(mereo.__file__).parent / "weights" / "rope.safetensors")
-    show_modes(weights, tmp_path / "with.png", 100)
+    SceneModes(weights, tmp_path / "with.png", 100).run()
     assert "left out" not in capsys.readouterr().out
     request.getfixturevalue("no_matplotlib")
-    show_modes(weights, tmp_path / "without.png", 100)
+    SceneModes(weights, tmp_path / "without.png", 100).run()
     said = capsys.readouterr().out.splitlines()[-1]
     assert said == "its plot is left out, for matplotlib is not installed: pip install 'mereo[plots]'"
     whole, sheet = picture(tmp_path / "with.png"), picture(tmp_path / "without.png")

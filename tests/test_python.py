@@ -20,6 +20,7 @@ from toy_scene import toy_scene
 import mereo
 from mereo.api import reconstruct
 from mereo.api.result import SINGLE, Result
+from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.evaluation.cases import Evaluation
 from mereo.fitting.registration.registration import Located
@@ -72,7 +73,7 @@ def contents(folder: Path) -> dict[str, Any]:
             found[path.name] = {name: value for name, value in facts.items() if name not in ("timings_s", "weights")}
         elif path.name == "report.html":
             found[path.name] = re.sub(r'"timings_s": \{.*?\}|"weights": ".*?"', "", path.read_text())
-        elif path.name != MARKER:
+        elif path.name not in (MARKER, "config.json"):
             found[path.name] = path.read_bytes()
     return found
 
@@ -80,7 +81,9 @@ def contents(folder: Path) -> dict[str, Any]:
 def test_a_result_is_saved_as_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: MODEL)
-    reconstruct_file(tmp_path / "cloud.npy", tmp_path / "command", FrameJob("any", 24))
+    reconstruct_file(
+        tmp_path / "cloud.npy", tmp_path / "command", FrameJob(ReconstructCommand((), weights="any", resolution=24))
+    )
     found = mereo.reconstruct(tmp_path / "cloud.npy", MODEL, resolution=24)
     assert found.save(tmp_path / "python") == tmp_path / "python"
     ours, theirs = contents(tmp_path / "python"), contents(tmp_path / "command")

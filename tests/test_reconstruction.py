@@ -16,6 +16,7 @@ from answers import answer_to, reconstruct
 
 import mereo
 from mereo.api.result import Result
+from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.cli.stream import stream_reconstructions
 from mereo.fitting.registration.answer import Answer
@@ -165,12 +166,16 @@ def test_from_file_to_files(
     cloud, model = scene("camera")
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
     np.save(tmp_path / "cloud.npy", cloud)
-    found = reconstruct_file(tmp_path / "cloud.npy", tmp_path / "out", FrameJob("any", 16))
+    found = reconstruct_file(
+        tmp_path / "cloud.npy", tmp_path / "out", FrameJob(ReconstructCommand((), weights="any", resolution=16))
+    )
     assert summary_of(found)["segments"][0]["name"] == "big"
     assert (tmp_path / "out/report.html").is_file()
     assert "wrote" in capsys.readouterr().out
     with pytest.raises(FileExistsError):
-        reconstruct_file(tmp_path / "cloud.npy", tmp_path / "out", FrameJob("any", 16))
+        reconstruct_file(
+            tmp_path / "cloud.npy", tmp_path / "out", FrameJob(ReconstructCommand((), weights="any", resolution=16))
+        )
 
 
 def test_what_is_read_and_left_out_is_printed_and_kept(
@@ -181,12 +186,17 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
     read = partial(reconstruct_file, tmp_path / "cloud.npy")
-    job = FrameJob("any", 16, InputConfig(unit_m=1.0))
+    job = FrameJob(ReconstructCommand((), weights="any", resolution=16, reading=InputConfig(unit_m=1.0)))
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
         read(tmp_path / "crowded", job)
     assert "strays:" not in capsys.readouterr().out, "it is a surface: nothing says that it is not the object"
     with pytest.warns(SizeWarning, match="the visible part is 0.1[0-9]* m long"):
-        read(tmp_path / "alone", replace(job, isolation=IsolationConfig(largest_cluster=True, cluster_gap=0.02)))
+        read(
+            tmp_path / "alone",
+            replace(
+                job, command=replace(job.command, isolation=IsolationConfig(largest_cluster=True, cluster_gap=0.02))
+            ),
+        )
     assert "largest cluster: 1200 of 1800 points kept (1 of 2 clusters" in capsys.readouterr().out
     summary = json.loads((tmp_path / "alone/summary.json").read_text())
     assert summary["points"] == 1200 and summary["isolation"][-1]["name"] == "largest cluster"
@@ -211,7 +221,7 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
         "mereo.models.weights.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]})
     )
     read = partial(reconstruct_file, tmp_path / "cloud.npy")
-    job = FrameJob("any", 16, InputConfig(unit_m=1.0))
+    job = FrameJob(ReconstructCommand((), weights="any", resolution=16, reading=InputConfig(unit_m=1.0)))
     result = read(tmp_path / "out", job).reconstruction
     said = capsys.readouterr().out
     assert "strays: 30 of 1230 points dropped, the longest side was" in said and "(--keep-all keeps them)" in said
@@ -221,7 +231,7 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     assert (step["name"], step["before"], step["kept"]) == ("strays", 1230, 1200)
     np.testing.assert_array_equal(result.labels.labels, reconstruct(own, model, resolution=16).labels.labels)
     with pytest.warns(SizeWarning, match="the visible part is 0.[5-9][0-9]* m long"):
-        read(tmp_path / "all", replace(job, isolation=IsolationConfig(keep_all=True)))
+        read(tmp_path / "all", replace(job, command=replace(job.command, isolation=IsolationConfig(keep_all=True))))
     assert "strays:" not in capsys.readouterr().out
     assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
 
@@ -252,7 +262,11 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     save_model(untrained(NAMES), tmp_path / "w.safetensors")
     np.save(tmp_path / "cloud.npy", scene("camera")[0][:5])
     with pytest.raises(ValueError, match="the cloud has 5 points; a reconstruction needs at least 32"):
-        reconstruct_file(tmp_path / "cloud.npy", tmp_path / "deep/out", FrameJob(tmp_path / "w.safetensors"))
+        reconstruct_file(
+            tmp_path / "cloud.npy",
+            tmp_path / "deep/out",
+            FrameJob(ReconstructCommand((), weights=str(tmp_path / "w.safetensors"))),
+        )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.npy", "w.safetensors"]
 
 

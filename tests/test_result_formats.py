@@ -13,7 +13,7 @@ from answers import answer_to
 
 from mereo.__main__ import main, parse
 from mereo.api.result import Result
-from mereo.cli.reconstruct_command import ReconstructCommand
+from mereo.cli.answers import ReconstructCommand
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.mesh import PALETTE
 from mereo.io.config import FilesConfig

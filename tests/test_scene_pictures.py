@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from toy_scene import toy_scene
 
-from mereo.cli.scene_commands import ScenePreview
+from mereo.cli.scenes import ScenePreview
 from mereo.scenes.scene import SCENES, Scene
 from mereo.visualization import previews
 from mereo.visualization.previews import TILE_PX, preview_all, scene_row

@@ -11,7 +11,7 @@ from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
 from mereo.api.generate import generate
-from mereo.cli import commands
+from mereo.cli import training
 from mereo.evaluation.scoring import EvaluationConfig
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
@@ -25,7 +25,7 @@ BASICS = "generate rope --examples 7 --output out"
 
 def generate_options(text: str) -> GenerateConfig:
     command = command_line.parse(f"{BASICS} {text}".split())
-    assert isinstance(command, commands.Generate)
+    assert isinstance(command, training.Generate)
     return command.settings
 
 
@@ -34,7 +34,7 @@ def generate_options(text: str) -> GenerateConfig:
 def test_one_option_chooses_a_sensor(name: Sensor, form: str) -> None:
     assert generate_options(form.format(name)) == GenerateConfig(sensor=SENSORS[name])
     command = command_line.parse(f"evaluate rope --output out {form.format(name)}".split())
-    assert isinstance(command, commands.Evaluate) and command.terms == SENSORS[name]
+    assert isinstance(command, training.Evaluate) and command.terms == SENSORS[name]
     assert SENSORS[name].on == (name != "paper")
 
 
@@ -52,9 +52,11 @@ def test_every_term_is_off_by_default_and_switches_the_sensor_on() -> None:
     assert all(replace(SensorConfig(), **{name: 0.1}).on for name in SENSOR_TERMS)
 
 
-def test_an_unknown_sensor_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="--sensor is 'lidar'; it must be one of paper, .*, time-of-flight"):
+def test_an_unknown_sensor_is_answered_with_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="^2$"):
         command_line.parse(f"{BASICS} --sensor lidar".split())
+    printed = capsys.readouterr().err
+    assert "invalid choice 'lidar'" in printed and "'time-of-flight'" in printed
 
 
 def test_a_bad_strength_is_refused_before_anything_is_written(

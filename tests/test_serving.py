@@ -19,6 +19,7 @@ from PIL import Image
 from serving_parts import ADDRESS, CLOUD, NPY, balls, figures, npy, run, running
 
 import mereo
+from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.evaluation.sample_views import load_view
 from mereo.io.config import InputConfig
@@ -44,7 +45,8 @@ def rope_only(rope: Model, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: replace(balls(), name="balls"))
     np.save(tmp_path / "frame.npy", CLOUD)
-    reconstruct_file(tmp_path / "frame.npy", tmp_path / "out", FrameJob("any", 12, inference=EXACT, method="network"))
+    options = ReconstructCommand((), weights="any", resolution=12, inference=EXACT, method="network")
+    reconstruct_file(tmp_path / "frame.npy", tmp_path / "out", FrameJob(options))
     expected = figures((tmp_path / "out/summary.json").read_bytes())
 
     async def ask() -> None:

@@ -23,7 +23,7 @@ pytest.importorskip("python_multipart", reason="python-multipart (extra `serve`)
 import uvicorn
 from serving_parts import ADDRESS, CLOUD, Server, ThreadWorker, balls, figures, npy, run, running, setup, until
 
-from mereo.cli.serve_command import ServeCommand
+from mereo.cli.answers import ServeCommand
 from mereo.visualization.viewer.guard import bound_socket
 from mereo_serving.answering import Answerer
 from mereo_serving.config import ServeConfig
@@ -279,7 +279,7 @@ def test_weights_that_cannot_be_served_are_a_sentence(weights: Any, scenes: Any,
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.cli.serve_command.find_spec", lambda name: None)
+    monkeypatch.setattr("mereo.cli.answers.find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"fastapi is not installed; .* run pip install 'mereo\[serve\]'"):
         ServeCommand(weights=("bunny",)).run()
 

@@ -14,7 +14,7 @@ import pytest
 from safetensors.numpy import load_file
 
 import mereo.__main__ as command_line
-from mereo.cli.stop_signals import STOPPING, Stopped, stop_signals
+from mereo.__main__ import STOPPING, Stopped, stop_signals
 from mereo.cli.stream import stream_reconstructions
 from mereo.io.atomic_files import atomic_file
 

@@ -12,7 +12,7 @@ from toy_scene import toy_scene
 import mereo
 from mereo.__main__ import main, parse
 from mereo.api.generate import generate
-from mereo.cli.commands import Generate, Train
+from mereo.cli.training import Generate, Train
 from mereo.io.object_cache import CACHE_VARIABLE
 from mereo.io.object_storage import ObjectPath, StorageError
 from mereo.io.places import names_in, write_whole

@@ -13,7 +13,7 @@ from scene_files import write_bar
 
 import mereo
 from mereo import __main__ as command_line
-from mereo.cli.object_option import loaded_object
+from mereo.cli.options import loaded_object
 from mereo.learning import learn as learning
 from mereo.learning import search_stage
 from mereo.learning import search_stage as scoring

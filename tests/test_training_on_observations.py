@@ -19,7 +19,6 @@ from mereo.training.batches import Batch, Draws, draw_observations
 from mereo.training.config import PRESETS, AugmentConfig
 from mereo.training.dataset import Dataset
 from mereo.training.metrics_log import FIELDS, SENSOR_FIELDS
-from mereo.training.model_card import card
 from mereo.training.run_directory import fit_config
 from mereo.training.validation import choose_offsets, held_out, validate
 
@@ -151,16 +150,6 @@ def test_an_autodecoder_sees_every_example_as_it_is(data: tuple[Dataset, Dataset
     assert fit_config(PRESETS["paper-autodecoder"], data[1]).augment.observations == 0.0
     assert fit_config(PRESETS["paper"], data[1]).augment.observations == 0.5
     assert fit_config(PRESETS["paper"], data[0]).augment.observations == 0.0
-
-
-def test_the_card_says_which_observations_were_seen(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    model = load_model(trainer.train(folders[1], tmp_path / "run", replace(SMALL, epochs=0.2)))
-    data = {"observations": ["tool", "mask"], "noise_std": 0.1}
-    model = replace(model, provenance={**model.provenance, "data": data})
-    assert "- observations: in 50 % of its turns an example is seen by one of tool, mask instead" in card(
-        "toy", model, [], b""
-    )
-    assert "- observations" not in card("toy", replace(model, provenance={"data": {"noise_std": 0.1}}), [], b"")
 
 
 def test_a_shard_whose_observations_are_cut_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:

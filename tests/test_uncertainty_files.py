@@ -15,6 +15,7 @@ import trimesh
 from answers import answer_to
 from scipy.spatial import cKDTree
 
+from mereo.cli.answers import ReconstructCommand
 from mereo.cli.explain import explain, wish_of
 from mereo.cli.reconstruct import FrameJob
 from mereo.cli.stream import line
@@ -286,5 +287,5 @@ def test_what_cannot_be_explained_is_said_in_one_sentence(cloud: PointCloud, tmp
     with pytest.raises(ValueError, match="--explain needs a registration, whose fit is explained"):
         explain(None, ["liver"], tmp_path, cloud.points, 1.0, Unit(1.0))
     with pytest.raises(ValueError, match="--method is network, but --explain needs a registration"):
-        FrameJob("liver", method="network", explain=("liver",)).check()
+        FrameJob(ReconstructCommand((), weights="liver", method="network", explain=("liver",))).check()
     assert not any(tmp_path.iterdir())

@@ -11,7 +11,7 @@ from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
 from mereo.api.generate import generate
-from mereo.cli import commands
+from mereo.cli import training
 from mereo.evaluation.scoring import EvaluationConfig
 from mereo.evaluation.tables import read_metrics
 from mereo.models.weights import load_model
@@ -96,19 +96,20 @@ def test_evaluation_looks_from_the_workspace_and_says_so(tmp_path: Path) -> None
         evaluate_weights("rope", tmp_path / name, config)
     own, sphere = (read_metrics(tmp_path / name / "metrics.json") for name in ("own", "sphere"))
     assert (own["workspace"], sphere["workspace"]) == ("own", "sphere") and own["iou"] != sphere["iou"]
-    said = ", cameras all around the object, noise 0.1 units"
+    said = ", workspace sphere, noise 0.1 units"
     assert said in card("rope", load_model("rope"), [sphere], b"")
-    assert "cameras" not in card("rope", load_model("rope"), [own], b"").split("## Results")[-1]
+    assert "workspace sphere" not in card("rope", load_model("rope"), [own], b"").split("## Results")[-1]
 
 
 def test_the_command_line_names_workspaces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["rope", "--output", "out", "--workspace"]
     made = command_line.parse(["generate", "--examples", "7", *options, "sphere"])
     scored = command_line.parse(["evaluate", *options, "cone"])
-    assert isinstance(made, commands.Generate) and made.settings.workspace == "sphere"
-    assert isinstance(scored, commands.Evaluate) and scored.workspace == "cone"
-    with pytest.raises(ValueError, match="--workspace is 'dome'; it must be one of own, cone, sphere"):
+    assert isinstance(made, training.Generate) and made.settings.workspace == "sphere"
+    assert isinstance(scored, training.Evaluate) and scored.workspace == "cone"
+    with pytest.raises(SystemExit, match="^2$"):
         command_line.parse(["evaluate", *options, "dome"])
+    assert "invalid choice 'dome' for argument '--workspace'" in capsys.readouterr().err
     settings = GenerateConfig()
     object.__setattr__(settings, "workspace", "dome")  # as where types are not checked
     with pytest.raises(ValueError, match="workspace is 'dome'; it must be one of own, cone, sphere: give"):

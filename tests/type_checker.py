@@ -17,6 +17,8 @@ _made: dict[tuple[object, ...], Any] = {}
 
 def check(function: Callable[..., Any]) -> Any:
     """A function with its arguments and result checked; for one within another, as it was made the first time."""
+    if function.__module__.startswith("mereo.cli.") and function.__name__ == "__init__":
+        return function  # of a command, whose required options are tyro.MISSING before it is parsed
     if "<locals>" not in function.__qualname__ or function.__code__.co_filename != "<string>":
         return CHECKED(function)  # not one that jaxtyping has made
     code, annotations = function.__code__, tuple(function.__annotations__.items())

@@ -3,37 +3,34 @@
 import importlib.metadata
 import io
 import os
+import signal
 import sys
+import threading
 import time
 import warnings
-from collections.abc import Mapping
-from contextlib import nullcontext, redirect_stderr, redirect_stdout, suppress
-from dataclasses import field, make_dataclass
-from functools import cache
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
+from dataclasses import MISSING, fields
 from itertools import pairwise
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 
 import tyro
 from tyro.conf import subcommand
 
 from mereo.api.words import option_words
-from mereo.cli import commands, dataset_commands, scene_commands, tool_commands, weights_commands, weights_hub_commands
-from mereo.cli.calibrate import CalibrateCommand
-from mereo.cli.config_file import GivenOptions, defaults_from, read_options
-from mereo.cli.last_resort import sentence
-from mereo.cli.learn import LearnCommand
-from mereo.cli.outcome import Outcome
-from mereo.cli.reconstruct_command import ReconstructCommand
-from mereo.cli.serve_command import ServeCommand
-from mereo.cli.stop_signals import Stopped, stop_signals
-from mereo.cli.usage import noted_events, usage_sentence
+from mereo.cli import answers, scenes, tools, training, weights
+from mereo.cli.config_file import read_options, with_options
+from mereo.cli.demo import Demo
+from mereo.cli.doctor import Doctor
+from mereo.cli.options import Outcome
 from mereo.cli.view_command import ViewCommand
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import FreeCores, use_free_cores, use_threads
 from mereo.io.foreseen import is_foreseen, printable_line, words_of
-from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
-from mereo.training.config import PRESETS, TrainConfig
+from mereo.synthesis.config import SENSORS, GenerateConfig
+from mereo.training.config import PRESETS
 
 Choice = TypeVar("Choice")
 
@@ -43,23 +40,75 @@ BEGUN, BRIEF_S = FreeCores(), 5.0
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 """Environment variable that shows where an error comes from."""
 
+COMMANDS: dict[str, Any] = {
+    "demo": Demo,
+    "doctor": Doctor,
+    "learn": training.LearnCommand,
+    "scene": (
+        "List, write, check, draw, record or export scenes.",
+        {
+            "list": scenes.SceneList,
+            "new": scenes.SceneNew,
+            "check": scenes.SceneCheck,
+            "preview": scenes.ScenePreview,
+            "modes": scenes.SceneModes,
+            "export": scenes.SceneExport,
+            "record": scenes.SceneRecord,
+        },
+    ),
+    "assets": (
+        "List or fetch downloadable meshes and scans.",
+        {"list": scenes.AssetsList, "get": scenes.AssetsGet},
+    ),
+    "weights": (
+        "List, show, publish or fetch weights.",
+        {
+            "list": weights.WeightsList,
+            "show": weights.WeightsShow,
+            "push": weights.WeightsPush,
+            "pull": weights.WeightsPull,
+        },
+    ),
+    "generate": training.Generate,
+    "dataset": (
+        "Check or describe generated examples.",
+        {"check": training.DatasetCheck, "show": training.DatasetShow},
+    ),
+    "train": training.Train,
+    "evaluate": training.Evaluate,
+    "calibrate": weights.CalibrateCommand,
+    "reconstruct": answers.ReconstructCommand,
+    "align": tools.Align,
+    "view": ViewCommand,
+    "stream": answers.StreamCommand,
+    "serve": answers.ServeCommand,
+    "export": training.Export,
+    "experiment": tools.Experiment,
+    "bench": tools.BenchCommand,
+    "release": weights.Release,
+}
+"""Class of each command; a group of commands has a description and its own."""
+
 CONFIGURABLE = ("generate", "train", "evaluate", "reconstruct", "learn")
 """Commands with the option --config."""
 
 ANSWERING = (
-    commands.Demo,
-    commands.Evaluate,
-    ReconstructCommand,
-    tool_commands.Align,
-    tool_commands.BenchCommand,
-    tool_commands.StreamCommand,
+    Demo,
+    training.Evaluate,
+    answers.ReconstructCommand,
+    tools.Align,
+    tools.BenchCommand,
+    answers.StreamCommand,
     ViewCommand,
 )
 """Commands that compute on the cores that are free. Not what trains: it outlives what is busy as it starts, and the
 same command gives the same weights."""
 
-AS_JSON = (commands.Demo, commands.Evaluate, ReconstructCommand)
-"""Commands that leave an outcome, which ``--json`` prints; others print their own."""
+NO_MEMORY = ("out of memory", "can't allocate memory", "bad_alloc")
+"""What torch and compiled libraries say where Python has a ``MemoryError``."""
+
+STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Signals by which systems, job schedulers (TERM) and closed terminals (HUP) end a program; Windows has no HUP."""
 
 USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 """Exit codes; 70 is EX_SOFTWARE of sysexits.h, the last two are 128 plus the signal's number, as shells report them."""
@@ -67,7 +116,10 @@ USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 
 @runtime_checkable
 class Command(Protocol):
-    """Command that arguments are read into: a class of ``commands``, ``scene_commands`` or ``tool_commands``."""
+    """Command that arguments are read into: a dataclass, its fields the options.
+
+    ``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
+    """
 
     def run(self) -> Outcome | None:
         """Do the work, and print what a person wants to know of it."""
@@ -105,13 +157,13 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         if is_foreseen(error):
             return _stop(f"mereo: error: {words_of(error)}", USER_ERROR)
-        return _stop(f"mereo: error: {sentence(error, arguments, TRACEBACK_VARIABLE)}", FAULT)
+        return _stop(f"mereo: error: {fault_sentence(error, arguments)}", FAULT)
     return status
 
 
 def _run(command: Command) -> int:
     """Run a command, and return its exit status; with ``--json`` standard output gets one object and nothing else."""
-    as_json = isinstance(command, AS_JSON) and command.json
+    as_json = getattr(command, "json", False)
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         outcome = command.run()
     if outcome is None:
@@ -142,141 +194,153 @@ def _stop(message: str, code: int) -> int:
     return code
 
 
-def parse(arguments: list[str]) -> Command:
-    """Command that these arguments mean; exits with 0 after a help that they ask for.
+# --- how a command ends before its end --------------------------------------------------------------------------------
 
-    Raises ``ValueError`` for arguments that mean none, and for settings that are refused, such as a number out of its
-    bounds.
+
+class Stopped(KeyboardInterrupt):
+    """End by a signal other than Ctrl-C's, which everything that knows Ctrl-C takes as that.
+
+    Attributes:
+        signal: which one.
     """
-    said = io.StringIO()
-    with noted_events() as events:
-        try:
-            with redirect_stderr(said):
-                command = _read(arguments)
-        except SystemExit as end:
-            if not end.code:
-                raise
-            refused = end.__context__
-            while refused is not None and not (isinstance(refused, ValueError) and is_foreseen(refused)):
-                refused = refused.__context__
-            if refused is None:
-                refused = ValueError(usage_sentence(arguments, events, said.getvalue(), _help))
-            raise refused from None  # tyro frames what it says; the sentence is enough by itself
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.signal = signal.Signals(number)
+
+
+@contextmanager
+def stop_signals() -> Iterator[None]:
+    """Raise ``Stopped`` in the block where a signal asks for the end; once, so that a second cuts no cleaning short.
+
+    A signal that is ignored stays so (``nohup``). Outside the main thread, where Python sets no handlers, nothing
+    changes; nor do processes that are started meanwhile inherit anything.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in STOPPING}
+    taken = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+
+    def stop(number: int, _: FrameType | None) -> None:
+        for each in taken:
+            signal.signal(each, signal.SIG_IGN)
+        raise Stopped(number)
+
+    for number in taken:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in taken.items():
+            signal.signal(number, handler)
+
+
+def fault_sentence(error: Exception, arguments: list[str]) -> str:
+    """Line about what no part of mereo has foreseen: the command, its files, the error, and what to do."""
+    what = words_of(error)
+    where = f"{_command(arguments)}: {what}"
+    if isinstance(error, MemoryError) or any(words in what.lower() for words in NO_MEMORY):
+        return f"{where}; the memory does not suffice: ask for less (resolution, points, batch, workers) or free some"
+    if isinstance(error, RecursionError):
+        return f"{where}; something is nested too deeply, or in itself: look into the files that are named"
+    whose = "mereo, or of the Python file" if any(word.endswith(".py") for word in arguments) else "mereo"
+    return (
+        f"{where}; this is a fault of {whose}: run it again with {TRACEBACK_VARIABLE}=1, and report the text that it "
+        "prints"
+    )
+
+
+def _command(arguments: list[str]) -> str:
+    """Names of the command and of the existing files among its arguments: ``mereo align on scan.ply``."""
+    words = next((n for n, word in enumerate(arguments) if not word.isalpha()), len(arguments))
+    named = arguments[:1] if words < 2 or not isinstance(COMMANDS.get(arguments[0]), tuple) else arguments[:2]
+    values = [word.partition("=")[2] if word.startswith("--") else word for word in arguments[len(named) :]]
+    files = [value for value in values if value and _is_there(value)]
+    return " ".join(["mereo", *named, *(["on", ", ".join(files)] if files else [])])
+
+
+def _is_there(value: str) -> bool:
+    try:
+        return Path(value).exists()
+    except (OSError, ValueError):  # a name that is too long, or has a zero in it
+        return False
+
+
+# --- from arguments to a command --------------------------------------------------------------------------------------
+
+
+def parse(arguments: list[str]) -> Command:
+    """Command that these arguments mean; exits with 0 after a help that they ask for, with 2 where they mean none.
+
+    Raises ``ValueError`` for settings that are refused, such as a number out of its bounds.
+    """
+    path, options = _option(arguments, "--config"), dict[str, Any]()
+    if path is not None and arguments[0] in CONFIGURABLE:
+        options = read_options(Path(path), arguments[0])
+    recipe = _chosen(PRESETS, "base", _option(arguments, "--preset"), options.get("preset"))
+    sensor = _chosen(SENSORS, "paper", _option(arguments, "--sensor"), options.get("sensor"))
+    starts = {
+        "generate": _start(training.Generate, settings=GenerateConfig(sensor=sensor)),
+        "train": _start(training.Train, config=recipe),
+        "evaluate": _start(training.Evaluate, terms=sensor),
+        "reconstruct": _start(answers.ReconstructCommand),
+        "learn": _start(training.LearnCommand),
+    }
+    if options:
+        starts[arguments[0]] = with_options(starts[arguments[0]], options, Path(path or ""))
+    box = io.StringIO()
+    try:
+        with redirect_stderr(box):
+            command: Command = tyro.cli(
+                _syntax(COMMANDS, starts),
+                args=arguments or ["--help"],
+                prog="mereo",
+                description="Reconstruct deformable objects with all their segments from one depth image or point "
+                "cloud. `mereo COMMAND --help` explains a command, `mereo --version` prints the version.",
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as end:
+        error = end.__context__
+        while error is not None and not (isinstance(error, ValueError) and is_foreseen(error)):
+            error = error.__context__
+        if error is not None:  # of settings, which is enough by itself
+            raise error from None
+        print(box.getvalue(), end="", file=sys.stderr)
+        raise
     check_bounds(command, "--")
     return command
 
 
-@cache
-def _help(*words: str) -> str:
-    """Help on the command of these words."""
-    said = io.StringIO()
-    with redirect_stdout(said), suppress(SystemExit):
-        _read([*words, "--help"])
-    return said.getvalue()
+def _syntax(members: Mapping[str, Any], starts: Mapping[str, Any]) -> Any:
+    """Commands, or those of a group, as a type that tyro reads; some start from other defaults than their class's."""
+    kinds = list[Any]()
+    for name, member in members.items():
+        if isinstance(member, tuple):
+            description, group = member
+            kinds.append(Annotated[_syntax(group, {}), subcommand(name, description=description)])
+        else:
+            default = {"default": starts[name]} if name in starts else {}
+            kinds.append(Annotated[member, subcommand(name, **default)])
+    return Union[*kinds]
 
 
-def _read(arguments: list[str]) -> Command:
-    """Command that tyro makes of these arguments, which exits where it cannot."""
-    given = _options_from(arguments)
-    recipe = _chosen(arguments, "--preset", PRESETS, (given and given.choice("preset")) or "base")
-    sensor = _chosen(arguments, "--sensor", SENSORS, (given and given.choice("sensor")) or "paper")
-    command: Command = tyro.cli(
-        _syntax(recipe, sensor, given),
-        args=arguments or ["--help"],
-        prog="mereo",
-        description="Reconstruct deformable objects with all their segments from one depth image or point cloud. "
-        "`mereo COMMAND --help` explains a command, `mereo --version` prints the version.",
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
-    return command
+def _start(command: type, **settings: Any) -> Any:
+    """Command with these settings, its other defaults, and nothing where there are none."""
+    required = [item.name for item in fields(command) if item.default is item.default_factory is MISSING]
+    return command(**dict.fromkeys(required, tyro.MISSING), **settings)
 
 
-def _syntax(recipe: TrainConfig, sensor: SensorConfig, given: GivenOptions | None) -> Any:
-    """All commands as a type that tyro reads.
-
-    ``train`` starts from this recipe, what renders from this sensor, and the command of a file of options from that.
-    """
-
-    def starting(command: type, name: str, **defaults: Any) -> Any:
-        own = given if given is not None and given.command == name else None
-        return Annotated[_starting(command, own, defaults), subcommand(name)]
-
-    scene = (
-        (scene_commands.SceneList, "list"),
-        (scene_commands.SceneNew, "new"),
-        (scene_commands.SceneCheck, "check"),
-        (scene_commands.ScenePreview, "preview"),
-        (scene_commands.SceneModes, "modes"),
-        (scene_commands.SceneExport, "export"),
-        (scene_commands.SceneRecord, "record"),
-    )
-    weights = (
-        (weights_commands.WeightsList, "list"),
-        (weights_commands.WeightsShow, "show"),
-        (weights_hub_commands.WeightsPush, "push"),
-        (weights_hub_commands.WeightsPull, "pull"),
-    )
-    datasets = (dataset_commands.DatasetCheck, "check"), (dataset_commands.DatasetShow, "show")
-    assets = (commands.AssetsList, "list"), (commands.AssetsGet, "get")
-    return (
-        Annotated[commands.Demo, subcommand("demo")]
-        | Annotated[commands.Doctor, subcommand("doctor")]
-        | starting(LearnCommand, "learn")
-        | Annotated[
-            _group(scene), subcommand("scene", description="List, write, check, draw, record or export scenes.")
-        ]
-        | Annotated[_group(assets), subcommand("assets", description="List or fetch downloadable meshes and scans.")]
-        | Annotated[_group(weights), subcommand("weights", description="List, show, publish or fetch weights.")]
-        | starting(commands.Generate, "generate", settings=GenerateConfig(sensor=sensor))
-        | Annotated[_group(datasets), subcommand("dataset", description="Check or describe generated examples.")]
-        | starting(commands.Train, "train", config=recipe)
-        | starting(commands.Evaluate, "evaluate", terms=sensor)
-        | Annotated[CalibrateCommand, subcommand("calibrate")]
-        | starting(ReconstructCommand, "reconstruct")
-        | Annotated[tool_commands.Align, subcommand("align")]
-        | Annotated[ViewCommand, subcommand("view")]
-        | Annotated[tool_commands.StreamCommand, subcommand("stream")]
-        | Annotated[ServeCommand, subcommand("serve")]
-        | Annotated[commands.Export, subcommand("export")]
-        | Annotated[tool_commands.Experiment, subcommand("experiment")]
-        | Annotated[tool_commands.BenchCommand, subcommand("bench")]
-        | Annotated[tool_commands.Release, subcommand("release")]
-    )
+def _chosen(choices: Mapping[Any, Choice], otherwise: str, *names: Any) -> Choice:
+    """First of these choices that there is, which must be known before parsing: other defaults depend on it."""
+    return choices[next((name for name in names if isinstance(name, str) and name in choices), otherwise)]
 
 
-def _starting(command: type, given: GivenOptions | None, defaults: Mapping[str, Any]) -> type:
-    """Command with other defaults, those of a file of options before the others; itself where there are none."""
-    if given is not None:
-        defaults = defaults_from(command, given, defaults)
-    if not defaults:
-        return command
-    changed = [(name, command.__annotations__[name], field(default=value)) for name, value in defaults.items()]
-    # by keyword alone, as options that have got a default come before some without
-    return make_dataclass(
-        command.__name__, changed, bases=(command,), frozen=True, kw_only=True, namespace={"__doc__": command.__doc__}
-    )
-
-
-def _options_from(arguments: list[str]) -> GivenOptions | None:
-    """Options of the file that --config names, for the command that takes them."""
-    files = _values(arguments, "--config")
-    return read_options(Path(files[-1]), arguments[0]) if files and arguments[0] in CONFIGURABLE else None
-
-
-def _group(members: tuple[tuple[type, str], ...]) -> Any:
-    return Union[*(Annotated[member, subcommand(name)] for member, name in members)]
-
-
-def _chosen(arguments: list[str], option: str, choices: Mapping[Any, Choice], otherwise: str) -> Choice:
-    """Choice of an option, which must be known before parsing because the other defaults depend on it."""
-    values = _values(arguments, option)
-    return choices[values[-1] if values and values[-1] in choices else otherwise]
-
-
-def _values(arguments: list[str], option: str) -> list[str]:
-    """All values that an option is given."""
-    values = [a.partition("=")[2] for a in arguments if a.startswith(f"{option}=")]
-    return values + [after for before, after in pairwise(arguments) if before == option]
+def _option(arguments: list[str], option: str) -> str | None:
+    """Last value that an option is given; None without one."""
+    values = [word.partition("=")[2] for word in arguments if word.startswith(f"{option}=")]
+    values += [after for before, after in pairwise(arguments) if before == option]
+    return values[-1] if values else None
 
 
 if __name__ == "__main__":

@@ -1,49 +1,26 @@
-"""``mereo demo``: a real range scan and two rendered depth frames, back to segments, compared with the truth.
-
-First the scan by its object's meshes alone, with nothing trained. Where torch is installed, all three with shipped
-weights then, network and registered model side by side. What is written is the answer that `mereo reconstruct` gives.
-"""
+"""The command ``mereo demo``: a real scan by its object's meshes alone, and with torch frames by shipped weights."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from rich.console import Console
-from rich.table import Table
+from mereo.cli.options import Outcome
 
-from mereo.api.objects import Object, load_object
-from mereo.api.reconstruct import reconstruct
-from mereo.api.result import Result
-from mereo.cli.reconstruct import print_source
-from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view, shipped_frame
-from mereo.evaluation.scans import BUNNY_SCAN_POSES
-from mereo.fitting.config import AnswerMethod
-from mereo.geometry.mesh import SegmentedMesh
-from mereo.io.extras import has_network
-from mereo.io.output_folders import check_new_directory, new_directory
-from mereo.io.progress import shown_stages
-from mereo.io.scratch_folders import check_place
-from mereo.io.sensor_frame import SensorFrame
-from mereo.io.writers.stl import write_surface_stl
-from mereo.models.weights_place import statistical_model_in
-from mereo.visualization.report_words import confidence_title
-from mereo.visualization.units import Unit
+if TYPE_CHECKING:
+    from mereo.api.objects import Object
+    from mereo.api.result import Result
+    from mereo.evaluation.ground_truth import TruthGrid
+    from mereo.io.sensor_frame import SensorFrame
 
-FRAMES = ("liver", "rope")
 RESOLUTION = 100
 
-OWN_OBJECT = """[bold]On your own object[/bold], from its meshes: nothing is trained; docs/own-object.md has joints
+NEXT = """On your own object, from its meshes: nothing is trained; docs/own-object.md has joints
   mereo reconstruct cloud.ply --object PART.stl PART.stl --output result
   mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --object PART.stl PART.stl --output result
 
-[bold]At once, and telling look-alike parts apart[/bold]: with a network, where that helps, ten minutes for an object
+At once, and telling look-alike parts apart: with a network, where that helps, ten minutes for an object
   mereo learn PART.stl PART.stl --output learned --minutes 10
   mereo reconstruct frame.ply --object learned --output result
 
@@ -51,174 +28,98 @@ In another shell, first: source .venv/bin/activate"""
 
 WITHOUT = (
     "PyTorch is not installed, so nothing is shown of networks, which start the fit at once: run pip install "
-    "'mereo[network]' and this again."
+    "'mereo[network]' and this again.\n"
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Case:
-    """Input of the demo with its truth.
+@dataclass(frozen=True)
+class Demo:
+    """Find an object in a real scan by its meshes; with the extra `network` also shipped frames, by network and fit.
 
     Attributes:
-        name: of the output folder.
-        title: one line about it.
-        object: that is found in it.
-        frame: as its sensor gives it.
-        truth: the right answer, in the frame's axes and unit.
+        output: folder for meshes, pictures and reports.
+        json: print one JSON object on standard output, of the scores, and all else on standard error.
     """
 
-    name: str
-    title: str
-    object: Object
-    frame: SensorFrame
-    truth: TruthGrid
+    output: Path = Path("out/demo")
+    json: bool = False
 
+    def run(self) -> Outcome:
+        """Reconstruct every input, and print its scores, seconds and where to look."""
+        from mereo.api.reconstruct import reconstruct
+        from mereo.io.extras import has_network
+        from mereo.io.output_folders import check_new_directory
+        from mereo.io.progress import shown_stages
 
-@dataclass(frozen=True, eq=False)
-class Column:
-    """Scores of one answer to a case, and the seconds that it took from the frame on."""
-
-    scores: Scores
-    seconds: float
-
-    def facts(self) -> dict[str, float | None]:
-        """IoU, mIoU and seconds."""
-        return {"iou": self.scores.iou, "miou": self.scores.miou, "seconds": self.seconds}
-
-
-def main(output: str | Path = Path("out/demo")) -> dict[str, Any]:
-    """Reconstruct every input, print tables, and write a folder each below ``output``; returns the scores."""
-    check_place(Path(output), may_be_link=True)
-    console, started = Console(markup=False, emoji=False), time.perf_counter()
-    scores: dict[str, Any] = {}
-    for make in _inputs(Path(output)):
-        with shown_stages():
-            case = make()
-        folder = _folder(Path(output) / case.name)
-        with shown_stages():
-            columns = _show(case, folder, console)
-        scores[case.name] = {"output": str(folder), **{name: column.facts() for name, column in columns.items()}}
-    if not has_network():
-        console.print(f"{WITHOUT}\n", highlight=False, soft_wrap=True)
-    console.print(f"All in {time.perf_counter() - started:.0f} s.\n", highlight=False)
-    console.print(OWN_OBJECT, markup=True, highlight=False, soft_wrap=True)
-    return scores
-
-
-def _folder(wanted: Path) -> Path:
-    """Folder for a case: the first of NAME, NAME-2, NAME-3, ... that is free or holds only what mereo wrote.
-
-    A folder of a version without lists of files, or with somebody's notes, is kept and stops nobody: the next name is
-    taken, and replaced from then on.
-    """
-    for folder in (wanted, *(wanted.with_name(f"{wanted.name}-{number}") for number in range(2, 1000))):
-        try:
+        scores, began = dict[str, Any](), time.perf_counter()
+        for name, title, known, frame, truth in _inputs(self.output):
+            folder, started = self.output / name, time.perf_counter()
             check_new_directory(folder, force=True)
-        except FileExistsError:
-            continue
-        if folder != wanted:
-            print(f"{wanted} holds what mereo may not replace; it is kept, and this result is written to {folder}")
-        return folder
-    raise FileExistsError(f"{wanted}, and every name up to {folder}, is taken: choose another --output")
+            with shown_stages():
+                result = reconstruct(frame, known, resolution=RESOLUTION)
+                seconds = time.perf_counter() - started
+                result.save(folder, overwrite=True)
+            scores[name] = {"output": str(folder), **_print_scores(title, result, truth), "seconds": seconds}
+            page = f", or in the browser: mereo view {folder}" if result.taken else ""
+            print(f"{len(frame.cloud)} points, {seconds:.1f} s; look at {folder / 'report.html'}{page}\n")
+        print("" if has_network() else f"{WITHOUT}\n", end="")
+        print(f"All in {time.perf_counter() - began:.0f} s.\n\n{NEXT}")
+        return Outcome(scores)
 
 
-def _inputs(output: Path) -> Iterator[Callable[[], Case]]:
-    """Inputs of the demo: the real scan by meshes; with a network the scan again, then frames of other objects."""
-    yield partial(_mesh_case, output)
-    if not has_network():
-        return
-    yield _scan_case
-    for name in FRAMES:
-        yield partial(_frame_case, name)
+def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, TruthGrid]]":
+    """Name, title, object, frame and truth of each input; the bunny's meshes are written: a user has such files."""
+    import numpy as np
 
+    from mereo.api.frames import load_frame
+    from mereo.api.objects import load_object
+    from mereo.evaluation.ground_truth import truth_grid
+    from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view
+    from mereo.evaluation.scans import BUNNY_SCAN_POSES
+    from mereo.geometry.mesh import SegmentedMesh
+    from mereo.io.extras import has_network
+    from mereo.io.output_folders import new_directory
+    from mereo.io.writers.stl import write_surface_stl
+    from mereo.models.weights_place import statistical_model_in
 
-def _mesh_case(output: Path) -> Case:
-    """The scan by nothing but the bunny's meshes, which are written beside the results: a user has such files."""
-    files, rest = [], _bunny_at_rest()
+    model = statistical_model_in("bunny")
+    assert model.source_frame is not None
+    rest = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source))  # as in its files, metres
+    frame, truth = load_frame(SHIPPED_SCAN), truth_grid(rest.transformed(np.linalg.inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
     with new_directory(output / "bunny-meshes", force=True) as folder:
         for part in rest.segments:
             write_surface_stl(folder / f"{part.name}.stl", SegmentedMesh((part,)))
-            files.append(output / "bunny-meshes" / f"{part.name}.stl")
-    known = load_object(files, units="m")
+    meshes = [output / "bunny-meshes" / f"{part.name}.stl" for part in rest.segments]
     title = f"{SHIPPED_SCAN}: a real range scan of the Stanford bunny, by its meshes alone, nothing trained"
-    return Case(f"{SHIPPED_SCAN}-meshes", title, known, shipped_frame(SHIPPED_SCAN), _scan_truth(rest))
+    yield f"{SHIPPED_SCAN}-meshes", title, load_object(meshes, units="m"), frame, truth
+    if has_network():
+        yield SHIPPED_SCAN, f"{SHIPPED_SCAN}: the same scan, with weights", load_object("bunny"), frame, truth
+        for name in ("liver", "rope"):
+            view = load_view(name)
+            title = f"{name}: a rendered depth image with noise, with weights"
+            yield name, title, load_object(name), load_frame(name), view.truth.scaled(view.metres)
 
 
-def _scan_case() -> Case:
-    known = load_object("bunny")
-    title = f"{SHIPPED_SCAN}: the same scan, with weights"
-    return Case(SHIPPED_SCAN, title, known, shipped_frame(SHIPPED_SCAN), _scan_truth(_bunny_at_rest()))
+def _print_scores(title: str, result: "Result", truth: "TruthGrid") -> dict[str, float | None]:
+    """Print IoU and volume of each segment, and return IoU and mIoU."""
+    from rich.console import Console
+    from rich.table import Table
 
+    from mereo.cli.reconstruct import print_source
+    from mereo.evaluation.cases import grid_confusion, labels_on
+    from mereo.evaluation.metrics import intersection_over_union
+    from mereo.visualization.units import Unit
 
-def _bunny_at_rest() -> SegmentedMesh:
-    """The bunny in its own files' frame, metres."""
-    model = statistical_model_in("bunny")
-    assert model.source_frame is not None
-    return model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source))
-
-
-def _scan_truth(rest: SegmentedMesh) -> TruthGrid:
-    return truth_grid(rest.transformed(np.linalg.inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
-
-
-def _frame_case(name: str) -> Case:
-    frame, view = shipped_frame(name), load_view(name)
-    camera = view.depth.camera
-    title = f"{name}: a rendered {camera.width} x {camera.height} depth image with noise"
-    return Case(name, title, load_object(name), frame, view.truth.scaled(view.metres))
-
-
-def _show(case: Case, folder: Path, console: Console) -> dict[str, Column]:
-    """Reconstruct a case, print network and registered model beside the truth, and write the default answer."""
-    columns: dict[str, Column] = {}
-    registrar = case.object.registrar()
-    if case.object.network is None:
-        result, columns["search"] = _answer(case, "auto")
-    else:
-        result, columns["network"] = _answer(case, "network")
-    if registrar is not None and case.object.network is not None:
-        result, columns["fit"] = _answer(case, "auto")
-    console.print(_table(case, result, columns))
-    if registrar is None:
-        print(f"the network's answer: the weights {case.name!r} carry no statistical model that could be registered")
-    else:
-        print_source(result)
-    started = time.perf_counter()
-    result.save(folder, overwrite=True)
-    written_s = time.perf_counter() - started
-    page = f", or in the browser: mereo view {folder}" if result.taken else ""
-    line = f"{len(case.frame.cloud)} points; written in {written_s:.1f} s; look at {folder / 'report.html'}{page}\n"
-    console.print(line, highlight=False, soft_wrap=True)
-    return columns
-
-
-def _answer(case: Case, method: AnswerMethod) -> tuple[Result, Column]:
-    """Answer to a case, its scores and seconds."""
-    started = time.perf_counter()
-    result = reconstruct(case.frame, case.object, method, resolution=RESOLUTION)
-    seconds = time.perf_counter() - started
-    labels = labels_on(result.surfaces, case.truth.grid)
-    network = case.object.network
-    confusion = grid_confusion(case.truth, labels, len(result.names))
-    return result, Column(intersection_over_union(confusion, network is None or network.segmented), seconds)
-
-
-def _table(case: Case, result: Result, columns: dict[str, Column]) -> Table:
-    """Table of the scores of each segment by network and fit, and of what is written."""
-    unit = Unit(result.unit_m)
-    table = Table(title=case.title, title_justify="left")
-    table.add_column("IoU with the truth")
-    known = not all(np.isnan(segment.confidence) for segment in result)
-    sure = [confidence_title(result.reconstruction.calibrated)] if known else []
-    for column in (*columns, *sure, f"volume ({unit.volume_name})"):
-        table.add_column(column, justify="right")
-    each = [column.scores.per_segment for column in columns.values()]
-    for segment, *ious in zip(result, *each, strict=True):
-        told = [f"{segment.confidence:.2f}"] if known else []
-        row = (*(f"{iou:.3f}" for iou in ious), *told, unit.volume(segment.volume))
-        table.add_row(segment.name, *row)
+    confusion = grid_confusion(truth, labels_on(result.surfaces, truth.grid), len(result.names))
+    scores, unit = intersection_over_union(confusion), Unit(result.unit_m)
+    table = Table(title=title, title_justify="left")
+    for column in ("segment", "IoU with the truth", f"volume ({unit.volume_name})"):
+        table.add_column(column, justify="left" if column == "segment" else "right")
+    for segment, iou in zip(result, scores.per_segment, strict=True):
+        table.add_row(segment.name, f"{iou:.3f}", unit.volume(segment.volume))
     table.add_section()
-    table.add_row("all as one (IoU)", *(f"{column.scores.iou:.3f}" for column in columns.values()))
-    table.add_row("mean of segments (mIoU)", *(f"{column.scores.miou:.3f}" for column in columns.values()))
-    table.add_row("seconds", *(f"{column.seconds:.1f}" for column in columns.values()))
-    return table
+    table.add_row("all as one (IoU)", f"{scores.iou:.3f}", "")
+    table.add_row("mean of segments (mIoU)", f"{scores.miou:.3f}", "")
+    Console(markup=False, emoji=False).print(table)
+    print_source(result)
+    return {"iou": scores.iou, "miou": scores.miou}

@@ -1,4 +1,4 @@
-"""``mereo doctor``: what this machine offers and what is installed, for bug reports and for choosing settings."""
+"""The command ``mereo doctor``: what this machine offers and what is installed, for bug reports."""
 
 import importlib.metadata
 import os
@@ -6,9 +6,7 @@ import platform
 import re
 import shlex
 import sys
-from collections.abc import Iterator
-
-from mereo.io.cores import cores, threads_for
+from dataclasses import dataclass
 
 PURPOSES: dict[str, str] = {
     "network": "weights: training them, and fits that start from them",
@@ -33,28 +31,34 @@ PURPOSES: dict[str, str] = {
 """Purpose of each extra of pyproject.toml; which packages it means is read from the installed metadata."""
 
 
-def diagnose() -> None:
-    """Print versions, device, threads, load, CPU features and extras, one fact a line."""
-    for line in (*_platform(), *_packages(), *_device(), *_extras()):
-        print(line)
+@dataclass(frozen=True)
+class Doctor:
+    """Show versions, device, threads and extras, and how to install what is missing."""
 
-
-def _row(name: str, value: object) -> str:
-    return f"{name:<14} {value}"
-
-
-def _platform() -> Iterator[str]:
-    yield _row("mereo", _version("mereo") or "not installed")
-    yield _row("python", f"{platform.python_version()} ({sys.executable})")
-    yield _row("system", f"{platform.system()} {platform.machine()}")
-
-
-def _packages() -> Iterator[str]:
-    if not requirements(""):
-        yield _row("packages", "unknown: mereo is not installed; run in its folder: pip install -e .")
-    for requirement in requirements(""):
-        name = _name(requirement)
-        yield _row(name, _version(name) or f"missing: {install_command([requirement])}")
+    def run(self) -> None:
+        """Print what is installed and what this machine offers, one fact a line."""
+        facts = {
+            "mereo": _version("mereo") or "not installed",
+            "python": f"{platform.python_version()} ({sys.executable})",
+            "system": f"{platform.system()} {platform.machine()}",
+        }
+        for requirement in requirements(""):
+            facts[_name(requirement)] = _version(_name(requirement)) or f"missing: {_install([requirement])}"
+        try:
+            import torch
+        except ModuleNotFoundError:
+            facts["device"] = "cpu; objects are found by search, as the extra `network` is not installed"
+        else:
+            device = (
+                f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}" if torch.cuda.is_available() else "cpu"
+            )
+            facts |= {"torch": torch.__version__, "device": device}
+            facts["threads"] = f"{torch.get_num_threads()} of {os.cpu_count()} cores"
+        for extra, purpose in PURPOSES.items():
+            missing = [each for each in requirements(extra) if _version(_name(each)) is None]
+            facts[extra] = f"missing, for {purpose}: {_install(missing)}" if missing else f"installed, for {purpose}"
+        for name, fact in facts.items():
+            print(f"{name:<14} {fact}")
 
 
 def requirements(extra: str) -> list[str]:
@@ -63,17 +67,14 @@ def requirements(extra: str) -> list[str]:
         declared = importlib.metadata.requires("mereo") or []
     except importlib.metadata.PackageNotFoundError:
         return []
-    found = []
-    for entry in declared:
-        requirement, _, marker = entry.partition(";")
-        named = re.search(r"extra == ['\"](.+?)['\"]", marker)
-        if (named.group(1) if named else "") == extra:
-            found.append(requirement.strip())
-    return found
+    entries = [entry.partition(";") for entry in declared]
+    extras = [re.search(r"extra == ['\"](.+?)['\"]", marker) for _, _, marker in entries]
+    return [
+        entry[0].strip() for entry, named in zip(entries, extras, strict=True) if (named[1] if named else "") == extra
+    ]
 
 
-def install_command(missing: list[str]) -> str:
-    """Command line that installs these requirements for the running Python."""
+def _install(missing: list[str]) -> str:
     return shlex.join([sys.executable, "-m", "pip", "install", *missing])
 
 
@@ -86,69 +87,3 @@ def _version(name: str) -> str | None:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return None
-
-
-def _device() -> Iterator[str]:
-    yield ""
-    try:
-        import torch
-    except ModuleNotFoundError:
-        yield _row("device", "cpu; objects are found by search, as the extra `network` is not installed")
-        if hasattr(os, "getloadavg"):
-            yield _row("load", describe_load(os.getloadavg()[0], os.cpu_count() or 1, cores()))
-        return
-    from mereo.models.device import cpu_features
-
-    yield _row("torch", torch.__version__)
-    if torch.cuda.is_available():
-        free, total = torch.cuda.mem_get_info()
-        memory = f"{free / 2**30:.1f} of {total / 2**30:.1f} GiB free"
-        yield _row("device", f"cuda: {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}, {memory}")
-    else:
-        yield _row("device", "cpu")
-    yield _row("threads", f"{torch.get_num_threads()} of {os.cpu_count()} cores")
-    yield _row("wait policy", os.environ.get("OMP_WAIT_POLICY", "not set"))
-    if hasattr(os, "getloadavg"):
-        yield _row("load", describe_load(os.getloadavg()[0], os.cpu_count() or 1, torch.get_num_threads()))
-    features = cpu_features()
-    for name, present in features.items():
-        yield _row(name, {True: "yes", False: "no", None: "unknown"}[present])
-    yield _row("bfloat16", _bfloat16())
-
-
-def describe_load(load: float, cores: int, threads: int) -> str:
-    """Sentence on how busy the machine is, and the OMP_NUM_THREADS that would help where it is.
-
-    Args:
-        load: processes that ran or wanted to, mean of the last minute.
-        cores: of the machine.
-        threads: that OpenMP would use.
-    """
-    found = f"{load:.1f} on {cores} cores"
-    if load < cores / 2:
-        return found
-    fewer = threads_for(cores - load, cores)
-    if threads <= fewer:
-        return f"{found}, which is crowded: everything waits for a core" if load >= 1.5 * cores else found
-    return (
-        f"{found}, which is busy: commands that answer take {fewer} thread{'' if fewer == 1 else 's'} while it is so; "
-        f"OMP_NUM_THREADS={fewer} would help others, as all threads wait for the one that shares a core"
-    )
-
-
-def _bfloat16() -> str:
-    from mereo.models.device import bfloat16_gain, pick_device, pick_precision
-
-    device = pick_device()
-    verdict = "does not pay here" if pick_precision("auto", device) is None else "pays here"
-    return verdict if device.type == "cuda" else f"{verdict}: {bfloat16_gain():.1f} times float32"
-
-
-def _extras() -> Iterator[str]:
-    yield ""
-    for extra, purpose in PURPOSES.items():
-        missing = [r for r in requirements(extra) if _version(_name(r)) is None]
-        if missing:
-            yield _row(extra, f"missing, for {purpose}: {install_command(missing)}")
-        else:
-            yield _row(extra, f"installed, for {purpose}")

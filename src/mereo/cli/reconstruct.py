@@ -14,17 +14,18 @@ from rich.table import Table
 from mereo.api.objects import Object
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Result, registration_of
+from mereo.cli.answers import ReconstructCommand
+from mereo.cli.config_file import options_of
 from mereo.cli.explain import explain, print_sure, wish_of
-from mereo.cli.object_option import MeshUnits, check_named, files_read, loaded_object
-from mereo.cli.outcome import NOT_RECOGNIZED, Outcome
-from mereo.fitting.config import AnswerMethod
+from mereo.cli.options import NOT_RECOGNIZED, Outcome, check_named, files_read, loaded_object
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried, Placed, place
 from mereo.fitting.registration.carry import carry as carry_one
+from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
 from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
-from mereo.io.config import CONFIG, DEFAULT_FILES, CarryFrame, FilesConfig, InputConfig
+from mereo.io.config import CONFIG
 from mereo.io.output_folders import new_directory
 from mereo.io.progress import shown_stages, stage
 from mereo.io.sensor_frame import SensorFrame, read_frame
@@ -32,96 +33,70 @@ from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.medical import MM_PER_M
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
-from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import files_of
 from mereo.visualization.report_words import confidence_title
 from mereo.visualization.result_files import summary_of, write_answer
 from mereo.visualization.units import Unit
 
+KNOWN: Mapping[Known, str] = {True: "yes", False: "no", "unsure": "unsure"}
+"""Words of a table for whether a frame shows the object."""
+
 
 @dataclass(frozen=True)
 class FrameJob:
-    """Options of ``mereo reconstruct``, and what all its frames share, which is read and loaded once.
+    """What all frames of a ``mereo reconstruct`` share, which is read and loaded once.
 
     Attributes:
-        weights: a shipped name or a file; None of an object without.
-        resolution: cells along the longest side of the object's box.
-        reading: how a frame is read.
-        isolation: what of a frame is left out.
-        inference: where and how exactly the network computes.
-        files: which files are written, and in which unit.
-        method: whether the network answers, or the registered model.
-        scene: whose draws are fitted, where it is not the built-in one that the weights were trained on.
-        carry: files of what is defined in the rest model, to be brought to where the object is.
-        carry_frame: their frame and unit: of the object's own files, or of its scene.
-        force: replace an existing folder that mereo wrote.
-        explain: segments and places of which it is told what decides them.
-        options: what config.json of the results says, with the frame's own name as its only input; without any, none.
-        looked_for: meshes or scene of the object, where more than its weights is named (``--object``).
-        units: of its meshes.
+        command: its options.
+        inference: where and how exactly the network computes, where that is not as the options say.
     """
 
-    weights: str | Path | None = None
-    resolution: int = 128
-    reading: InputConfig = field(default_factory=InputConfig)
-    isolation: IsolationConfig = field(default_factory=IsolationConfig)
-    inference: InferenceConfig = field(default_factory=InferenceConfig)
-    files: FilesConfig = DEFAULT_FILES
-    method: AnswerMethod = "auto"
-    scene: str | None = None
-    carry: tuple[str | Path, ...] = ()
-    carry_frame: CarryFrame = "source"
-    force: bool = False
-    explain: tuple[str, ...] = ()
-    options: Mapping[str, Any] | None = field(default=None, compare=False)
-    looked_for: tuple[str, ...] = ()
-    units: MeshUnits = None
+    command: ReconstructCommand
+    inference: InferenceConfig | None = None
 
     def check(self) -> None:
         """Raise for options that fit together with no frame: before the work, not after.
 
         ``ImportError`` for a missing extra, ``ValueError`` and ``OSError`` for files that cannot be carried.
         """
-        check_named("reconstruct", self.looked_for, self.weights)
-        chosen_formats(self.files.formats)
-        if self.carry_frame != "source" and not self.attachments:
-            raise ValueError(f"--carry-frame is {self.carry_frame!r} and nothing is carried: name a file with --carry")
-        if self.attachments and self.method == "network":
-            raise ValueError("--method is network, but --carry needs a registration, along which things move: use auto")
-        if self.explain and self.method == "network":
+        command = self.command
+        check_named("reconstruct", command.object, command.weights)
+        chosen_formats(command.files.formats)
+        if command.carry_frame != "source" and not command.carry:
             raise ValueError(
-                "--method is network, but --explain needs a registration, whose fit is explained: use auto"
+                f"--carry-frame is {command.carry_frame!r} and nothing is carried: name a file with --carry"
             )
+        for option, needs in (("carry", "along which things move"), ("explain", "whose fit is explained")):
+            if getattr(command, option) and command.method == "network":
+                raise ValueError(f"--method is network, but --{option} needs a registration, {needs}: use auto")
+        _ = self.attachments  # raises for those that cannot be carried
 
     @property
     def read(self) -> tuple[str | Path, ...]:
         """Files that are read beside the frames."""
-        named = () if self.scene is None else files_of(self.scene)
-        given = (
-            *files_read(self.looked_for, self.weights),
-            *named,
-            self.reading.intrinsics,
-            self.reading.mask,
-            *self.carry,
-        )
-        return tuple(path for path in given if path is not None)
+        command = self.command
+        named = () if command.scene is None else files_of(command.scene)
+        given = (command.reading.intrinsics, command.reading.mask, *command.carry)
+        return (*files_read(command.object, command.weights), *named, *(path for path in given if path is not None))
 
     @cached_property
     def attachments(self) -> tuple[Attachment, ...]:
         """Content of the files that are carried."""
-        return tuple(read_attachments(self.carry))
+        return tuple(read_attachments(self.command.carry))
 
     @cached_property
     def object(self) -> Object:
         """What is looked for, its weights on their device; what is carried needs a deformation model."""
-        loaded = loaded_object(self.looked_for, self.weights, self.scene, self.units, self.inference)
+        command = self.command
+        inference = self.inference or command.inference
+        loaded = loaded_object(command.object, command.weights, command.scene, command.units, inference)
         return loaded.with_deformation_model() if self.attachments else loaded
 
     @cached_property
     def registrar(self) -> Registrar | None:
         """Registrar of the object's model; None where the network alone answers."""
-        return self.object.registrar(self.method)
+        return self.object.registrar(self.command.method)
 
     def asking(self, network: Trained | None) -> "FrameJob":
         """The same, asking the same weights on another device; what is known of scene and attachments stays so."""
@@ -134,7 +109,9 @@ class FrameJob:
     @cached_property
     def placed(self) -> tuple[Placed, ...]:
         """What is carried, in its place on the object at rest."""
-        return () if self.registrar is None else tuple(place(self.attachments, self.registrar, self.carry_frame))
+        return (
+            () if self.registrar is None else tuple(place(self.attachments, self.registrar, self.command.carry_frame))
+        )
 
 
 def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Result:
@@ -150,8 +127,8 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Re
     ``explain`` without a registration.
     """
     job.check()
-    with shown_stages(), new_directory(output, job.force, [input, *job.read]) as directory:
-        found = answer_frame(read_frame(input, job.reading), directory, job, Path(input).absolute())
+    with shown_stages(), new_directory(output, job.command.force, [input, *job.read]) as directory:
+        found = answer_frame(read_frame(input, job.command.reading), directory, job, Path(input).absolute())
     print_segments(found)
     print(written(output, found.reconstruction.seconds))
     return found
@@ -162,17 +139,18 @@ def answer_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: Path)
 
     ``path`` is the frame's own, for the options. Raises and warns as ``reconstruct_file``.
     """
-    seen = find_object(frame, job.isolation)
+    command = job.command
+    seen = find_object(frame, command.isolation)
     print(seen)
     placed = job.placed  # what is carried is refused before the work
-    wishes = [wish_of(text, job.object.names) for text in job.explain]
+    wishes = [wish_of(text, job.object.names) for text in command.explain]
     found = reconstruct_observation(
         seen,
         job.object,
-        job.method,
-        resolution=job.resolution,
-        isolation=job.isolation,
-        label_points="points" in chosen_formats(job.files.formats),
+        command.method,
+        resolution=command.resolution,
+        isolation=command.isolation,
+        label_points="points" in chosen_formats(command.files.formats),
     )
     if found.hypothesis.dropped:
         print(found.hypothesis)
@@ -181,11 +159,10 @@ def answer_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: Path)
         print_source(found)
         print_sure(found.registered, unit)
     with stage("write the files"):
-        write_answer(directory, found, job.files, carried_along(placed, found))
-    factor = MM_PER_M * found.seen.frame.metres if job.files.millimetres else 1.0
+        write_answer(directory, found, command.files, carried_along(placed, found))
+    factor = MM_PER_M * found.seen.frame.metres if command.files.millimetres else 1.0
     explain(found.registered, wishes, directory, found.seen.cloud.points, factor, unit)
-    if job.options is not None:
-        write_json(directory / CONFIG, {**job.options, "inputs": [str(path)]})
+    write_json(directory / CONFIG, {**options_of(command, "reconstruct"), "inputs": [str(path)]})
     return found
 
 
@@ -251,3 +228,40 @@ def print_segments(answered: Result) -> None:
     console.print(f"seconds: {stages}", highlight=False, soft_wrap=True)
     if result.clipped:
         console.print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")
+
+
+# --- a table of many frames -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Told:
+    """Row of a table about a frame, but for its name and folder.
+
+    Attributes:
+        answer: who answers.
+        explained: share of the cloud that the registered model explains; "" without one.
+        known: whether it shows the object.
+        segments: how many of them were found.
+        seconds: that the answer took.
+        summary: content of its summary.json.
+    """
+
+    answer: str
+    explained: str
+    known: str
+    segments: str
+    seconds: float
+    summary: Mapping[str, Any] = field(compare=False, repr=False)
+
+    @classmethod
+    def of(cls, found: Answer) -> "Told":
+        """Row about an answer."""
+        registration, segments = found.registration, found.reconstruction.segments
+        return cls(
+            answer="registered model" if found.taken else "network",
+            explained="" if registration is None else f"{registration.explained:.1%}",
+            known=KNOWN[found.recognition.known],
+            segments=f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}",
+            seconds=found.reconstruction.seconds,
+            summary=summary_of(found),
+        )

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.api.words import option_words
-from mereo.cli import outcome as command
+from mereo.cli import options as command
 from mereo.cli.reconstruct import FrameJob, answer_frame, outcome_of, print_segments, reconstruct_file, written
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.recognition import Known
@@ -106,7 +106,7 @@ def reconstruct_inputs(
         if cluster is not None:
             raise ValueError("--ray is for several frames, each of which is a task: name more, or leave it out")
         return outcome_of(reconstruct_file(inputs[0], output, job), output)
-    found = reconstruct_frames(list_frames(inputs, job.reading), output, job, cluster)
+    found = reconstruct_frames(list_frames(inputs, job.command.reading), output, job, cluster)
     frames = [{"output": str(one.folder), **one.row.summary} for one in found if one.row is not None]
     unknown = any(one.row is not None and one.row.known == KNOWN[False] for one in found)
     return command.Outcome({"output": str(output), "frames": frames}, command.NOT_RECOGNIZED if unknown else 0)
@@ -304,8 +304,8 @@ def _answer_in_tasks(frames: Iterable[tuple[Path, Path]], job: FrameJob, cluster
 
     def read(path: Path, folder: Path) -> _Frame:
         try:
-            check_new_directory(folder, job.force, [path, *job.read])
-            return _Frame(path, folder, read_frame(path, job.reading))
+            check_new_directory(folder, job.command.force, [path, *job.read])
+            return _Frame(path, folder, read_frame(path, job.command.reading))
         except Exception as problem:
             return _Frame(path, folder, problem)
 
@@ -321,7 +321,7 @@ def _write_answer(frame: _Frame, found: _Answered | Exception, job: FrameJob) ->
     print(found.printed, end="")
     for text in found.warned:
         warnings.warn(text, FrameWarning, stacklevel=2)
-    with new_directory(frame.folder, job.force, [frame.path, *job.read]) as directory:
+    with new_directory(frame.folder, job.command.force, [frame.path, *job.read]) as directory:
         for name, content in found.files.items():
             (directory / name).parent.mkdir(parents=True, exist_ok=True)
             (directory / name).write_bytes(content)

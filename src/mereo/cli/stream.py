@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mereo.cli.object_option import MeshUnits, check_named, loaded_object
+from mereo.cli.options import MeshUnits, check_named, loaded_object
 from mereo.cli.stream_answers import Answering, FrameAnswer, Seen
 from mereo.cli.stream_rerun import RerunLog, RerunTarget
 from mereo.fitting.tracking.config import StreamMethod

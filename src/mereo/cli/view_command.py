@@ -6,8 +6,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from mereo.cli.object_option import MeshUnits
-from mereo.cli.positionals import InputOrNone
+from mereo.cli.options import InputOrNone, MeshUnits
 from mereo.io.bounds import Cells, Port
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig
@@ -81,7 +80,7 @@ class ViewCommand:
         if is_state(self.input):
             raise ValueError(f"{self.input} is a result, which shows itself: leave out --object")
         from mereo.api.reconstruct import reconstruct
-        from mereo.cli.object_option import loaded_object
+        from mereo.cli.options import loaded_object
         from mereo.evaluation.sample_views import shipped_frame, shipped_frames
         from mereo.io.progress import shown_stages
         from mereo.io.sensor_frame import read_frame

@@ -2,9 +2,11 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 
+from mereo.io.errors import reason
 from mereo.io.extras import network_needed
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
@@ -38,6 +40,25 @@ def find_weights(name: str | Path) -> Path:
             f"names: {', '.join(shipped_names()) or 'none'}"
         )
     return path
+
+
+def read_facts(name: str | Path) -> tuple[Path, dict[str, Any]]:
+    """Path of weights, and what their header says, read without torch and without their network.
+
+    Raises ``FileNotFoundError`` as ``find_weights`` does, and ``ValueError`` for a file that is not weights.
+    """
+    path = find_weights(name)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {}).get("mereo", "null"))
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        raise ValueError(
+            f"{path} is not a safetensors file of weights ({reason(error)}); give the weights written by mereo train"
+        ) from None
+    kinds = {"names": list, "network": dict, "provenance": dict}
+    if not isinstance(header, dict) or not all(isinstance(header.get(key), kind) for key, kind in kinds.items()):
+        raise ValueError(f"{path} holds tensors but no mereo header; give the weights.safetensors of a mereo run")
+    return path, header
 
 
 def is_weights(name: str | Path) -> bool:

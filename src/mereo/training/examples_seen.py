@@ -7,7 +7,7 @@ any length add up. It has a module of its own because runs write it, and cards a
 from collections.abc import Mapping
 from typing import Any
 
-from mereo.models.weights_facts import read_facts
+from mereo.models.weights import load_model
 
 _BEFORE: Mapping[tuple[str, str, str], int] = {
     ("bunny", "3", "6530"): 132_320,
@@ -60,9 +60,9 @@ def seen_in_all(provenance: Mapping[str, Any]) -> int | None:
 def seen_by(init: str) -> int | None:
     """Number of examples that weights have seen in all, by a shipped name or a file; empty are random ones.
 
-    None where they do not say. Raises as ``read_facts`` does.
+    None where they do not say. Raises as ``load_model`` does.
     """
-    return seen_in_all(read_facts(init).header.provenance) if init else 0
+    return seen_in_all(load_model(init).provenance) if init else 0
 
 
 def told(provenance: Mapping[str, Any]) -> str:

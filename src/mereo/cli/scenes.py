@@ -1,18 +1,24 @@
-"""The commands ``mereo scene ...``: list, write, check, draw, record and export scenes.
-
-See ``mereo.cli.commands`` for how commands are written.
-"""
+"""The commands ``mereo scene ...`` and ``mereo assets ...``: scenes of objects, and meshes and scans to download."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from mereo.cli.positionals import ObjectFiles, SceneName, SceneNameOrNone
+from mereo.cli.options import AssetNames, MeshUnits, ObjectFiles, SceneName, SceneNameOrNone
 from mereo.io.bounds import CountOrNone, States
 from mereo.synthesis.config import SENSORS, Sensor
 from mereo.synthesis.sequence_config import SequenceConfig
+
+if TYPE_CHECKING:
+    from mereo.scenes.statistical_model import StatisticalModel
+
+SHARES = (0.9, 0.95, 0.99, 0.999)
+"""Shares of the variance for which the number of modes is printed."""
+
+ENOUGH = 0.1
+"""Distance in scene units that modes may leave of a state: the noise of the paper's sensor."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,7 @@ class SceneNew:
 
     files: ObjectFiles
     output: Path | None = None
-    units: Literal["mm", "cm", "m", "in"] | None = None
+    units: MeshUnits = None
 
     def run(self) -> None:
         """Write the scene file, and print what to do next."""
@@ -127,9 +133,56 @@ class SceneModes:
 
     def run(self) -> None:
         """Print how many modes are needed, and write the picture."""
-        from mereo.cli.modes import show_modes
+        from mereo.io.atomic_files import atomic_file, check_file_place
+        from mereo.io.plots import CURE, has_plots
+        from mereo.scenes.registry import files_of
+        from mereo.visualization.mode_pictures import preview_modes
 
-        show_modes(self.scene, self.output, self.states, self.force)
+        check_file_place(self.output, force=self.force)
+        if self.output is not None and self.output.suffix.lower() != ".png":
+            raise ValueError(
+                f"{self.output} has the suffix {self.output.suffix!r}; the picture is a PNG file: rename it"
+            )
+        name, model = self._model()
+        print(f"{name}: {model.count} modes of {len(model.library)} states, and what they leave of an unseen one (rms)")
+        for share in SHARES:
+            number = int((model.explained < share).sum()) + 1
+            if number <= model.count:
+                print(f"{share:6.1%} of the variance: {number:4} modes, {model.residues[number]:.3f} units left")
+        print(f"             all modes: {model.count:4} modes, {model.residue:.3f} units left")
+        count = model.modes_for(ENOUGH)
+        print(
+            f"even all modes leave {model.residue:.3f} units, more than {ENOUGH}, the noise of the paper's sensor: the "
+            "states lie on a curved set, so the scene's own draws fit better (--method full)"
+            if count is None
+            else f"{count} modes leave at most {ENOUGH} units, the noise of the paper's sensor"
+        )
+        if self.output is not None:
+            with atomic_file(self.output, force=self.force, inputs=files_of(self.scene)) as partial:
+                preview_modes(model, partial, name)
+            print(f"wrote {self.output}")
+            if not has_plots():
+                print(f"its plot is left out, for matplotlib {CURE}")
+
+    def _model(self) -> "tuple[str, StatisticalModel]":
+        """Name and statistical model of a scene, or those that weights carry."""
+        from mereo.models.weights import load_model
+        from mereo.scenes.random_states import LEAST_STATES, scene_model
+        from mereo.scenes.registry import load_scene
+
+        if self.scene.endswith(".safetensors"):
+            network = load_model(self.scene)
+            if network.statistical_model is None:
+                raise ValueError(
+                    f"{self.scene} carries no statistical model: name the scene that it was trained on instead"
+                )
+            return str(network.provenance.get("scene")), network.statistical_model
+        if self.states < LEAST_STATES:
+            raise ValueError(
+                f"{self.states} states are asked for; fewer than {LEAST_STATES} say little: leave --states out"
+            )
+        loaded = load_scene(self.scene)
+        return loaded.name, scene_model(loaded, self.states, quiet=False)
 
 
 @dataclass(frozen=True)
@@ -205,3 +258,34 @@ class SceneRecord:
         print(f"wrote {self.output}: {len(index.frames)} frames in {self.settings.seconds:g} s; then:")
         print(f"  mereo view {self.output}")
         print(f"  mereo stream {self.output} --rate {index.rate_hz:g} --weights WEIGHTS")
+
+
+@dataclass(frozen=True)
+class AssetsList:
+    """Name the downloadable meshes and scans, with licence and credit."""
+
+    def run(self) -> None:
+        """Print every asset with its licence, credit and place."""
+        from mereo_objects.assets import ASSETS, location
+
+        for asset in ASSETS.values():
+            print(f"{asset.name}\n  {asset.description}\n  {asset.licence}; credit: {asset.credit}")
+            print(f"  {location(asset.name) or 'not here yet'}")
+
+
+@dataclass(frozen=True)
+class AssetsGet:
+    """Download assets, check them, and print where they are.
+
+    Attributes:
+        names: from `mereo assets list`; none means all of them.
+    """
+
+    names: AssetNames = ()
+
+    def run(self) -> None:
+        """Fetch assets and print where they are."""
+        from mereo_objects.assets import ASSETS, get
+
+        for name in self.names or ASSETS:
+            print(get(name))

@@ -1,88 +1,22 @@
-"""Commands of the command line: one dataclass for each, its fields the options, ``run`` the work.
-
-``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
-"""
+"""The commands that make and use networks: generate, dataset ..., train, evaluate, learn, export."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from mereo.cli.config_file import ConfigFile, options_of
-from mereo.cli.outcome import Outcome
-from mereo.cli.place_option import PlaceOption
-from mereo.cli.positionals import AssetNames, DatasetFolder, SceneName, WeightsName
+from mereo.cli.config_file import ConfigFile, flat_options, options_of
+from mereo.cli.options import DatasetFolder, MeshUnits, ObjectFiles, Outcome, PlaceOption, SceneName, WeightsName
 from mereo.fitting.config import AnswerMethod
 from mereo.geometry.conventions import WorkspaceName
-from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Threads, Workers
+from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Positive, Threads, Workers
 from mereo.io.config import CONFIG
 from mereo.io.cores import workers_for
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.training.config import PresetName, TrainConfig
 from mereo.workers.config import ONE_CPU, RayAddress, TaskResources
-
-
-@dataclass(frozen=True)
-class Demo:
-    """Find an object in a real scan by its meshes; with the extra `network` also shipped frames, by network and fit.
-
-    Attributes:
-        output: folder for meshes, pictures and reports.
-        json: print one JSON object on standard output, of the scores, and all else on standard error.
-    """
-
-    output: Path = Path("out/demo")
-    json: bool = False
-
-    def run(self) -> Outcome:
-        """Reconstruct and print every input of the demo."""
-        from mereo.cli.demo import main
-
-        return Outcome(main(self.output))
-
-
-@dataclass(frozen=True)
-class Doctor:
-    """Show versions, device, CPU features and extras, and how to install what is missing."""
-
-    def run(self) -> None:
-        """Print what is installed and what this machine offers."""
-        from mereo.cli.doctor import diagnose
-
-        diagnose()
-
-
-@dataclass(frozen=True)
-class AssetsList:
-    """Name the downloadable meshes and scans, with licence and credit."""
-
-    def run(self) -> None:
-        """Print every asset with its licence, credit and place."""
-        from mereo_objects.assets import ASSETS, location
-
-        for asset in ASSETS.values():
-            print(f"{asset.name}\n  {asset.description}\n  {asset.licence}; credit: {asset.credit}")
-            print(f"  {location(asset.name) or 'not here yet'}")
-
-
-@dataclass(frozen=True)
-class AssetsGet:
-    """Download assets, check them, and print where they are.
-
-    Attributes:
-        names: from `mereo assets list`; none means all of them.
-    """
-
-    names: AssetNames = ()
-
-    def run(self) -> None:
-        """Fetch assets and print where they are."""
-        from mereo_objects.assets import ASSETS, get
-
-        for name in self.names or ASSETS:
-            print(get(name))
 
 
 @dataclass(frozen=True)
@@ -139,6 +73,68 @@ class Generate:
             ray=self.ray,
         )
         write_whole(self.output / CONFIG, json_text(options_of(self, "generate")).encode())
+
+
+def part_of(shard: str) -> tuple[int, int]:
+    """Part and number of parts of a shard: ``"1/4"`` is part 1 of 4, counted from 0. Raises ``ValueError``."""
+    part, _, parts = shard.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
+        raise ValueError(f"the shard is {shard!r}; it must be i/n with i from 0 to n - 1: give for example --shard 0/4")
+    return int(part), int(parts)
+
+
+@dataclass(frozen=True)
+class DatasetCheck:
+    """Read all of a dataset, and name every file that is missing or wrong, with the reason.
+
+    Attributes:
+        dataset: folder written by `mereo generate`, or its URL in an object storage.
+        write: write the SHA-256 of each file into the manifest of a dataset that has none, if all are good.
+    """
+
+    dataset: DatasetFolder
+    write: bool = False
+
+    def run(self) -> None:
+        """Print what is wrong, a line for each file."""
+        from mereo.synthesis.dataset_contents import check_dataset
+
+        check_dataset(self.dataset, self.write)
+
+
+@dataclass(frozen=True)
+class DatasetShow:
+    """Say what a dataset is, from its manifest and the names of its files: object, seed, examples, settings.
+
+    Attributes:
+        dataset: folder written by `mereo generate`, or its URL in an object storage.
+    """
+
+    dataset: DatasetFolder
+
+    def run(self) -> None:
+        """Print a line for each fact."""
+        from mereo.scenes.seeds import TEST_SEED_START
+        from mereo.synthesis.dataset_contents import DatasetContents, recorded_files
+
+        contents = DatasetContents.of(self.dataset)
+        manifest, files = contents.manifest, contents.expected
+        hashes = (
+            "of each file in the manifest" if recorded_files(manifest) else "not recorded: see dataset check --write"
+        )
+        facts = {
+            "dataset": contents.folder,
+            "scene": f"{manifest['scene']}, of {', '.join(segment['name'] for segment in manifest['segments'])}",
+            "seed": f"{manifest['seed']}" + ", which is for testing" * (manifest["seed"] >= TEST_SEED_START),
+            "examples": f"{manifest['examples']}"
+            + (f", {manifest['bytes'] / 1e6:,.1f} MB" if "bytes" in manifest else ""),
+            "files": f"{sum(name in contents.there for name in files)} of {len(files)} are there",
+            "SHA-256": hashes,
+            "made by": f"mereo {manifest['version']}",
+            **dict(flat_options(manifest["settings"])),
+        }
+        for name, value in facts.items():
+            print(f"{name:<14} {value}")
 
 
 @dataclass(frozen=True)
@@ -254,6 +250,74 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class LearnCommand:
+    """Find out whether an object of yours, or each of a folder, needs training, and train it if so: extra `network`.
+
+    First the search alone, which needs no training, is scored on test views. Where it is good enough (every view is
+    explained, and mIoU is 0.85 or more, 0.5 or more in each view), that is all; else: generate, train, evaluate.
+
+    The same command again goes on where it was stopped.
+
+    The result is a folder for --object: scores in metrics.json and a frame to try, and where it was trained
+    weights.safetensors, and a report in test.
+
+    Attributes:
+        object: a scene file (.yaml, .py), or the object's meshes as for `mereo scene new`: one for each segment, one
+            file of named parts, or a label volume. Or a folder of objects: each scene file in it and each subfolder of
+            meshes is one, is learnt into --output/NAME, and one that fails stops no other.
+        output: folder to create; the same command continues one that was stopped.
+        minutes: what all stages of an object may take together; more is better.
+        train: auto trains where the search alone is not good enough; always; or never.
+        init: weights to start from, a shipped name or a file; by default the shipped ones that adapt fastest.
+        units: of the meshes; guessed where not given.
+        workers: processes that make examples; 0 means as many as --threads.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+        ray: learn each object of a folder in a task of a Ray cluster: local, one of so many --threads for this run;
+            auto or HOST:PORT, the one that this machine is a node of.
+        cpus_per_object: CPUs of such a task: its processes and threads.
+        gpus_per_object: GPUs of such a task; 0 learns on CPUs.
+        options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
+    """
+
+    object: ObjectFiles
+    output: Path
+    minutes: Positive = 10.0
+    train: Literal["auto", "always", "never"] = "auto"
+    init: str = ""
+    units: MeshUnits = None
+    workers: Workers = 0
+    threads: Threads = 0
+    ray: RayAddress = None
+    cpus_per_object: Count = 2
+    gpus_per_object: NotNegative = 0
+    options_from: ConfigFile = None
+
+    def run(self) -> None:
+        """Learn, and print the scores and how to use the object."""
+        from mereo.api.steps import learn
+        from mereo.learning.object_folders import learn_objects
+        from mereo.workers.spread import choose_cluster
+
+        shared: dict[str, Any] = {
+            "minutes": self.minutes,
+            "init": self.init,
+            "units": self.units,
+            "workers": workers_for(self.workers, self.threads),
+            "train": self.train,
+        }
+        if len(self.object) == 1 and self.object[0].is_dir():
+            task = ONE_CPU if self.ray is None else TaskResources(self.cpus_per_object, self.gpus_per_object)
+            cluster = choose_cluster(self.ray, self.threads, task)
+            if cluster is not None:
+                shared["workers"] = cluster.cpus
+            learn_objects(self.object[0], self.output, shared, cluster)
+        elif self.ray is not None:
+            raise ValueError("--ray is for a folder of objects, each of which is a task: name one, or leave it out")
+        else:
+            learn(self.object, self.output, **shared)
+
+
+@dataclass(frozen=True)
 class Export:
     """Write weights as two graphs, encoder and query, for ONNX Runtime (no torch needed) or for torch.export.
 
@@ -274,11 +338,3 @@ class Export:
         from mereo.api.steps import export
 
         export(self.weights, self.output, self.format, self.force)
-
-
-def part_of(shard: str) -> tuple[int, int]:
-    """Part and number of parts of a shard: ``"1/4"`` is part 1 of 4, counted from 0. Raises ``ValueError``."""
-    part, _, parts = shard.partition("/")
-    if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
-        raise ValueError(f"the shard is {shard!r}; it must be i/n with i from 0 to n - 1: give for example --shard 0/4")
-    return int(part), int(parts)

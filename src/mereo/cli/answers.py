@@ -1,0 +1,240 @@
+"""The commands that answer frames: reconstruct, stream, serve."""
+
+import os
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import UseAppendAction, arg
+
+from mereo.cli.config_file import ConfigFile
+from mereo.cli.options import InputName, Inputs, MeshUnits, Outcome
+from mereo.fitting.config import AnswerMethod
+from mereo.fitting.tracking.config import StreamMethod
+from mereo.io.bounds import Cells, Port, Positive, Threads, Workers
+from mereo.io.config import CarryFrame, FilesConfig, InputConfig
+from mereo.models.config import InferenceConfig
+from mereo.reconstruction.config import IsolationConfig
+from mereo.workers.config import ONE_CPU, RayAddress, TaskResources
+from mereo_serving.config import ServeConfig
+
+SERVE_MODULES = ("fastapi", "uvicorn", "prometheus_client", "python_multipart")
+"""Modules of the extra `serve`."""
+
+
+@dataclass(frozen=True)
+class ReconstructCommand:
+    """Reconstruct all segments from a frame, a depth image, point cloud or ROS recording, or from many frames.
+
+    Several frames, or folders of them, share one loading of the weights and all options. Each gets a folder of its own
+    in --output, named by its file; one that cannot be answered is reported and skipped.
+
+    The exit status is 0 where every frame is answered, 3 where an answer is not recognized as the object, 2 where a
+    frame cannot be answered.
+
+    Attributes:
+        inputs: depth images (PNG, TIFF, EXR, NPY), point clouds (PLY, PCD, XYZ, NPY, NPZ, ZDF), ROS recordings (bag,
+            MCAP; one frame of each), or folders of images and clouds; results are in each one's frame and units.
+        object: what is looked for: its meshes, one file for each segment, one file of named parts or a label volume; a
+            scene file, a built-in scene's name, or the folder of `mereo learn`. Nothing is trained for it.
+        weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
+        units: of the object's meshes; guessed where not given.
+        output: folder to create, by default result, result2, ...; of several frames, the folder in which each one's is
+            created.
+        resolution: grid cells along the longest side.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
+        files: which files, and in which unit.
+        method: register the object's own deformation model to the frame: auto takes the registered model where it
+            explains the frame, if the weights carry one; network leaves the network's answer, search the network out;
+            modes and full take the model in any case, full by fitting the draws of the scene as well.
+        scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
+        carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
+            glTF), points (PLY, PCD, XYZ, NPY), CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses) or volume (NIfTI,
+            NRRD), which is resampled around the object.
+        carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
+        explain: segment, for its centroid, or place x,y,z in the input's frame and unit: print how sure the object's
+            point there is and what leaves it unsure, and write the observed points coloured by how much each decides it
+            (explained/1.ply, those that the model does not explain in red); once for each. The report has all segments.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        ray: answer each of several frames in a task of a Ray cluster: local, one of so many --threads for this run;
+            auto or HOST:PORT, the one that this machine is a node of.
+        task: what each task has for itself.
+        json: print the summary as one JSON object on standard output, of several frames a list of them in it, and all
+            else on standard error.
+        options_from: file of options, JSON or YAML, such as the config.json of a result; the command line wins over it.
+    """
+
+    inputs: Inputs
+    object: tuple[str, ...] = ()
+    weights: str | None = None
+    units: MeshUnits = None
+    output: Path | None = None
+    resolution: Cells = 128
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
+    method: AnswerMethod = "auto"
+    scene: str | None = None
+    carry: UseAppendAction[tuple[Path, ...]] = ()
+    carry_frame: CarryFrame = "source"
+    explain: UseAppendAction[tuple[str, ...]] = ()
+    force: bool = False
+    threads: Threads = 0
+    ray: RayAddress = None
+    task: Annotated[TaskResources, arg(name="")] = ONE_CPU
+    json: bool = False
+    options_from: ConfigFile = None
+
+    def run(self) -> Outcome:
+        """Write the folder of results and print the segments."""
+        from mereo.api.result import free_folder
+        from mereo.cli.reconstruct import FrameJob
+        from mereo.cli.reconstruct_many import reconstruct_inputs
+        from mereo.workers.spread import choose_cluster
+
+        cluster, inference = choose_cluster(self.ray, self.threads, self.task), self.inference
+        if cluster is not None and self.weights is not None:
+            from mereo.models.remote import settings_for
+
+            inference = settings_for(inference, cluster)
+        job = FrameJob(self, inference)
+        return reconstruct_inputs(self.inputs, self.output or free_folder(), job, cluster)
+
+
+@dataclass(frozen=True)
+class StreamCommand:
+    """Reconstruct frames as they come: the latest one wins, a bad one is reported and passed over.
+
+    Each answer is one line of JSON on standard output, in the input's frame and units; rate and latency come at the
+    end, on standard error. Where the object's own deformation model is known, it is followed: each frame's fit starts
+    from the last one's state, and network or search are asked at first and where the object is lost. The exit status is
+    0 where any frame was answered and the sequence was whole, else 2.
+
+    Attributes:
+        input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
+        object: what is looked for, as for `mereo reconstruct`: its meshes or its scene.
+        weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
+        units: of the object's meshes; guessed where not given.
+        resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
+        method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
+            the network; network asks it alone, for each frame anew; search leaves it out; modes takes the model in any
+            case.
+        uncertainty: say how sure the registered model is: radii, in the input's unit, that hold the true places of the
+            surface and of each segment's centroid with probability 0.95, and intervals of its volume; takes some 30 ms.
+        rate: frames per second at which a folder was recorded.
+        every_frame: answer all frames, however long it takes, instead of the latest.
+        watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
+        surfaces: folder for the surfaces of each answered frame, one GLB file each; one with content is refused.
+        rerun: a new recording FILE.rrd for `rerun FILE.rrd`, or the address of an open viewer: needs the extra `rerun`.
+        force: write into a folder with content, and replace the files of the same names in it; replace a recording.
+        reading: how a frame is read.
+        isolation: what is left out of it.
+        inference: where and how exactly the network computes.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+    """
+
+    input: InputName
+    object: tuple[str, ...] = ()
+    weights: str | None = None
+    units: MeshUnits = None
+    resolution: Cells = 48
+    method: StreamMethod = "auto"
+    uncertainty: bool = False
+    rate: Positive = 30.0
+    every_frame: bool = False
+    watch: bool = False
+    surfaces: Path | None = None
+    rerun: str | None = None
+    force: bool = False
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    threads: Threads = 0
+
+    def run(self) -> None:
+        """Print a line of JSON for each frame, and the summary at the end."""
+        # read when torch is loaded; clouds of ever other sizes would fill it with products that do not come again
+        os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "4")
+        from mereo.cli.stream import stream_reconstructions
+
+        stream_reconstructions(
+            self.input,
+            self.weights,
+            looked_for=self.object,
+            units=self.units,
+            resolution=self.resolution,
+            rate_hz=self.rate,
+            every_frame=self.every_frame,
+            watch=self.watch,
+            surfaces=self.surfaces,
+            rerun=self.rerun,
+            force=self.force,
+            reading=self.reading,
+            isolation=self.isolation,
+            inference=self.inference,
+            method=self.method,
+            uncertainty=self.uncertainty,
+        )
+
+
+@dataclass(frozen=True)
+class ServeCommand:
+    """Answer frames of many clients over HTTP: a depth image or cloud in, JSON or GLB out: needs the extra `serve`.
+
+    POST a frame to /v1/NAME/reconstruct; /docs says how, /metrics has numbers for Prometheus. TERM and Ctrl-C answer
+    what is begun and refuse the rest.
+
+    Attributes:
+        object: meshes, joined by commas, or a scene, once for each object that has no weights; NAME=FILE,FILE says what
+            clients call it.
+        weights: a shipped name or a file, once for each object that has them; NAME=FILE says what clients call it.
+        scene: NAME=FILE of the scene whose draws are fitted, where it is not the built-in one of the weights; once for
+            each.
+        method: register the object's own deformation model to the frames: auto takes the registered model where it
+            explains the frame, if the weights carry one; network leaves the network's answer, search the network out;
+            modes and full take the model in any case, full by fitting the draws of the scene as well.
+        port: where it listens; 0 takes any that is free.
+        host: address of this machine. Only this machine reaches the default. Another one needs the token of the address
+            that is printed, and others on the network can read along: a proxy that encrypts is safer.
+        resolution: grid cells along the longest side, where a request does not say.
+        limits: so that no client, and no crowd of them, takes more than the machine has.
+        inference: where and how exactly the networks compute.
+        workers: processes that answer, each with all weights and one thread; 0 means one per core that is free, on half
+            of them at least.
+    """
+
+    object: UseAppendAction[tuple[str, ...]] = ()
+    weights: UseAppendAction[tuple[str, ...]] = ()
+    scene: UseAppendAction[tuple[str, ...]] = ()
+    method: AnswerMethod = "auto"
+    port: Port = 8000
+    host: str = "127.0.0.1"
+    resolution: Cells = 128
+    limits: Annotated[ServeConfig, arg(name="")] = field(default_factory=ServeConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    workers: Workers = 0
+
+    def run(self) -> None:
+        """Serve until a signal asks for the end."""
+        if missing := [name for name in SERVE_MODULES if find_spec(name) is None]:
+            raise ImportError(f"{missing[0]} is not installed; `mereo serve` needs it: run pip install 'mereo[serve]'")
+        from mereo.io.cores import FreeCores, cores, threads_for
+        from mereo_serving.server import serve
+
+        serve(
+            self.weights,
+            objects=self.object,
+            scenes=self.scene,
+            method=self.method,
+            resolution=self.resolution,
+            host=self.host,
+            port=self.port,
+            workers=self.workers or threads_for(FreeCores().now(), cores()),
+            config=self.limits,
+            inference=self.inference,
+        )

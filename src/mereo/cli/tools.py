@@ -1,0 +1,217 @@
+"""The commands for one tool each: align, experiment, bench."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tyro.conf import Positional
+
+from mereo.cli.options import ScanCloud
+from mereo.io.bounds import Count, CountOrNone, PositiveOrUnknown, Threads, Workers
+from mereo.io.cores import workers_for
+from mereo.models.config import Device, Precision
+from mereo.training.config import PresetName
+from mereo_experiments.paper.scales import ExperimentName, ScaleName
+
+if TYPE_CHECKING:
+    from mereo.evaluation.registration.placement import Placement
+
+
+@dataclass(frozen=True)
+class Align:
+    """Place every segment of a model on a full-resolution scan, from a rough start: ground truth for `mereo evaluate`.
+
+    Attributes:
+        scan: point cloud (PLY, PCD, XYZ, NPY, NPZ) that shows this object alone, from one side.
+        scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
+        output: folder to create: truth.json, overlay.png, segments.glb.
+        start: JSON file with poses or picked point pairs, of the object or of single segments.
+        weights: instead of --start, a shipped name or a file: the network's guess. The truth is then not independent.
+        unit: of the scan.
+        scene_unit_mm: millimetres per scene unit, where the scene does not say.
+        frame: axes of the scan: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
+        as_one: the object is rigid: place it as a whole.
+        hold: segments to leave at their start or at their neighbour, whatever the scan shows.
+        drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
+        force: replace an existing output folder that mereo wrote, and nothing else is in.
+    """
+
+    scan: ScanCloud
+    scene: str
+    output: Path
+    start: Path | None = None
+    weights: str | None = None
+    unit: Literal["m", "cm", "mm", "in"] = "m"
+    scene_unit_mm: PositiveOrUnknown = None
+    frame: Literal["camera", "scanner"] = "camera"
+    as_one: bool = False
+    hold: tuple[str, ...] = ()
+    drop_invalid: bool = False
+    force: bool = False
+
+    def run(self) -> None:
+        """Write truth.json, overlay.png and segments.glb into a new folder, and print the residuals."""
+        if (self.start is None) == (self.weights is None):
+            raise ValueError(
+                f"{'no start is' if self.start is None else 'two starts are'} given; one is needed: --start FILE or "
+                "--weights NAME (docs/own-object.md says how to make a start file)"
+            )
+        from mereo.evaluation.registration.icp import load_icp
+        from mereo.evaluation.registration.placement import place, read_start, start_from_model
+        from mereo.evaluation.registration.truth_file import TRUTH, ScanFile, write_truth
+        from mereo.geometry.conventions import UNITS_M
+        from mereo.io.output_folders import new_directory
+        from mereo.io.readers import read_point_cloud
+        from mereo.io.writers.glb import viewer_rotation, write_segments_glb
+        from mereo.models.weights import load_model
+        from mereo.scenes.registry import files_of, is_yaml, load_scene
+        from mereo.scenes.scene import SCENES
+        from mereo.visualization.contact_sheets import save_png
+        from mereo.visualization.scan_overlay import overlay
+
+        load_icp()  # its absence is better said before the work
+        scan = ScanFile(self.scan, self.unit, self.frame, self.drop_invalid)
+        read = [path for path in (self.scan, *files_of(self.scene), self.start, self.weights) if path is not None]
+        with new_directory(self.output, self.force, read) as directory:
+            scene = load_scene(self.scene)
+            rest, unit_m = scene.rest, scene.unit_m if self.scene_unit_mm is None else self.scene_unit_mm / 1000
+            cloud = read_point_cloud(self.scan, self.drop_invalid)
+            scale = None if unit_m is None else unit_m / UNITS_M[self.unit]
+            if self.start is not None:
+                start = read_start(self.start, rest, scale)
+            else:
+                start = start_from_model(load_model(str(self.weights)), cloud.points, self.frame, rest, scale)
+            placement = place(rest, cloud.points, start, self.frame, as_one=self.as_one, hold=self.hold)
+            write_truth(directory, self.output, scan, self.scene, rest, placement, start.how)
+            write_segments_glb(
+                directory / "segments.glb", placement.mesh, viewer_rotation(self.frame), UNITS_M[self.unit]
+            )
+            save_png(directory / "overlay.png", overlay(placement, cloud, scan))
+        print_placement(placement, f"{self.scan.name}, {len(cloud)} points", 1000 * UNITS_M[self.unit])
+        # a data file runs no Python scene
+        trusted = "" if self.scene in SCENES or is_yaml(self.scene) else f" --scene {self.scene}"
+        evaluation = f"mereo evaluate WEIGHTS --scans {self.output / TRUTH}{trusted}"
+        print(f"wrote {self.output}; look at {self.output / 'overlay.png'}, then: {evaluation}")
+
+
+def print_placement(placement: "Placement", title: str, mm: float) -> None:
+    """Print a table of the segments, lengths in millimetres, and how much of the scan they explain.
+
+    Args:
+        placement: in the scan's frame and unit.
+        title: of the table.
+        mm: millimetres in a unit of the scan.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{title}; millimetres and degrees", title_justify="left", box=None, padding=(0, 2, 0, 0))
+    for column in ("segment", "placed by"):
+        table.add_column(column, no_wrap=True)
+    for column in ("points", "median", "RMS", "95 %", "moved", "turned", "held"):
+        table.add_column(column, justify="right")
+    for one in placement.segments:
+        fit = [f"{mm * value:.3f}" if one.points else "-" for value in (one.median, one.rms, one.p95)]
+        by = one.placed_by if one.seen else f"unseen: {one.placed_by}"
+        held = str(one.held) if one.held else ""
+        table.add_row(one.name, by, str(one.points), *fit, f"{mm * one.shift:.2f}", f"{one.turn_deg:.1f}", held)
+    console = Console(markup=False, emoji=False)
+    console.print(table)
+    console.print(
+        f"{placement.explained:.1%} of the scan lies within {mm * placement.limit:.3g} mm of the placed segments",
+        highlight=False,
+        soft_wrap=True,
+    )
+    for one in placement.segments:
+        if one.held:
+            console.print(
+                f"{one.name}: the scan leaves {one.held} of 6 directions open (it could turn or slide); there it "
+                "stays where it was placed together with the others",
+                highlight=False,
+                soft_wrap=True,
+            )
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Repeat one of the paper's experiments; the same command again continues a stopped one. `list` says which.
+
+    Attributes:
+        name: which one; list shows what each answers and costs, and which results are here.
+        scale: smoke shows in minutes that it runs, cpu takes hours on two cores, paper is the full recipe for a GPU.
+        objects: some of the experiment's own, whatever the scale takes: --objects engine.
+        output: folder for datasets, runs, scores and results, shared by all experiments.
+        workers: processes that make datasets; 0 means as many as --threads.
+        threads: of torch and all else that computes; 0 means one per core, and 1 helps on a busy machine.
+    """
+
+    name: Positional[Literal["list", ExperimentName]]
+    scale: ScaleName = "smoke"
+    objects: tuple[str, ...] = ()
+    output: Path = Path("out/experiments")
+    workers: Workers = 0
+    threads: Threads = 0
+
+    def run(self) -> None:
+        """Run the experiment and print its table, or list all."""
+        if self.name == "list":
+            from mereo_experiments.paper.plan import list_experiments
+
+            list_experiments(self.output)
+            return
+        from mereo.io.plots import pyplot
+
+        pyplot()  # before the hours that it takes
+        from mereo_experiments.paper.registry import run_experiment
+
+        workers = workers_for(self.workers, self.threads)
+        directory = run_experiment(self.name, self.scale, self.output, workers, self.objects)
+        print((directory / "table.md").read_text("utf-8"))
+        print(f"wrote {directory}")
+
+
+@dataclass(frozen=True)
+class BenchCommand:
+    """Time every stage of an answer against this machine's floor, and against the straightforward implementation.
+
+    Attributes:
+        weights: a shipped name or a file; without it the preset's network is fitted to one shipped frame first.
+        preset: the architecture to fit.
+        device: where the network runs, auto on a CUDA device where there is one; preprocessing is always on the CPU.
+        precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
+        repeats: of each stage.
+        rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
+        beside: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
+        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        output: a JSON file for the figures.
+        force: replace an existing file, unless the weights are read from it.
+    """
+
+    weights: str | None = None
+    preset: PresetName = "paper"
+    device: Device = "auto"
+    precision: Precision = "float32"
+    repeats: Count = 7
+    rival: bool = False
+    beside: CountOrNone = 1
+    threads: Threads = 0
+    output: Path | None = None
+    force: bool = False
+
+    def run(self) -> None:
+        """Print the times of all stages of an answer."""
+        from mereo.models.device import find_device
+        from mereo_experiments.speed.report import benchmark
+
+        device = find_device(self.device)
+        benchmark(
+            self.weights,
+            self.preset,
+            device,
+            self.precision,
+            self.repeats,
+            self.rival,
+            self.beside,
+            self.output,
+            self.force,
+        )
