@@ -92,10 +92,11 @@ class Display:
         toward: Callable[[], Float[np.ndarray, "3"]],
         bounds: Callable[[], Float[np.ndarray, "2 3"]],
         first: str = "camera",
-    ) -> None:
+    ) -> Callable[[str], None]:
         """Add buttons that turn the page to ``bounds`` as seen from ``toward`` (``first``), its side and its back.
 
-        The page is turned to the first view at once. All are a little from above and from the side.
+        The page is turned to the first view at once. All are a little from above and from the side. Returns what turns
+        the page to a view by its name.
         """
 
         def look(name: str) -> None:
@@ -107,6 +108,7 @@ class Display:
         view = self.server.gui.add_button_group("View", (first, "side", "behind"))
         view.on_click(lambda _: look(view.value))
         look(first)
+        return look
 
 
 class SegmentControls:

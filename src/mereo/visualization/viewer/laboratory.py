@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from mereo.evaluation.cases import grid_confusion, labels_on
 from mereo.evaluation.ground_truth import truth_grid
@@ -40,7 +39,8 @@ from mereo.visualization.viewer.display import Display, PointLayer, SegmentContr
 from mereo.visualization.viewer.probe import source_of
 from mereo.visualization.viewer.server import OpenPage, import_viser, start_server
 
-PAPER = GenerateConfig()
+PIXELS = 64
+"""Pixels a side of the simulated camera."""
 
 CELLS = 64
 """Cells a side on which an answer is scored; the paper takes 100, fewer are faster and a little off."""
@@ -48,11 +48,8 @@ CELLS = 64
 RESOLUTION = 96
 """Cells along the longest side of a network's surfaces."""
 
-ASIDE = 1.2
-"""Shift of the truth and of what is found, side by side, in stage units."""
-
-UNDER = 1.25
-"""Distance below the middle at which each is named, in stage units."""
+GAP = 0.15
+"""Room beside and below truth and reconstruction, side by side, in stage units."""
 
 
 # --- without a page ---------------------------------------------------------------------------------------------------
@@ -134,8 +131,8 @@ class Laboratory:
         center, cosine = state.mesh.bounds.mean(axis=0), float(np.cos(place.tilt_rad))
         T_world_camera = workspace.pose(center, cosine, place.azimuth_rad, place.distance)
         mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
-        camera = Camera.from_fov(PAPER.image_size, PAPER.image_size, workspace.fov_rad)
-        seen = observe(Solids(mesh), camera, PAPER.noise_std, SENSORS[sensor], np.random.default_rng(0))
+        camera = Camera.from_fov(PIXELS, PIXELS, workspace.fov_rad)
+        seen = observe(Solids(mesh), camera, GenerateConfig().noise_std, SENSORS[sensor], np.random.default_rng(0))
         if seen.object_points < MIN_POINTS:
             raise ValueError(
                 f"the camera sees {seen.object_points} points of the object; at least {MIN_POINTS} are needed: move "
@@ -172,7 +169,8 @@ class ParameterSliders:
 
     def __init__(self, gui: Any, moved: Callable[[Slot, float], None]) -> None:
         self._gui, self._moved = gui, moved
-        self._folder: Any = None
+        self._folder = gui.add_folder("Deformation")
+        self._groups: dict[str, Any] = {}
         self._handles: dict[Slot, Any] = {}
 
     def show(self, shown: Sequence[Parameter]) -> None:
@@ -188,15 +186,15 @@ class ParameterSliders:
             handle.value = min(max(round(parameter.value / step) * step, low), high)
 
     def _build(self, shown: Sequence[Parameter]) -> None:
-        if self._folder is not None:
-            self._folder.remove()
-        self._folder, self._handles = self._gui.add_folder("Deformation"), {}
-        groups: dict[str, Any] = {}
+        for group in self._groups.values():
+            group.remove()
+        self._groups, self._handles = {}, {}
         for parameter in shown:
-            with self._folder:
-                if parameter.group not in groups:
-                    groups[parameter.group] = self._gui.add_folder(parameter.group, expand_by_default=not groups)
-            with groups[parameter.group]:
+            group = parameter.group
+            if group not in self._groups:
+                with self._folder:
+                    self._groups[group] = self._gui.add_folder(group, expand_by_default=not self._groups)
+            with self._groups[group]:
                 self._handles[parameter.key, parameter.index] = self._add(parameter)
 
     def _add(self, parameter: Parameter) -> Any:
@@ -271,7 +269,7 @@ class LabPage:
         panel.set_width(300)
         network = self.laboratory.network
         facts = "no weights: a search finds the object" if network is None else f"weights {network.name}"
-        with panel.add_tab("What the camera sees"):
+        with panel.add_tab("Frame"):
             gui.add_html(html.heading(f"Laboratory: {self.laboratory.scene.name}", facts))
             self.picture = gui.add_image(np.zeros((320, 320, 3), dtype=np.uint8), format="png")
             self.scores = gui.add_html("")
@@ -283,7 +281,7 @@ class LabPage:
         self.sliders = ParameterSliders(gui, self.move)
         self.points = PointLayer(self.stage)
         self.controls = SegmentControls(gui, rest, self._draw)
-        self.stage.add_views(self._toward, self._bounds)
+        self._look = self.stage.add_views(self._toward, self._bounds)
 
     def _build_camera(self) -> None:
         gui, first, laboratory = self.server.gui, self.laboratory.first_place, self.laboratory
@@ -350,6 +348,7 @@ class LabPage:
             self.scores.content = html.scores(self.trial.scores, surfaces.names, surfaces.colors)
             self._say(f"{self.trial.source}; {self.trial.seconds:.1f} s; scored on {CELLS}³ points")
             self._draw()
+            self._look("camera")
 
     # --- what is shown ------------------------------------------------------------------------------------------------
 
@@ -358,11 +357,14 @@ class LabPage:
             float(np.deg2rad(self._tilt.value)), float(np.deg2rad(self._around.value)), float(self._distance.value)
         )
         self.sliders.show(parameters(self.shape))
+        is_first = self.view is None
         self.view, self.trial = self.laboratory.look(self.shape, place, self.sensor.value), None
         self.picture.image = enlarged(depth_picture(self.view.depth))
         self.scores.content = ""
         self._say(f"{len(self.view.depth.to_points()):,} points seen")
         self._draw()
+        if is_first:
+            self._look("camera")
 
     def _say(self, text: str, bad: bool = False) -> None:
         self.status.content = html.message(text, bad)
@@ -372,39 +374,39 @@ class LabPage:
         return np.array([0.0, 0.0, 1.0]) if self.view is None else -self.view.T_world_camera[:3, 2]
 
     def _bounds(self) -> Float[np.ndarray, "2 3"]:
-        """Box around the object, or around truth and reconstruction beside each other."""
-        low, high = self.laboratory.scene.rest.bounds
-        room = (high - low).max() * (0.15 if self.trial is None else 0.6)
-        return np.stack([low - room, high + room])
+        """Box around the object, or around truth and reconstruction side by side, in the scene's frame."""
+        if self.view is None:
+            return self.laboratory.scene.rest.bounds
+        low, high = self.view.mesh.transformed(self.view.T_world_camera).bounds
+        aside = np.abs(self._aside(self.view)) / self.stage.scale
+        return np.stack([low - aside, high + aside])
+
+    def _aside(self, view: View) -> Float[np.ndarray, "3"]:
+        """Shift on the stage of the truth to the right, and of what is found to the left, once it is there."""
+        width = float(np.ptp(view.mesh.bounds[:, 0])) * self.stage.scale
+        return (0.0 if self.trial is None else 0.5 * width + GAP) * view.T_world_camera[:3, 0]
 
     def _draw(self) -> None:
         """Callbacks of several threads draw; one at a time."""
-        view, trial = self.view, self.trial
-        if view is None:
-            return
         with self._drawing, self.server.atomic():
-            T, right, down = view.T_world_camera, view.T_world_camera[:3, 0], view.T_world_camera[:3, 1]
-            aside = (0.0 if trial is None else ASIDE) * right
-            self.true.show(view.mesh.transformed(T), self.controls, shift=aside)
-            self.points.show(PointCloud(transform_points(T, view.depth.to_points().points)), -aside)
+            view, trial = self.view, self.trial
+            if view is None:
+                return
+            T_world_camera, aside = view.T_world_camera, self._aside(view)
+            self.true.show(view.mesh.transformed(T_world_camera), self.controls, shift=aside)
+            self.points.show(PointCloud(transform_points(T_world_camera, view.depth.to_points().points)), -aside)
             for name in self._names:
                 name.remove()
             self._names = []
             if trial is None:
                 self.found.clear_from()
-            else:
-                self.found.show(trial.surfaces.transformed(T), self.controls, shift=-aside)
-                for text, shift in (("reconstruction", -aside), ("truth", aside)):
-                    place = tuple(shift + UNDER * down)
-                    label = self.server.scene.add_label(f"/names/{text}", text, position=place, anchor="top-center")
-                    self._names.append(label)
-            x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-            self.server.scene.add_camera_frustum(
-                "/camera",
-                self.laboratory.scene.workspace.fov_rad,
-                1.0,
-                scale=0.35,
-                color=(150, 160, 176),
-                wxyz=(w, x, y, z),
-                position=tuple(self.stage.place(T[:3, 3])),
-            )
+                return
+            self.found.show(trial.surfaces.transformed(T_world_camera), self.controls, shift=-aside)
+            low, high = view.mesh.bounds  # of the camera frame, where y is down
+            foot = np.array([(low[0] + high[0]) / 2, high[1] + GAP / self.stage.scale, (low[2] + high[2]) / 2])
+            place = self.stage.place(transform_points(T_world_camera, foot))
+            for text, shift in (("reconstruction", -aside), ("truth", aside)):
+                label = self.server.scene.add_label(
+                    f"/names/{text}", text, position=tuple(place + shift), anchor="top-center"
+                )
+                self._names.append(label)
