@@ -12,13 +12,13 @@ from mereo.api.frames import load_frame
 from mereo.api.objects import Object
 from mereo.cli import demo
 from mereo.evaluation.sample_views import GUESSED_UNIT_M
+from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.state import STATE, load_state
 from mereo.geometry.solids import Solids
 from mereo.io.output_folders import MARKER, new_directory
 from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud
 from mereo.models.weights import load_model
-from mereo.visualization.viewer.laboratory import QuickRegistrar
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_weights_with_a_statistical_model_show_the_fit_and_write_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert rope.statistical_model is not None
-    modes = QuickRegistrar(rope, rope.statistical_model)  # the scene's draws would take long
+    modes = Registrar(rope, rope.statistical_model, "modes")  # the scene's draws would take long
     monkeypatch.setattr(demo, "load_object", lambda _: Object(rope, None, {"auto": modes}))
     demo.main(tmp_path)
     out = capsys.readouterr().out

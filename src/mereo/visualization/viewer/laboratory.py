@@ -338,7 +338,7 @@ class LabPage:
         with self._working:
             if self.view is None:
                 return
-            self._say("reconstructing")
+            self._say("reconstructing; the first time takes longest")
             try:
                 self.trial = self.laboratory.answer(self.view)
             except Exception as error:  # as above
