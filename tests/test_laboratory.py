@@ -15,7 +15,7 @@ from mereo.evaluation.metrics import Scores
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
-from mereo.scenes.parameters import Parameter, parameters, random_state, set_value
+from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Workspace
 from mereo.scenes.statistical_model import StatisticalModel
@@ -109,7 +109,7 @@ def test_weights_answer_as_they_do_elsewhere(rope: Model) -> None:
 def test_a_slider_has_few_digits_and_a_hundred_steps(
     low: float, high: float, value: float, ends: tuple[float, float, float]
 ) -> None:
-    slider = Parameter((((), None), 0), None, "whole", "x", "", low, high, value)  # type: ignore[arg-type]
+    slider = replace(parameters(random_state(toy_scene(), 0))[0], low=low, high=high, value=value)
     assert slider_range(slider) == pytest.approx(ends)
     assert slider_range(replace(slider, low=2.0, high=5.0, whole=True)) == (2.0, 5.0, 1.0)
 
@@ -127,7 +127,7 @@ def test_sliders_and_buttons_change_what_is_shown(server: object) -> None:
     page.move((slider.key, slider.index), 0.25)
     assert parameters(page.shape)[1].value == pytest.approx(0.25)
     assert page.sliders._handles[slider.key, slider.index].value == pytest.approx(0.25)
-    page.move((((), None), 7), 0.5)  # type: ignore[arg-type]  # of a state that has just gone
+    page.move(((slider.key[0], 99), 0), 0.5)  # of a state that has just gone
     before = page.view.depth.depth
     page._tilt.value = 3.0
     page.update()

@@ -183,9 +183,9 @@ def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
 
 
 def test_an_inner_segment_is_seen_through_the_outer_one(folder: Path) -> None:
-    assert content_of_files(folder).mesh.opaque == [True, True]
+    assert content_of_files(folder).mesh.opaque == (True, True)
     (folder / "summary.json").write_text(json.dumps({"nested": [["head", "tail"]]}))
-    assert content_of_files(folder).mesh.opaque == [True, False]
+    assert content_of_files(folder).mesh.opaque == (True, False)
     for damaged in ('{"nested": [["head", "nose"]]}', '{"nested": 3}', "{}", "[]", "{", '{"nested": [[[], {}]]}'):
         (folder / "summary.json").write_text(damaged)
         assert content_of_files(folder).mesh.nested == ()
@@ -224,7 +224,7 @@ def test_places_are_asked_of_the_default_answer(rope: Model) -> None:
     answer = answer_to(cloud, rope, Registrar.of(rope, "modes"), 24)
     assert answer.registered is not None
     assert f"registered model (modes) explains {answer.registered.explained:.1%}" in content_of_answer(answer).verdict
-    points = np.concatenate([cloud.points[:5] + [0, 0, 1], cloud.points[:2] - [0, 0, 10]])
+    points = np.concatenate([cloud.points[:5] + np.array([0, 0, 1]), cloud.points[:2] - np.array([0, 0, 10])])
     shown, wanted = seen_as(answer, points), answer.registered.query(points)
     np.testing.assert_array_equal(shown.label, wanted.label)
     np.testing.assert_allclose(shown.distance, wanted.distance)
