@@ -130,8 +130,8 @@ def small_previews(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def server() -> Iterator[object]:
     """A viewer's server on a free port, without pages."""
-    from mereo.visualization.viewer import display
+    from mereo.visualization.viewer.server import start_server, stop_server
 
-    started = display.start_server(0, "mereo")
+    started = start_server(0)
     yield started
-    display.stop_server(started)
+    stop_server(started)

@@ -17,11 +17,11 @@ from test_reconstruction import BIG, NAMES, SMALL, front, two_balls
 
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
-from mereo.visualization.viewer.guard import Entry
 from mereo_serving.answering import Answerer
 from mereo_serving.app import Service, make_app
 from mereo_serving.config import ServeConfig
 from mereo_serving.dispatcher import Dispatcher
+from mereo_serving.gate import Entry
 from mereo_serving.messages import FrameRequest, Reply, Served, Setup
 from mereo_serving.metrics import Metrics
 from mereo_serving.workers import WorkerDied

@@ -6,19 +6,14 @@ import numpy as np
 import pytest
 from shapes import ball
 
-from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
-from mereo.geometry.solids import Solids
 from mereo.models.trained import Answer
 from mereo.visualization.vertex_colors import (
     ColorScale,
     confidence,
     distance_scale,
-    error_scale,
     observed_distance,
-    surface_error,
 )
-from mereo.visualization.viewer.laboratory import FAR, NEAR, NOTHING, depth_picture
 from mereo.visualization.viewer.probe import first_hit
 
 GREYS = ColorScale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
@@ -53,7 +48,6 @@ def test_segments_that_were_not_found_have_no_colours() -> None:
     lost = replace(mesh.segments[1], vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), dtype=np.int64))
     mesh = SegmentedMesh((mesh.segments[0], lost))
     assert [len(v) for v in observed_distance(mesh, np.zeros((1, 3)))] == [len(mesh.segments[0].vertices), 0]
-    assert len(surface_error(mesh, Solids(two_balls()))[1]) == 0
     assert distance_scale([np.zeros(0)], "").high > 0
 
 
@@ -65,16 +59,6 @@ def test_distance_to_what_was_observed_tells_seen_from_guessed() -> None:
     assert two.max() == pytest.approx(6.0, abs=0.05)
     scale = distance_scale([one, two], " mm")
     assert 0 < scale.high <= 6 and scale.words[1].endswith(" mm, guessed")
-
-
-@pytest.mark.parametrize("radius, wanted", [(2.5, 0.5), (1.6, -0.4)])
-def test_error_is_positive_outside_of_the_truth(radius: float, wanted: float) -> None:
-    for values in surface_error(two_balls(radius), Solids(two_balls())):
-        np.testing.assert_allclose(values, wanted, atol=0.03)
-    scale = error_scale(two_balls(), "")
-    assert (scale.low, scale.high) == (-0.5, 0.5)
-    blue, orange = scale.colors(np.array([0.5, -0.5])).tolist()
-    assert blue[2] > blue[0] and orange[0] > orange[2]
 
 
 def test_vertex_normals_of_a_ball_point_away_from_its_middle() -> None:
@@ -108,10 +92,3 @@ def test_first_hits_are_those_of_moeller_and_trumbore() -> None:
             hits += 1
             np.testing.assert_allclose(found, origin + distance * direction, atol=1e-5)
     assert 20 < hits < 60
-
-
-def test_a_depth_picture_shows_near_light_and_nothing_dark() -> None:
-    camera = Camera.from_fov(3, 1, 1.0)
-    picture = depth_picture(DepthImage(np.array([[0.0, 2.0, 5.0]]), camera), factor=2)
-    assert picture.shape == (2, 6, 3)
-    assert [tuple(p) for p in picture[0, ::2].tolist()] == [NOTHING, NEAR, FAR]

@@ -1,5 +1,6 @@
 """No cloud is encoded twice: the code that a reconstruction comes with answers everything that is asked after it."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from answers import answer_to, reconstruct
 
 import mereo
 from mereo.evaluation.sample_views import load_view
+from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
@@ -17,7 +19,7 @@ from mereo.scenes.parameters import random_state
 from mereo.scenes.registry import load_scene
 from mereo.visualization.vertex_colors import confidence
 from mereo.visualization.viewer.laboratory import Laboratory
-from mereo.visualization.viewer.probe import Inspection
+from mereo.visualization.viewer.probe import ask_network, probe_answer
 
 
 @pytest.fixture
@@ -36,9 +38,9 @@ def encoded(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
 
 @pytest.mark.slow
 def test_a_trial_of_the_laboratory(encoded: list[np.ndarray]) -> None:
-    laboratory = Laboratory(load_scene("rope"), load_model("rope"))
-    view = laboratory.look(random_state(laboratory.scene, 3), laboratory.first_place())
-    laboratory.rebuild(view, 16, 12)
+    laboratory = Laboratory(load_scene("rope"), model := load_model("rope"), Registrar.of(model, "modes"))
+    view = laboratory.look(random_state(laboratory.scene, 3), laboratory.first_place)
+    laboratory.answer(view)
     assert 1 <= len(encoded) <= 2, "a frame that counts as noisy is smoothed, which is another cloud"
     assert len({cloud.tobytes() for cloud in encoded}) == len(encoded)
 
@@ -52,9 +54,9 @@ def test_a_result_that_is_written(encoded: list[np.ndarray], tmp_path: Path) -> 
 def test_a_page_of_a_frame(encoded: list[np.ndarray]) -> None:
     cloud = load_view("rope").depth.to_points()
     model = load_model("rope")
-    inspection = Inspection.of_answer(answer_to(cloud, model, None, 16))
-    inspection.ask(cloud.points[:5])
-    confidence(inspection.surfaces, inspection.network)
+    answer = answer_to(cloud, model, None, 16)
+    probe_answer(answer, cloud.points[:5])
+    confidence(answer.reconstruction.surfaces, partial(ask_network, answer))
     assert len(encoded) == 1
 
 

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from mereo.cli.options import loaded_object
 from mereo.evaluation.cases import grid_confusion, labels_on
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.evaluation.metrics import intersection_over_union
+from mereo.fitting.registration.register import Registrar
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import ClustersWarning
@@ -24,7 +26,7 @@ from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.visualization.viewer.open_page import OpenPage
+from mereo.visualization.viewer.server import OpenPage
 from mereo_serving.answering import Answerer
 from mereo_serving.messages import JSON, FrameRequest, Served, Setup
 
@@ -159,12 +161,16 @@ def test_its_result_shows_itself(
     assert command_line.main(["view", str(tmp_path / "out"), "--port", "0"]) == 0
     opened[0].close()
     assert command_line.main(["view", str(tmp_path / "out"), "--object", "rope"]) == 2
-    assert "is a result, which shows itself: leave out --object" in capsys.readouterr().err
+    assert "is shown as it is, and --object is not asked: leave it out" in capsys.readouterr().err
 
 
-def test_a_page_needs_a_frame(meshes: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert command_line.main(["view", "--object", *meshes]) == 2
-    assert "no frame is given; --object is looked for in one" in capsys.readouterr().err
+def test_without_a_frame_its_laboratory_opens(meshes: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[tuple[Scene, object, Registrar]] = []
+    kept = SimpleNamespace(stay=lambda _: None)
+    monkeypatch.setattr("mereo.api.view.open_laboratory", lambda *given: opened.append(given[:3]) or kept)
+    assert command_line.main(["view", "--object", *meshes, "--units", "mm"]) == 0
+    scene, network, registrar = opened[0]
+    assert scene.rest.names == registrar.model.rest.names and network is None and registrar.network is None
 
 
 # --- what cannot be found ---------------------------------------------------------------------------------------------

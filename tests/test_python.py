@@ -18,7 +18,7 @@ from PIL import Image
 from toy_scene import toy_scene
 
 import mereo
-from mereo.api import reconstruct
+from mereo.api import reconstruct, view
 from mereo.api.result import SINGLE, Result
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
@@ -29,8 +29,8 @@ from mereo.io.output_folders import MARKER
 from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
 from mereo.visualization.units import Unit
-from mereo.visualization.viewer import result_page, serve
-from mereo.visualization.viewer.open_page import OpenPage
+from mereo.visualization.viewer import result_page
+from mereo.visualization.viewer.server import OpenPage
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 
@@ -272,7 +272,7 @@ def test_a_page_stays_open_where_somebody_goes_on(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = Server()
-    page = OpenPage(server, serve.Entry())
+    page = OpenPage(server)
     monkeypatch.setattr(OpenPage, "wait", lambda page: page.close())
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
     assert page.stay() is page and server.stopped == 0
@@ -290,14 +290,16 @@ def test_a_page_stays_open_where_somebody_goes_on(
 def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is computed again: the page's surfaces are the result's."""
     shown: list[Any] = []
-    monkeypatch.setattr(result_page, "import_viser", lambda: None)
-    monkeypatch.setattr(result_page, "start_server", lambda port, *_: shown.append(port) or Server())
-    monkeypatch.setattr(result_page, "FramePage", lambda *given: shown.append(given))
+    for module in (result_page, view):
+        monkeypatch.setattr(module, "import_viser", lambda: None)
+    monkeypatch.setattr(result_page, "start_server", lambda port: shown.append(port) or Server())
+    monkeypatch.setattr(result_page, "ResultPage", lambda _, content: shown.append(content))
     with result.show(block=False) as page, mereo.view(result, block=False, port=8081):
         assert page.address == "http://127.0.0.1:1234"
     assert shown[0] == 0 and shown[2] == 8081
-    _, inspection, title, facts, unit, depth = shown[1]
-    assert inspection.surfaces is result.reconstruction.surfaces and inspection.code is result.reconstruction.code
-    assert (title, unit, depth) == ("cloud", Unit(1.0), None) and facts.startswith("1,200 points")
+    content = shown[1]
+    assert content.mesh is result.reconstruction.surfaces
+    assert (content.title, content.unit, content.depth) == ("cloud", Unit(1.0), None)
+    assert content.facts.startswith("1,200 points")
     with pytest.raises(ValueError, match="both .* and --scene rope are given; one can be shown: drop one"):
         mereo.view("frame.ply", scene="rope", block=False)

@@ -2,12 +2,10 @@
 
 import json
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import until
 from toy_scene import Shear, rest_mesh, toy_scene
 
 from mereo import __main__ as command_line
@@ -21,10 +19,7 @@ from mereo.synthesis.clutter import OCCLUDER
 from mereo.synthesis.config import SENSORS
 from mereo.synthesis.recording import Moment, Recording, is_recording_folder, read_recording, sequence, write_recording
 from mereo.synthesis.sequence_config import SequenceConfig
-from mereo.visualization.viewer import display
-from mereo.visualization.viewer.sequence_page import SequencePage
 
-needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 SHORT = SequenceConfig(seconds=1.0, rate=12.0, occluded=0.5, image_size=48)
 
 
@@ -212,22 +207,3 @@ def test_test_seeds_are_for_testing(tmp_path: Path, capsys: pytest.CaptureFixtur
     out = ["scene", "record", "rope", "--output", str(tmp_path / "x"), "--seed", "1000000"]
     assert command_line.main(out) == 2 and not (tmp_path / "x").exists()
     assert "seeds from 1000000 up are for testing: take a smaller one, or say --test" in capsys.readouterr().err
-
-
-@needs_viser
-def test_the_page_plays_frames_and_answers(recording: Recording) -> None:
-    server = display.start_server(0, "mereo")
-    page = SequencePage(server, recording, lambda number: None if number == 4 else recording.truth(number), "toy")
-    try:
-        until(lambda: len(page.answers) == len(recording))
-        until(lambda: page.number.value > 0)  # it plays by itself
-        page.playing.value = False
-        page.number.value = 5
-        until(lambda: "in front" in page.told.content and len(page.found.handles) == 4)
-        page.number.value = 4
-        until(lambda: "not found" in page.told.content and not page.found.handles)
-        page.shown.value = "answer"
-        until(lambda: not page.true.handles)
-    finally:
-        page.close()
-        display.stop_server(server)

@@ -24,9 +24,9 @@ import uvicorn
 from serving_parts import ADDRESS, CLOUD, Server, ThreadWorker, balls, figures, npy, run, running, setup, until
 
 from mereo.cli.answers import ServeCommand
-from mereo.visualization.viewer.guard import bound_socket
 from mereo_serving.answering import Answerer
 from mereo_serving.config import ServeConfig
+from mereo_serving.gate import bound_socket
 from mereo_serving.messages import Served
 from mereo_serving.names import served_objects
 

@@ -231,34 +231,16 @@ def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -
 
 
 @needs_viser
-def test_the_viewer_colours_it_and_says_it_of_a_place_and_shows_why(
-    found: Answer, model: Model, server: object
-) -> None:
-    from mereo.visualization.viewer.frame_page import SURE, FramePage
-    from mereo.visualization.viewer.probe import Inspection
+def test_the_viewer_colours_it_and_says_it_of_a_place(found: Answer, server: object) -> None:
+    from mereo.visualization.viewer.result_page import SURE, ResultPage, content_of_answer
 
-    page = FramePage(server, Inspection.of_answer(found), "liver", "", Unit(1.0))
-    assert SURE in page.coloring.options and page.why is not None
-    colors, legend = page._colors(SURE)
-    assert [len(part) for part in colors] == [len(s.vertices) for s in page.mesh.segments] and "mm" in legend
-    place = page.mesh.segments[0].vertices[0]
-    page.probe(place)
-    assert re.search(r"± [\d.]+ mm \(95\s%\)", page.told.content) and not page.why.told.visible
-    page.why.box.value = True
-    page.probe(place)
-    assert "what leaves it unsure" in page.why.told.content and page.why._points is not None
-    page.why.box.value = False
-    page.probe(place)
-    assert page.why._points is None
-
-
-def test_a_state_without_its_frame_has_no_such_colours(found: Answer, model: Model) -> None:
-    from mereo.visualization.viewer.probe import Inspection
-
-    assert found.registration is not None
-    read = replace(found.registration, optimum=None)
-    inspection = Inspection.of_registration(read, model, np.eye(4))
-    assert inspection.here is None and inspection.ask(read.material[:1]).radius95 is None
+    page = ResultPage(server, content_of_answer(replace(found, seen=observe(found.seen.cloud, unit_m=1.0))))
+    colors, scale = page.content.colorings[SURE]()
+    mesh = page.content.mesh
+    assert [len(part) for part in colors] == [len(s.vertices) for s in mesh.segments]
+    assert scale is not None and "mm" in scale.words[1]
+    page.probe(mesh.segments[0].vertices[0])
+    assert re.search(r"± [\d.]+ mm \(95\s%\)", page.told.content)
 
 
 def test_the_command_explains_segments_and_places(

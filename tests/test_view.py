@@ -1,9 +1,11 @@
 """`mereo view`: its pages in a real browser, and its command."""
 
+import contextlib
 import gc
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -15,18 +17,17 @@ import numpy as np
 import pytest
 from browser import BROWSER, Page, pixels_of, until
 from PIL import Image
-from toy_scene import rest_mesh, toy_scene
+from toy_scene import rest_mesh
 
 from mereo.geometry.camera import PointCloud
-from mereo.models.model import Model
-from mereo.models.network import Network
-from mereo.training.config import PRESETS
+from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.visualization.units import Unit
-from mereo.visualization.viewer import display, html, open_page
-from mereo.visualization.viewer.frame_page import FramePage
-from mereo.visualization.viewer.lab_page import LabPage
-from mereo.visualization.viewer.laboratory import Laboratory
-from mereo.visualization.viewer.probe import Inspection, Probed
+from mereo.visualization.vertex_colors import ColorScale
+from mereo.visualization.viewer import html
+from mereo.visualization.viewer import server as viewer_server
+from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, point_size
+from mereo.visualization.viewer.probe import Probed
+from mereo.visualization.viewer.result_page import Content, ResultPage
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 needs_browser = pytest.mark.skipif(
@@ -34,30 +35,34 @@ needs_browser = pytest.mark.skipif(
 )
 
 
-class Told(Inspection):
-    """An inspection whose answers are a closed form: the label is the box that holds a point, or nothing."""
-
-    def ask(self, points: np.ndarray) -> Probed:
-        label = np.where(np.abs(points[:, 1]) < 6, 1 + np.clip((points[:, 0] + 18) // 12, 0, 2), 0).astype(np.uint8)
-        toward = np.tile([0.0, 0.0, -1.0], (len(points), 1))
-        return Probed(label, points[:, 2] - 150.0, toward, np.eye(5)[label], None)
-
-
-def toy_inspection() -> Told:
-    """The toy, 150 units in front of a camera."""
+def toy_content() -> Content:
+    """The toy, 150 units in front of a camera; a point is in the box that holds it, or in nothing."""
     T_camera_rest = np.eye(4)
     T_camera_rest[2, 3] = 150.0
     mesh = rest_mesh().transformed(T_camera_rest)
     points = np.concatenate([segment.vertices[::2] for segment in mesh.segments])
     cloud = PointCloud(points[points[:, 2] <= 162.0])
-    model = Model(Network(PRESETS["tiny"].network, 4).eval(), mesh.names, mesh.colors)
-    return Told(mesh, np.eye(4), model, "closed form, of course", cloud, model.encode(cloud))
+
+    def ask(points: np.ndarray) -> Probed:
+        label = np.where(np.abs(points[:, 1]) < 6, 1 + np.clip((points[:, 0] + 18) // 12, 0, 2), 0).astype(np.uint8)
+        toward = np.tile([0.0, 0.0, -1.0], (len(points), 1))
+        return Probed(label, points[:, 2] - 150.0, toward, np.eye(5)[label])
+
+    def by_depth() -> tuple[list[np.ndarray], ColorScale]:
+        scale = ColorScale("depth of the toy", 130.0, 170.0, ((0, 0, 0), (250, 250, 250)), ("near", "far"))
+        return [scale.colors(segment.vertices[:, 2]) for segment in mesh.segments], scale
+
+    up = GLTF_CAMERA_ROTATION
+    colorings = {"depth": by_depth}
+    return Content(
+        "toy <frame>", "7 facts", "closed form, of course", mesh, Unit(0.001), up, cloud, None, colorings, ask
+    )
 
 
 @needs_viser
 @needs_browser
 def test_the_page_of_a_frame_shows_every_segment_and_answers(tmp_path: Path, server: object) -> None:
-    page = FramePage(server, toy_inspection(), "toy <frame>", "closed form", Unit(0.001))
+    page = ResultPage(server, toy_content())
     with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (760, 480)) as browser:  # type: ignore[attr-defined]
         until(lambda: "toy <frame>" in browser.text())
         browser.still()
@@ -67,37 +72,95 @@ def test_the_page_of_a_frame_shows_every_segment_and_answers(tmp_path: Path, ser
         def all_shown() -> bool:
             shown = browser.screenshot()[:, :420]
             Image.fromarray(shown).save(tmp_path / "page.png")
-            return all(pixels_of(shown, segment.color) > 150 for segment in page.mesh.segments)
+            return all(pixels_of(shown, segment.color) > 150 for segment in page.content.mesh.segments)
 
         until(all_shown)
         # the middle of the stage lies in the middle box: a click there asks the model
         browser.click(220, 250)
         until(lambda: "the nearest surface" in browser.text())
         assert re.search(r"box_\d at -?[\d.,]+", browser.text())
-        page.coloring.value = "distance"
-        until(lambda: "distance to the nearest observed point" in browser.text())
+        page.coloring.value = "depth"
+        until(lambda: "depth of the toy" in browser.text())
 
 
-@pytest.mark.slow
 @needs_viser
-@needs_browser
-def test_the_laboratory_follows_its_sliders_in_a_browser(tmp_path: Path, server: object) -> None:
-    page = LabPage(server, Laboratory(toy_scene(), None), "Laboratory: toy", "no weights")
-    with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (1200, 760)) as browser:  # type: ignore[attr-defined]
-        until(lambda: "points seen" in browser.text())
-        browser.still()
-        words = set(browser.text().split("\n"))
-        assert {"Camera", "Deformation", "tilt (°)", "shear x", "ball", "Random state"} <= words  # "ball" is a folder
-        before, picture = page.moment, page._picture.image.copy()
-        assert before is not None
-        browser.evaluate("[...document.querySelectorAll('button')].find(b => b.innerText == 'Random state').click()")
-        until(lambda: page.moment is not before and (page._picture.image != picture).any())
+def test_points_give_way_to_colours_and_a_probe_is_shown(server: object) -> None:
+    page = ResultPage(server, toy_content())
+    nodes = server.scene._handle_from_node_name  # type: ignore[attr-defined]
+    assert nodes["/cloud"].visible and page.legend.visible is False
+    page.coloring.value = "depth"
+    assert not nodes["/cloud"].visible and page.legend.visible
+    page.coloring.value = "segment"
+    assert nodes["/cloud"].visible
+    page.move_probe(np.array([0.0, 0.0, 148.0]))
+    assert "box_1" in page.told.content and "2 mm inside the nearest surface" in page.told.content
+    assert nodes["/probe"].visible and nodes["/arrow"].visible
 
-        def shown() -> bool:
-            return all(pixels_of(browser.screenshot(), segment.color) > 150 for segment in rest_mesh().segments)
 
-        until(shown)
-    page.close()
+def test_points_take_a_share_of_their_spacing_within_bounds() -> None:
+    low, high = CLOUD_SIZES
+    assert point_size(grid(60, 0.02)) == pytest.approx(POINT_SHARE * 0.02)
+    assert point_size(grid(60, 1e-4)) == low and point_size(grid(5, 0.5)) == high
+    # a cloud's points more than once, one alone, all at one place
+    assert point_size(np.repeat(grid(60, 0.02), 2, axis=0)) == high
+    twice = np.concatenate([grid(60, 0.02), grid(60, 0.02)[:100]])
+    assert point_size(twice) == pytest.approx(POINT_SHARE * 0.02)
+    assert point_size(np.zeros((1, 3))) == high and point_size(np.zeros((9, 3))) == high
+
+
+def grid(count: int, spacing: float) -> np.ndarray:
+    axis = np.arange(count) * spacing
+    return np.stack(np.meshgrid(axis, axis, [0.0]), axis=-1).reshape(-1, 3)
+
+
+# --- server -----------------------------------------------------------------------------------------------------------
+
+
+def first_message(port: int, host: str, origin: str | None) -> bytes:
+    """First message of the websocket, of which a page of ``origin`` asks the name ``host``."""
+    from viser import __version__ as version
+    from websockets.sync.client import connect
+
+    with (
+        socket.create_connection(("127.0.0.1", port), timeout=20) as line,
+        connect(f"ws://{host}", sock=line, origin=origin, subprotocols=[f"viser-v{version}"]) as page,  # type: ignore[arg-type, list-item]
+    ):
+        return bytes(page.recv(timeout=20))  # type: ignore[arg-type]
+
+
+@needs_viser
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "[::1]"])
+def test_its_own_page_gets_the_scene(server: object, name: str) -> None:
+    port = server.get_port()  # type: ignore[attr-defined]
+    assert first_message(port, f"{name}:{port}", f"http://{name}:{port}")
+    assert first_message(port, f"{name}:{port}", None), "programs other than browsers"
+    assert first_message(port, f"{name}:9000", f"http://{name}:9000"), "the end of a tunnel"
+
+
+@needs_viser
+@pytest.mark.parametrize(
+    "origin",
+    [
+        *("http://evil.example", "null", "http://127.0.0.1.evil.example", "http://127.0.0.2", "https://127.0.0.1"),
+        *("http://user@127.0.0.1", "http://evil.example:{port}"),
+    ],
+)
+def test_a_page_of_another_address_gets_nothing(server: object, origin: str) -> None:
+    """The last one is a name that is made to mean 127.0.0.1: page and websocket then have the same address."""
+    from websockets.exceptions import InvalidStatus
+
+    port = server.get_port()  # type: ignore[attr-defined]
+    origin = origin.format(port=port)
+    host = origin.removeprefix("http://") if origin.endswith(f":{port}") else f"127.0.0.1:{port}"
+    with pytest.raises(InvalidStatus, match="403"):
+        first_message(port, host, origin)
+
+
+@needs_viser
+def test_a_viser_that_starts_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer_server, "own_pages_only", lambda: contextlib.nullcontext([]))
+    with pytest.raises(ImportError, match="starts its server in a way that mereo cannot close to other web pages"):
+        viewer_server.start_server(0)
 
 
 @needs_viser
@@ -107,7 +170,7 @@ def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object)
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as answer:
         assert answer.status == 200
     with pytest.raises(OSError, match=f"port {port} is taken or not allowed; choose another one with --port"):
-        display.start_server(port, "mereo")
+        viewer_server.start_server(port)
 
 
 @pytest.mark.slow
@@ -120,10 +183,10 @@ def test_pages_that_were_closed_leave_nothing_behind(server: object, monkeypatch
     def connections() -> int:
         return sum(type(known) is ServerConnection for known in gc.get_objects())
 
-    monkeypatch.setattr(open_page, "COLLECT_EVERY_S", 0.05)
+    monkeypatch.setattr(viewer_server, "COLLECT_EVERY_S", 0.05)
     address = f"127.0.0.1:{server.get_port()}"  # type: ignore[attr-defined]
     end = threading.Event()
-    keeper = threading.Thread(target=open_page.keep_open, args=(end,))
+    keeper = threading.Thread(target=viewer_server.keep_open, args=(end,))
     gc.collect()
     gc.disable()  # or some of the pages might be collected by chance
     try:
@@ -168,7 +231,7 @@ def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -
     "arguments, sentence",
     [
         (("--weights", "lizard"), "none is shipped for 'lizard'; name a depth image or a point cloud"),
-        (("cloud.ply",), "cloud.ply is given without weights; the model of its object is needed: give --weights"),
+        (("cloud.ply",), "cloud.ply is given without its object: name the object's meshes or scene with --object"),
         (("cloud.ply", "--scene", "rope"), "both cloud.ply and --scene rope are given; one can be shown: drop one"),
     ],
 )
@@ -177,7 +240,7 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
 ) -> None:
     from mereo.__main__ import main
 
-    monkeypatch.setattr("mereo.visualization.viewer.serve.import_viser", lambda: None)
+    monkeypatch.setattr("mereo.api.view.import_viser", lambda: None)
     assert main(["view", *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("mereo: error: ") and error.count("\n") == 1

@@ -1,8 +1,9 @@
 """`mereo view` of what is on disk: a folder of results with all that its report shows, and any GLB file."""
 
-import gzip
+import json
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -10,24 +11,27 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from answers import answer_to
 from browser import BROWSER, Page, pixels_of, until
 from PIL import Image
 from test_report import ball, example, wall
-from test_view_states import by_modes
 
+import mereo
 from mereo.__main__ import main
-from mereo.fitting.registration.state import STATE, save_state, state_of
-from mereo.geometry.camera import PointCloud
+from mereo.evaluation.sample_views import load_view
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.state import STATE
+from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.io.glb_scene import MOST_PARTS, read_glb
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.models.model import Model
-from mereo.models.weights import load_model, save_model
 from mereo.visualization.reconstruction_report import write_report
 from mereo.visualization.units import UNKNOWN, Unit
-from mereo.visualization.viewer import serve
-from mereo.visualization.viewer.kept_result import KeptResult
+from mereo.visualization.viewer.probe import Probed, ask_network
+from mereo.visualization.viewer.result_page import OWN, SURE, content_of_answer, content_of_files
 from mereo.visualization.written_report import read_report
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
@@ -157,67 +161,114 @@ def test_many_parts_become_few_and_names_are_their_own(tmp_path: Path) -> None:
     assert sum(segment.volume for segment in mesh.segments) == pytest.approx(MOST_PARTS + 3)
 
 
-def test_radii_of_a_folder_are_those_of_its_mesh_alone(folder: Path) -> None:
-    kept = KeptResult.of(folder)
-    radii = kept.radii(found())
-    assert radii is not None and kept.unit is not None and kept.unit.metres == pytest.approx(0.001)
-    np.testing.assert_allclose(radii.values, radii_of(found()).values, rtol=1e-5)
-    moved = found().transformed(trimesh.transformations.translation_matrix([0.01, 0, 0]))
-    assert kept.radii(moved) is None and kept.radii(SegmentedMesh(found().segments[:1])) is None
-    assert KeptResult.of(folder / "other.json").report is None
+# --- contents ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
+    content = content_of_files(folder)
+    assert content.title == "frame <7>" and "2 segments" in content.facts and not content.is_doubtful
+    assert content.verdict.startswith("Network alone") and content.unit.metres == pytest.approx(0.001)
+    assert content.cloud is not None and content.depth is not None and content.depth[1] == ("500 mm", "700 mm")
+    assert tuple(content.colorings) == ("distance", SURE)
+    colors, scale = content.colorings[SURE]()
+    assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments] and scale is not None
     cloud, mesh, summary = example()
     write_report(folder / "report.html", cloud, mesh, summary)
-    assert KeptResult.of(folder).unit == UNKNOWN
+    assert content_of_files(folder).unit == UNKNOWN
+    (folder / "report.html").unlink()
+    plain = content_of_files(folder)
+    assert plain.title == "result" and plain.cloud is None and plain.verdict == ""
+    (folder / STATE).write_text("{}")
+    assert content_of_files(folder / STATE).facts == plain.facts
+
+
+def test_an_inner_segment_is_seen_through_the_outer_one(folder: Path) -> None:
+    assert content_of_files(folder).mesh.opaque == (True, True)
+    (folder / "summary.json").write_text(json.dumps({"nested": [["head", "tail"]]}))
+    assert content_of_files(folder).mesh.opaque == (True, False)
+    for damaged in ('{"nested": [["head", "nose"]]}', '{"nested": 3}', "{}", "[]", "{", '{"nested": [[[], {}]]}'):
+        (folder / "summary.json").write_text(damaged)
+        assert content_of_files(folder).mesh.nested == ()
+
+
+def test_places_are_asked_of_a_results_surfaces(folder: Path) -> None:
+    content, head = content_of_files(folder), found().segments[0]
+    assert content.ask is not None
+    middle, rim = head.vertices.mean(axis=0), head.vertices[0]
+    inside, outside, on_it = (content.ask(point[None]) for point in (middle, middle + 5.0, rim))
+    assert inside.label == 1 and outside.label == 0 and on_it.label == 1
+    size = np.linalg.norm(rim - middle)
+    assert inside.distance[0] == pytest.approx(-size, rel=0.1) and outside.distance[0] > 4
+    assert outside.radius95 is None and on_it.radius95 is not None
+    assert on_it.radius95[0] == pytest.approx(0.001, rel=0.01)
+    np.testing.assert_allclose(rim, middle + inside.direction[0] * size, atol=3 * size)
+
+
+def test_any_glb_has_its_own_colours_and_no_probe(tmp_path: Path) -> None:
+    write_strange(tmp_path / "s.GLB")
+    content = content_of_files(tmp_path / "s.GLB")
+    assert content.ask is None and content.first_view == "front" and content.facts.startswith("3 parts")
+    colors, scale = content.colorings[OWN]()
+    assert scale is None and [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
+
+
+def seen_as(answer: Answer, points: np.ndarray) -> Probed:
+    content = content_of_answer(answer)
+    assert content.ask is not None
+    return content.ask(points)
+
+
+@pytest.mark.slow
+def test_places_are_asked_of_the_default_answer(rope: Model) -> None:
+    cloud = load_view("rope").depth.to_points()
+    answer = answer_to(cloud, rope, Registrar.of(rope, "modes"), 24)
+    assert answer.registered is not None
+    assert f"registered model (modes) explains {answer.registered.explained:.1%}" in content_of_answer(answer).verdict
+    points = np.concatenate([cloud.points[:5] + np.array([0, 0, 1]), cloud.points[:2] - np.array([0, 0, 10])])
+    shown, wanted = seen_as(answer, points), answer.registered.query(points)
+    np.testing.assert_array_equal(shown.label, wanted.label)
+    np.testing.assert_allclose(shown.distance, wanted.distance)
+    np.testing.assert_allclose(shown.direction, wanted.direction)
+    assert shown.rest is not None and shown.probability is not None and shown.label[:5].any()
+    np.testing.assert_allclose(shown.rest, wanted.rest)
+    np.testing.assert_allclose(shown.probability, ask_network(answer, points).probability)
+    base = answer.registered.mesh.segments[0]
+    places = base.vertices[base.faces[::7]].mean(axis=1)  # rounding puts some of them outside
+    assert seen_as(answer, places).label.all()
+
+
+@pytest.mark.slow
+def test_a_scanners_frame_is_asked_in_its_own_axes(rope: Model) -> None:
+    points = load_view("rope").depth.to_points().points @ SCANNER_TO_CAMERA.T
+    answer = answer_to(PointCloud(points), rope, Registrar.of(rope, "modes"), 24, "scanner")
+    assert answer.registered is not None
+    places = points[:6] - [0.0, 0.0, 2.0]
+    shown = seen_as(answer, places)
+    # what the way to the surface leads to lies on it, in the scanner's frame
+    ends = places + np.abs(shown.distance)[:, None] * shown.direction
+    np.testing.assert_allclose(answer.registered.solids.nearest(ends).distance, 0.0, atol=1e-6)
+
+
+def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> None:
+    cloud = load_view("rope").depth.to_points()
+    answer = answer_to(cloud, replace(rope, statistical_model=None), None, 24)
+    content, shown = content_of_answer(answer), seen_as(answer, cloud.points[:4])
+    assert content.verdict == "network alone: the weights carry no statistical model"
+    assert shown.rest is None and shown.probability is not None
+    assert tuple(content.colorings) == ("confidence", "distance")
+    colors, scale = content.colorings["confidence"]()
+    assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
+    assert scale is not None and scale.title == "confidence of the surface"
 
 
 # --- pages ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_state_is_shown_with_all_that_its_folder_keeps(
-    rope: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shown: list[tuple[Any, ...]] = []
-    titles: list[str] = []
-    monkeypatch.setattr(serve, "start_server", lambda port, title, entry: titles.append(title))
-    monkeypatch.setattr(serve, "FramePage", lambda *given: shown.append(given))
-    monkeypatch.setattr(serve.OpenPage, "__init__", lambda *_: None)
-    monkeypatch.setattr(serve.OpenPage, "stay", lambda page, _: page)
-    save_model(rope, tmp_path / "rope.safetensors")
-    states = load_model(tmp_path / "rope.safetensors").statistical_model
-    assert states is not None
-    registration = by_modes(states)
-    folder, mesh = tmp_path / "result", registration.mesh
-    save_state(folder / STATE, state_of(registration, "rope", weights=str(tmp_path / "rope.safetensors")))
-    radii = radii_of(mesh)
-    write_segments_glb(folder / "segments.glb", mesh, radii=radii)
-    cloud = PointCloud(np.concatenate([segment.vertices[::3] for segment in mesh.segments]))
-    recognition = {"known": False, "reason": "it is too long: cut it", "signs": {"size": 1.0}}
-    told = {"title": "a rope", "recognition": recognition, "registration": {"answer": "registration"}}
-    write_report(folder / "report.html", cloud, mesh, told, depth=wall(40, 30))
-    for path in (folder, folder / STATE):
-        assert main(["view", str(path)]) == 0
-        _, inspection, title, _, unit, depth = shown.pop()
-        assert inspection.source == "Do not trust it: it is too long. Cut it."
-        assert (title, titles.pop(), unit) == ("a rope", "a rope · mereo", UNKNOWN)
-        assert depth is not None and len(inspection.cloud) == len(cloud) and inspection.code is not None
-        np.testing.assert_allclose(inspection.sure.values, radii.values, rtol=1e-4)
-
-
-def page_of(address: str, encoding: str) -> str:
-    request = urllib.request.Request(address, headers={"Accept-Encoding": encoding})
-    with urllib.request.urlopen(request, timeout=20) as answer:
-        content = answer.read()
-    return (gzip.decompress(content) if encoding == "gzip" else content).decode("utf-8")
-
-
 @needs_viser
-def test_the_tab_is_called_after_what_it_shows(folder: Path, tmp_path: Path, opened: list[Any]) -> None:
-    write_strange(tmp_path / "part.GLB")
-    for path, title in ((tmp_path / "part.GLB", "part.GLB"), (folder, "frame &lt;7&gt;")):
-        opened.append(serve.view(path, port=0, block=False))
-        for encoding in ("identity", "gzip", "gzip"):
-            page = page_of(opened[-1].address, encoding)
-            assert page.count("<title>") == 1 and f"<title>{title} · mereo</title>" in page and len(page) > 100_000
+def test_the_command_opens_the_page_of_a_folder(folder: Path, opened: list[Any]) -> None:
+    opened.append(mereo.view(folder, port=0, block=False))
+    with urllib.request.urlopen(opened[-1].address, timeout=20) as answer:
+        assert b"<html" in answer.read()
 
 
 @pytest.mark.parametrize(
@@ -227,7 +278,7 @@ def test_the_tab_is_called_after_what_it_shows(folder: Path, tmp_path: Path, ope
         (b"glTF but not really", (), "s.glb cannot be read as a GLB file"),
         (b"", (), "s.glb is empty (0 bytes)"),
         (trimesh.Scene([trimesh.PointCloud(np.eye(3))]).export(file_type="glb"), (), "it has no faces"),
-        (b"", ("--weights", "rope"), "is shown as it is, and --weights rope are not asked: leave them out"),
+        (b"", ("--weights", "rope"), "is shown as it is, and --weights rope is not asked: leave it out"),
     ],
 )
 def test_what_cannot_be_shown_is_said_in_one_sentence(
@@ -238,7 +289,8 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("mereo.visualization.viewer.mesh_page.import_viser", lambda: None)
+    for module in ("visualization.viewer.result_page", "api.view"):
+        monkeypatch.setattr(f"mereo.{module}.import_viser", lambda: None)
     if content is not None:
         (tmp_path / "s.glb").write_bytes(content)
     assert main(["view", str(tmp_path / "s.glb"), *options]) == 2
@@ -252,13 +304,12 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
 def test_a_result_of_the_network_alone_is_seen_with_points_and_depth(
     folder: Path, tmp_path: Path, opened: list[Any]
 ) -> None:
-    opened.append(serve.view(folder, port=0, block=False))
+    opened.append(mereo.view(folder, port=0, block=False))
     with Page(tmp_path, opened[-1].address, (900, 900)) as browser:
         until(lambda: "Network alone" in browser.text())
         browser.still()
         words = browser.text()
         for told in ("frame <7>", "Observed points", "Depth image", "bright: 500 mm; dark: 700 mm", "2 segments"):
             assert told in words
-        assert browser.evaluate("document.title") == "frame <7> · mereo"
         colors = [segment.color for segment in found().segments]
         until(lambda: all(pixels_of(browser.screenshot()[:, :560], color, 0.97) > 150 for color in colors))

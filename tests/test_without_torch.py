@@ -65,8 +65,7 @@ found.save("hidden", overwrite=True)
 found.save("hidden.html", overwrite=True)
 found.carry("long.stl").save("carried.stl", overwrite=True)
 print(mereo.Tracker(known).follow(frame, 0.0).found_by, found.found_by)
-import mereo.visualization.viewer.result_page
-import mereo.visualization.viewer.serve
+import mereo.api.view
 """
     ran = hidden(program, folder)
     assert ran.returncode == 0, ran.stderr

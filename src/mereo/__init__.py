@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mereo.api.steps import learn as learn
     from mereo.api.steps import train as train
     from mereo.api.tracker import Tracker as Tracker
+    from mereo.api.view import view as view
     from mereo.geometry.camera import Camera as Camera
     from mereo.geometry.camera import DepthImage as DepthImage
     from mereo.geometry.camera import PointCloud as PointCloud
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from mereo.synthesis.config import GenerateConfig as GenerateConfig
     from mereo.synthesis.examples import synthesize as synthesize
     from mereo.training.config import TrainConfig as TrainConfig
-    from mereo.visualization.viewer.serve import view as view
 
 # Here and not where torch is used, because this runs before every import of torch that mereo makes. A thread that spins
 # at a barrier holds the core that the thread it waits for needs: beside other work each barrier may cost a time slice.
@@ -75,7 +75,7 @@ _HOME = {
     "reconstruct": "api.reconstruct",
     "synthesize": "synthesis.examples",
     "train": "api.steps",
-    "view": "visualization.viewer.serve",
+    "view": "api.view",
 }
 """Module of each public name, below ``mereo``."""
 

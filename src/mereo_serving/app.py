@@ -21,11 +21,10 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from mereo.visualization.viewer.guard import Entry
 from mereo_serving.bodies import MEDIA, SUFFIXES, take, too_large
 from mereo_serving.config import ServeConfig
 from mereo_serving.dispatcher import Dispatcher, Waiting
-from mereo_serving.gate import Gate
+from mereo_serving.gate import Entry, Gate
 from mereo_serving.messages import GLB, JSON, FrameRequest, Media, Reply
 from mereo_serving.metrics import Metrics
 from mereo_serving.options import FrameOptions, sentence_of

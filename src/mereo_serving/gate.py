@@ -1,15 +1,21 @@
 """Before every request: whose it is, and after it: its number; and bodies that nobody reads.
 
-The rules are those of the viewer (``visualization.viewer.guard``): on this machine's own address requests must name it
-(a page of another host could ask too, and DNS can be made to lie), on another one they need the token.
+On this machine's own address requests must name it (a page of another host could ask too, and a name can be made to
+mean 127.0.0.1, DNS rebinding), on another one they need the token. Browsers say in ``Host`` which name they asked for
+and in ``Origin`` whose page asks; other programs may leave ``Origin`` out.
 """
 
 import asyncio
+import errno
+import re
+import secrets
+import socket
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
-from mereo.visualization.viewer.guard import Entry, refusal
 from mereo_serving.metrics import OTHER, Metrics
 from mereo_serving.refusals import failed
 
@@ -18,6 +24,73 @@ PROBES = ("/healthz", "/readyz")
 
 DRAINED_S = 2.0
 """Seconds for which a body is still taken that is refused: a client that sends cannot read why."""
+
+
+OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
+"""Names of this machine, with any port: a tunnel (``ssh -L``) may end at another one."""
+
+
+LOOPBACK = "127.0.0.1"
+"""Address that only programs of this machine reach."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Address that a server listens at, and the token that its requests need; "" for none."""
+
+    host: str = LOOPBACK
+    token: str = ""
+
+    @classmethod
+    def of(cls, host: str) -> "Entry":
+        """Entry with a random token, unless the host is this machine's own."""
+        return cls(host, "" if host in (LOOPBACK, "localhost", "::1") else secrets.token_urlsafe(24))
+
+    def address(self, port: int) -> str:
+        """What to open in a browser."""
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host  # all of this machine's addresses
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{port}" + (f"/?token={self.token}" if self.token else "")
+
+    def is_token(self, given: str) -> bool:
+        """Whether this is the token, in a time that does not depend on where it differs."""
+        return secrets.compare_digest(given.encode(errors="replace"), self.token.encode())
+
+
+def bound_socket(host: str, port: int) -> socket.socket:
+    """Socket at an address of this machine, with any free port for 0.
+
+    Raises ``OSError`` where the port is taken, or the host no address of this machine.
+    """
+    try:
+        family, *_, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except (OSError, UnicodeError):
+        raise OSError(f"{host!r} is no name of this machine; choose another --host, or leave it out") from None
+    bound = socket.socket(family)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind(place)
+    except OSError as error:
+        bound.close()
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise OSError(f"{host} is no address of this machine; choose another --host") from None
+        raise OSError(f"port {port} is taken or not allowed; choose another one with --port") from None
+    return bound
+
+
+def refusal(hosts: Sequence[str], origins: Sequence[str], entry: Entry | None = None, given: Sequence[str] = ()) -> str:
+    """Reason to refuse a request by its ``Host`` and ``Origin`` headers; empty where it may be answered.
+
+    With an ``entry`` that has a token, any name will do, but one of the tokens ``given`` must be it.
+    """
+    if entry is not None and entry.token:
+        if len(hosts) != 1 or not any(map(entry.is_token, given)):
+            return "the address has no token, or another one: open the address that mereo serve has printed"
+    elif len(hosts) != 1 or not OWN_HOST.fullmatch(hosts[0]):
+        return f"the host is {', '.join(hosts) or 'not given'}; it must be 127.0.0.1 or localhost: open that address"
+    if any(origin.lower() != f"http://{hosts[0].lower()}" for origin in origins):
+        return f"the page is of {', '.join(origins)}; only pages of http://{hosts[0]} are answered: open that address"
+    return ""
 
 
 class Gate:

@@ -15,10 +15,10 @@ import uvicorn
 from mereo.fitting.config import AnswerMethod
 from mereo.io.scratch_folders import scratch_folder
 from mereo.models.config import InferenceConfig
-from mereo.visualization.viewer.guard import LOOPBACK, Entry, bound_socket
 from mereo_serving.app import Service, make_app
 from mereo_serving.config import ServeConfig
 from mereo_serving.dispatcher import Dispatcher
+from mereo_serving.gate import LOOPBACK, Entry, bound_socket
 from mereo_serving.messages import Setup
 from mereo_serving.metrics import Metrics
 from mereo_serving.names import served_objects

@@ -110,7 +110,7 @@ class SegmentResult:
 if TYPE_CHECKING:
     import trimesh
 
-    from mereo.visualization.viewer.open_page import OpenPage
+    from mereo.visualization.viewer.server import OpenPage
 
 SINGLE = (".glb", ".ply", ".npz", ".vti", ".nii.gz", ".seg.nrrd", ".json", ".html", ".png")
 """Suffixes of the files that ``Result.save`` writes alone."""
@@ -263,12 +263,11 @@ class Result(Answer):
         return path
 
     @python_words()
-    def show(self, *, port: int | None = None, host: str = "127.0.0.1", block: bool | None = None) -> "OpenPage":
-        """Open the viewer on this result, as `mereo view` does, and print its address.
+    def show(self, *, port: int | None = None, block: bool | None = None) -> "OpenPage":
+        """Open the viewer on this result, as `mereo view` does, and print its address, which only this machine reaches.
 
         Args:
             port: where the page is; by default any that is free.
-            host: address of this machine that the page is at; only this machine reaches the default.
             block: wait until Ctrl-C; by default everywhere but in a notebook or an interactive session, where the page
                 stays open until ``close()`` of what is returned, which a notebook shows as a frame.
 
@@ -276,7 +275,7 @@ class Result(Answer):
         """
         from mereo.visualization.viewer.result_page import open_answer
 
-        return open_answer(self, port=port or 0, host=host).stay(block)
+        return open_answer(self, port or 0).stay(block)
 
     def _read(self) -> list[Path]:
         """Files that this was made from."""

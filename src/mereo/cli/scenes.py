@@ -246,7 +246,7 @@ class SceneRecord:
     force: bool = False
 
     def run(self) -> None:
-        """Write the folder, and print how it is answered and looked at."""
+        """Write the folder, and print how it is answered."""
         from mereo.io.output_folders import new_directory
         from mereo.scenes.registry import files_of, load_scene
         from mereo.synthesis.recording import training_seed, write_recording
@@ -256,7 +256,6 @@ class SceneRecord:
             scene, sensor = load_scene(self.scene), (self.sensor, SENSORS[self.sensor])
             index = write_recording(folder, scene, self.settings, sensor, seed, named=self.scene)
         print(f"wrote {self.output}: {len(index.frames)} frames in {self.settings.seconds:g} s; then:")
-        print(f"  mereo view {self.output}")
         print(f"  mereo stream {self.output} --rate {index.rate_hz:g} --weights WEIGHTS")
 
 

@@ -1,7 +1,6 @@
-"""The command ``mereo view``. See ``mereo.cli.commands`` for how commands are written."""
+"""The command ``mereo view``."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import arg
@@ -15,20 +14,20 @@ from mereo.reconstruction.config import IsolationConfig
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Look at a frame and its reconstruction in a browser, or move a scene by hand (--scene): needs the extra `view`.
+    """Look at a frame and its reconstruction in a browser, or try an object (--scene): needs the extra `view`.
+
+    Only this machine reaches the page; from another one use a tunnel: ssh -L 8080:127.0.0.1:8080 HOST.
 
     Attributes:
-        input: a point cloud or depth image, as for `mereo reconstruct`, or a result of it (the folder, or its
-            state.json; the YAML scene file that it was made with is found again); a GLB file; a folder of `mereo scene
-            record`, which is played; without it (and --scene) a shipped frame.
-        object: what is looked for in the frame, as for `mereo reconstruct`: its meshes or its scene.
-        weights: a shipped name or a file; by default those of the state, or those shipped for the frame or the scene.
+        input: a point cloud or depth image, as for `mereo reconstruct`, or the folder of a result of it; a GLB file;
+            without it (and --scene, --object) a shipped frame.
+        object: what is looked for in the frame, as for `mereo reconstruct`: its meshes or its scene. Without a frame
+            the laboratory of this object is opened.
+        weights: a shipped name or a file; by default those of the shipped frame, or none.
         units: of the object's meshes; guessed where not given.
-        scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py).
-        state: a result with a registered model: shown on the frame, or where the laboratory's sliders start.
+        scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py). States of its are
+            shown to a simulated camera, and what is found in its image beside the truth.
         port: where the page is; 0 takes any that is free.
-        host: address of this machine that the page is at. Only this machine reaches the default. Another one needs the
-            token of the address that is printed, and others on the network can read along: ssh -L is safer.
         resolution: grid cells along the longest side.
         reading: how the frame is read.
         isolation: what of the frame is left out.
@@ -40,58 +39,31 @@ class ViewCommand:
     weights: str | None = None
     units: MeshUnits = None
     scene: str | None = None
-    state: Path | None = None
     port: Port = 8080
-    host: str = "127.0.0.1"
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
 
     def run(self) -> None:
-        """Open the page of a frame or of a scene, and keep it until Ctrl-C."""
-        if self.object:
-            self._view_object()
-            return
-        from mereo.visualization.viewer.serve import view
+        """Open a page, and keep it until Ctrl-C."""
+        from mereo.api.view import view
+        from mereo.scenes.registry import load_scene
+        from mereo.scenes.scene import SCENES
 
+        one = self.object[0] if len(self.object) == 1 else None
+        # a scene's name is that scene, never the weights of the same name
+        object = list(self.object) or None if one is None else load_scene(one) if one in SCENES else one
         view(
             self.input,
             self.weights,
+            object=object,
             scene=self.scene,
-            state=self.state,
+            units=self.units,
             port=self.port,
-            host=self.host,
             resolution=self.resolution,
             reading=self.reading,
             isolation=self.isolation,
             inference=self.inference,
             block=True,
         )
-
-    def _view_object(self) -> None:
-        """Find an object in a frame, and keep the page of the answer open."""
-        if self.input is None:
-            raise ValueError("no frame is given; --object is looked for in one: mereo view FRAME --object PART.stl")
-        from mereo.fitting.registration.state import is_state
-
-        if self.state is not None:
-            raise ValueError(f"--state is {self.state}, which has its own object: leave out --object")
-        if is_state(self.input):
-            raise ValueError(f"{self.input} is a result, which shows itself: leave out --object")
-        from mereo.api.reconstruct import reconstruct
-        from mereo.cli.options import loaded_object
-        from mereo.evaluation.sample_views import shipped_frame, shipped_frames
-        from mereo.io.progress import shown_stages
-        from mereo.io.sensor_frame import read_frame
-        from mereo.visualization.viewer.display import import_viser
-        from mereo.visualization.viewer.result_page import open_answer
-
-        import_viser()
-        with shown_stages():
-            is_shipped = str(self.input) in shipped_frames() and not self.input.exists()
-            frame = shipped_frame(str(self.input)) if is_shipped else read_frame(self.input, self.reading)
-            found = loaded_object(self.object, self.weights, self.scene, self.units, self.inference)
-            result = reconstruct(frame, found, resolution=self.resolution, isolation=self.isolation)
-            page = open_answer(result, port=self.port, host=self.host)
-        page.stay(True)

@@ -1,4 +1,4 @@
-"""The rest pose: its coordinates, its state, and its segments as signed distances on a grid (template.safetensors).
+"""The rest pose: its coordinates, and its segments as signed distances on a grid (template.safetensors).
 
 Rest coordinates are ``(rest - centre) / half`` of the joint rest box, ``half`` being half of its longest side, so that
 the object fills [-1, 1] along its longest side.
@@ -9,11 +9,8 @@ import hashlib
 import numpy as np
 from jaxtyping import Float, Float16
 
-from mereo.deformation.maps import Identity
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.scenes.parameters import Played
-from mereo.scenes.scene import Scene
 
 TEMPLATE_NODES = 64
 """Nodes of the grid along each axis: 0.04 apart, a fiftieth of the object's longest side."""
@@ -30,16 +27,6 @@ def rest_frame(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "3"], float]:
     """Centre and half of the longest side of the joint rest box."""
     low, high = rest.bounds
     return (low + high) / 2, float((high - low).max() / 2)
-
-
-def at_rest(scene: Scene, before: Played) -> Played:
-    """The object at rest. Few scenes have draws that lead there, so these stay as they were, for the next move."""
-    return Played(before.seed, before.calls, (Identity(),) * len(scene.rest.names), before.remembered, before.turns)
-
-
-def is_at_rest(played: Played) -> bool:
-    """Whether a state is that of ``at_rest``."""
-    return all(isinstance(deformation, Identity) for deformation in played.deformations)
 
 
 def rest_digest(rest: SegmentedMesh) -> str:

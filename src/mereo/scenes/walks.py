@@ -1,7 +1,6 @@
 """Walks through the states of a scene: its own random numbers, changing smoothly with time.
 
     scene, seed -walk-> Played, Played, ...
-    scene, Played -smooth_round-> Played, Played, ... and back
 
 Every number that a scene draws is a standard normal one as ``Phi^-1(share)`` (``scenes.draw_recorder``). A walk lets
 each follow a smooth Gaussian process of mean 0 and variance 1, so that at any time the state is distributed as the
@@ -11,7 +10,6 @@ start: whole numbers, choices, permutations, and draws on which it depends what 
 Notation: n times, d numbers, k nodes of the process.
 """
 
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -21,7 +19,7 @@ from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
 from mereo.scenes.draw_recorder import SMOOTH, Key, OutOfDraws, Recorder
-from mereo.scenes.parameters import Played, play, random_state, replayed, turned
+from mereo.scenes.parameters import Played, play, random_state, replayed
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
@@ -75,27 +73,6 @@ def walk(scene: Scene, seed: int, times_s: Float[np.ndarray, " n"], change_s: fl
         kept = path.redraw(i, shrink=tries % SHRINK_EVERY == 0)
         del states[kept:], places[kept:]
     return states
-
-
-def smooth_round(scene: Scene, start: Played, seed: int, count: int) -> Iterator[Played]:
-    """States of one round, ``count`` of them at most, the last one the start again.
-
-    All smooth draws go round a circle at once (``parameters.turned``), so every state is as random as the scene's own.
-    Those that the scene refuses are left out.
-    """
-    for step in range(1, count + 1):
-        shares = {
-            call.key: turned(call.shares, step / count, (seed, number)) if call.kind in SMOOTH else call.shares
-            for number, call in enumerate(start.calls)
-        }
-        state = replayed(scene, start.seed, shares)
-        if state is not None:
-            yield state
-
-
-def blend(count: int) -> Float[np.ndarray, " n"]:
-    """Shares of another state on a way there and back in ``count`` steps, slow at both ends."""
-    return (1 - np.cos(2 * np.pi * np.arange(1, count + 1) / count)) / 2
 
 
 def process_weights(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:

@@ -1,5 +1,6 @@
 """Folders of results that `mereo reconstruct` leaves on disk."""
 
+import hashlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,10 +21,11 @@ from mereo.io.attachments import write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
+from mereo.scenes.rest_pose import rest_digest
+from mereo.scenes.scene import Scene
 from mereo.visualization.pictured import pictured, with_carried
 from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.reconstruction_report import write_report
-from mereo.visualization.result_scene import scene_facts
 from mereo.visualization.units import Unit
 
 
@@ -84,6 +86,17 @@ def frame_facts(answer: Answer, carried: Sequence[Carried] = ()) -> dict[str, ob
     if carried:
         facts["carried"] = [one.facts() for one in carried]
     return {**facts, **seen.facts(), **scene_facts(None if registrar is None else registrar.given)}
+
+
+def scene_facts(scene: Scene | None) -> dict[str, object]:
+    """What a summary says of the scene file that was given; nothing of a scene that is no file's.
+
+    The digest is of what the file states and of the segments at rest.
+    """
+    if scene is None or scene.file is None:
+        return {}
+    digest = hashlib.sha256((rest_digest(scene.rest) + scene.definition).encode()).hexdigest()
+    return {"scene_file": {"path": str(scene.file), "sha256": digest}}
 
 
 def registration_facts(answer: Answer) -> dict[str, object]:

@@ -9,18 +9,13 @@ from scipy.spatial import cKDTree
 
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii, between_stops, level_told
-from mereo.geometry.solids import Solids
 from mereo.models.trained import Answer
-from mereo.visualization.error_maps import OVER, UNDER
 
 Ask = Callable[[Float[np.ndarray, "n 3"]], Answer]
 """Function that answers as a model does at points in the frame of the surfaces."""
 
 CONFIDENCE_STEP = 0.02
 """Distance to either side of a surface at which the model is asked, as a share of the object's longest side."""
-
-ERROR_SHARE = 0.05
-"""Share of the true object's longest side at which the scale of errors ends."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,6 @@ CONFIDENCE = ColorScale(
     ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)),
     ("0, a guess", "1, certain"),
 )
-EVEN: Color = (228, 230, 234)
 
 
 def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> ColorScale:
@@ -70,13 +64,6 @@ def radius_scale(radii: Radii, unit: str) -> ColorScale:
     """Scale for radii of 95 % in the unit that is named."""
     title = f"true places are within ({level_told(radii.calibrated)})"
     return ColorScale(title, 0.0, max(radii.high, 1e-9), STOPS, (f"0{unit}, sure", f"{radii.high:.3g}{unit}"))
-
-
-def error_scale(truth: SegmentedMesh, unit: str) -> ColorScale:
-    """Scale for ``surface_error``: orange where the reconstruction falls short, blue where it goes too far."""
-    high = ERROR_SHARE * float((truth.bounds[1] - truth.bounds[0]).max())
-    words = f"−{high:.2g}{unit}, too little", f"+{high:.2g}{unit}, too much"
-    return ColorScale("distance to the true surface", -high, high, (UNDER, EVEN, OVER), words)
 
 
 def confidence(surfaces: SegmentedMesh, ask: Ask) -> list[Float[np.ndarray, " _"]]:
@@ -111,15 +98,3 @@ def observed_distance(surfaces: SegmentedMesh, observed: Float[np.ndarray, "n 3"
     """Distance from every vertex to the nearest observed point: what is far from all of them is a guess."""
     tree = cKDTree(observed)
     return [tree.query(s.vertices)[0] if len(s.vertices) else np.zeros(0) for s in surfaces.segments]
-
-
-def surface_error(surfaces: SegmentedMesh, truth: Solids) -> list[Float[np.ndarray, " _"]]:
-    """Signed distance from every vertex to the same segment's true surface: above 0 outside of the true segment."""
-    result = []
-    for index, segment in enumerate(surfaces.segments):
-        if len(segment.vertices) == 0:
-            result.append(np.zeros(0))
-            continue
-        distance = truth.segment_distance(index, segment.vertices)
-        result.append(np.where(truth.inside(index, segment.vertices), -distance, distance))
-    return result

@@ -1,5 +1,1 @@
-"""The browser pages of ``mereo view``: a frame with its reconstruction, and the laboratory of a scene.
-
-They only show and listen; what they show is computed in ``probe``, ``vertex_colors``, ``laboratory`` and
-``scenes.parameters``.
-"""
+"""The browser pages of ``mereo view``: of a result, with what was observed, and the laboratory of an object."""

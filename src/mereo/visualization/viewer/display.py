@@ -1,30 +1,21 @@
-"""Parts that both pages share: the server, its looks, and the layer that shows segments.
+"""Parts that the pages share: the stage, the layer and the controls of segments, observed points, depth, views.
 
 Everything is shown in stage coordinates: the object's middle is the origin and half its longest side is 1, whatever
 the input's unit, so that sizes of points, gizmos and clipping distances fit.
 """
 
-import contextlib
-import io
-import logging
-from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.creases import split_at_creases
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
-from mereo.visualization.viewer.guard import Entry, bound_socket, guarded_servers
-from mereo.visualization.viewer.tab_title import PROGRAM, titling
-
-BACKDROP = ((58, 65, 78), (22, 25, 32))
-"""Top and bottom of the background, neutral and dark: the palette's yellow is hard to see on white."""
-
-ENVIRONMENT = 0.45
-"""Share of viser's surrounding light; with all of it the palette's colours fade to white."""
+from mereo.visualization.contact_sheets import Picture, enlarge
 
 CLOUD_COLOR = (244, 246, 250)
 CLOUD_SIZES = (0.001, 0.012)
@@ -37,62 +28,16 @@ SAMPLED = 1000
 """Points whose neighbours are measured."""
 
 FOV_RAD = float(np.deg2rad(40.0))
-"""Of the page's own camera."""
+"""Angle of view of the page's own camera."""
+
+OBLIQUE = 0.28
+"""Share by which views are turned to the side and from above, so that depth is seen."""
 
 FEW = 6
 """More segments than this have their check boxes in a closed folder, or the panel would be all boxes."""
 
-
-def import_viser() -> Any:
-    """Module of viser; raises ``ImportError`` with a sentence on how to get it."""
-    try:
-        import viser
-    except ImportError:
-        raise ImportError("viser is not installed; `mereo view` needs it: run pip install 'mereo[view]'") from None
-    return viser
-
-
-def start_server(port: int, title: str, entry: Entry | None = None) -> Any:
-    """Server of viser that answers its own page only (``guard``), by default on 127.0.0.1; port 0 means any.
-
-    ``title`` is that of the browser's tab.
-
-    Raises ``OSError`` where the port is taken, or the host no address of this machine, and ``ImportError`` for a viser
-    that the guard does not know.
-    """
-    viser = import_viser()
-    entry = entry or Entry()
-    with bound_socket(entry.host, port) as probe:  # viser would silently take another port
-        port = probe.getsockname()[1]
-    # browsers open connections ahead and drop them, which websockets reports with a traceback each
-    logging.getLogger("websockets").setLevel(logging.CRITICAL)
-    with (
-        contextlib.redirect_stdout(io.StringIO()),
-        guarded_servers(entry, titling(title)) as guards,
-    ):  # without its own banner
-        server = viser.ViserServer(host=entry.host, port=port, label=PROGRAM, verbose=False)
-    if not guards:
-        stop_server(server)
-        raise ImportError(
-            f"viser {viser.__version__} starts its server in a way that mereo cannot guard against other pages: run "
-            "pip install 'viser==1.1.1'"
-        )
-    server.gui.configure_theme(
-        dark_mode=True, show_logo=False, show_share_button=False, control_width="medium", brand_color=(86, 180, 233)
-    )
-    server.gui.main_panel.dock_right()
-    share = np.linspace(0.0, 1.0, 256)[:, None, None]
-    backdrop = np.array(BACKDROP[0]) * (1 - share) + np.array(BACKDROP[1]) * share
-    server.scene.set_background_image(np.broadcast_to(backdrop, (256, 8, 3)).astype(np.uint8), format="png")
-    server.scene.configure_default_lights(cast_shadow=False)
-    server.scene.configure_environment_map(environment_intensity=ENVIRONMENT)
-    return server
-
-
-def stop_server(server: Any) -> None:
-    """Close all pages; without the line that viser prints."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
+PICTURE_PX = 320
+"""Width of a picture in the panel, to which small ones are enlarged: a browser would blur their pixels."""
 
 
 def point_size(points: Float[np.ndarray, "n 3"]) -> float:
@@ -102,17 +47,6 @@ def point_size(points: Float[np.ndarray, "n 3"]) -> float:
     apart = apart[np.isfinite(apart) & (apart > 0)]  # repeated points have no spacing
     smallest, largest = CLOUD_SIZES
     return float(np.clip(POINT_SHARE * np.median(apart), smallest, largest)) if len(apart) else largest
-
-
-@runtime_checkable
-class Shown(Protocol):
-    """Choice of the segments that are shown, and how opaque each is."""
-
-    def visible(self) -> list[bool]:
-        """Whether each segment is shown."""
-
-    def opacity(self) -> list[float]:
-        """Opacity of each segment, 0 to 1."""
 
 
 class Display:
@@ -140,38 +74,67 @@ class Display:
         """Points of the stage in the input's frame."""
         return points / self.scale + self.center
 
-    def show_points(self, name: str, points: Float[np.ndarray, "n 3"], visible: bool) -> None:
-        """Show observed points, at places of the stage."""
-        self.server.scene.add_point_cloud(
-            name,
-            points,
-            CLOUD_COLOR,
-            point_size=point_size(points),
-            point_shape="circle",
-            precision="float32",
-            visible=visible,
-        )
-
-    def look_from(
-        self,
-        direction: Float[np.ndarray, "3"],
-        bounds: Float[np.ndarray, "2 3"],
-        room: float = 1.35,
-        up: Float[np.ndarray, "3"] | None = None,
-    ) -> None:
+    def look_from(self, direction: Float[np.ndarray, "3"], bounds: Float[np.ndarray, "2 3"]) -> None:
         """Turn every open page, and those to come, to what lies within ``bounds``, from this direction."""
-        up = self.up if up is None else up
         low, high = self.place(bounds)
         target = (low + high) / 2
-        distance = room * float(np.linalg.norm(high - low)) / 2 / np.sin(FOV_RAD / 2)
+        distance = 1.35 * float(np.linalg.norm(high - low)) / 2 / np.sin(FOV_RAD / 2)
         position = tuple(target + distance * direction / np.linalg.norm(direction))
         first = self.server.initial_camera
-        first.position, first.look_at, first.up = position, tuple(target), tuple(up)
-        first.fov = FOV_RAD
+        first.position, first.look_at, first.up, first.fov = position, tuple(target), tuple(self.up), FOV_RAD
         for client in self.server.get_clients().values():
             with client.atomic():
                 client.camera.position, client.camera.look_at = position, tuple(target)
-                client.camera.up_direction = tuple(up)
+                client.camera.up_direction = tuple(self.up)
+
+    def add_views(
+        self,
+        toward: Callable[[], Float[np.ndarray, "3"]],
+        bounds: Callable[[], Float[np.ndarray, "2 3"]],
+        first: str = "camera",
+    ) -> Callable[[str], None]:
+        """Add buttons that turn the page to ``bounds`` as seen from ``toward`` (``first``), its side and its back.
+
+        The page is turned to the first view at once. All are a little from above and from the side. Returns what turns
+        the page to a view by its name.
+        """
+
+        def look(name: str) -> None:
+            ahead = toward()
+            side = np.cross(self.up, ahead)
+            direction = {first: ahead, "side": side, "behind": -ahead}[name]
+            self.look_from(direction + OBLIQUE * (np.cross(self.up, direction) + self.up), bounds())
+
+        view = self.server.gui.add_button_group("View", (first, "side", "behind"))
+        view.on_click(lambda _: look(view.value))
+        look(first)
+        return look
+
+
+class SegmentControls:
+    """Controls with a check box and an opacity slider for each segment."""
+
+    def __init__(self, gui: Any, mesh: SegmentedMesh, changed: Callable[[], None]) -> None:
+        with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= FEW):
+            self._boxes = [gui.add_checkbox(segment.name, True) for segment in mesh.segments]
+        with gui.add_folder("Opacity", expand_by_default=False):
+            self._all = gui.add_slider("all", 0.0, 1.0, 0.05, 1.0)
+            # what holds nested segments is see-through, or they would never be seen
+            start = [1.0 if opaque else 0.35 for opaque in mesh.opaque]
+            self._sliders = [
+                gui.add_slider(segment.name, 0.0, 1.0, 0.05, value)
+                for segment, value in zip(mesh.segments, start, strict=True)
+            ]
+        for handle in (*self._boxes, self._all, *self._sliders):
+            handle.on_update(lambda _: changed())
+
+    def visible(self) -> list[bool]:
+        """Whether each segment is shown: its box is checked, and it is not wholly transparent."""
+        return [bool(box.value) and value > 0 for box, value in zip(self._boxes, self.opacity(), strict=True)]
+
+    def opacity(self) -> list[float]:
+        """Opacity of each segment, 0 to 1: its own slider's times that of all."""
+        return [float(self._all.value * slider.value) for slider in self._sliders]
 
 
 class SegmentLayer:
@@ -184,7 +147,7 @@ class SegmentLayer:
     def show(
         self,
         mesh: SegmentedMesh,
-        shown: Shown,
+        controls: SegmentControls,
         colors: Sequence[UInt8[np.ndarray, "_ 3"]] | None = None,
         shift: Float[np.ndarray, "3"] | None = None,
     ) -> None:
@@ -192,7 +155,7 @@ class SegmentLayer:
 
         ``colors`` holds one colour per vertex for each segment; ``shift`` is on the stage. Surfaces keep their creases.
         """
-        visible, opacity = shown.visible(), shown.opacity()
+        visible, opacity = controls.visible(), controls.opacity()
         offset = np.zeros(3) if shift is None else shift
         self.clear_from(len(mesh.segments))
         handles = []
@@ -238,27 +201,34 @@ def _painted(
     )
 
 
-class SegmentControls:
-    """Controls with a check box and an opacity slider for each segment."""
+class PointLayer:
+    """Observed points on the stage, with a check box and a slider of their size; none are shown at first."""
 
-    def __init__(self, gui: Any, mesh: SegmentedMesh, changed: Any) -> None:
-        with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= FEW):
-            self._boxes = [gui.add_checkbox(segment.name, True) for segment in mesh.segments]
-        with gui.add_folder("Opacity", expand_by_default=False):
-            self._all = gui.add_slider("all", 0.0, 1.0, 0.05, 1.0)
-            # what holds nested segments is see-through, or they would never be seen
-            start = [1.0 if opaque else 0.35 for opaque in mesh.opaque]
-            self._sliders = [
-                gui.add_slider(segment.name, 0.0, 1.0, 0.05, value)
-                for segment, value in zip(mesh.segments, start, strict=True)
-            ]
-        for handle in (*self._boxes, self._all, *self._sliders):
-            handle.on_update(lambda _: changed())
+    def __init__(self, stage: Display) -> None:
+        self.stage = stage
+        gui = stage.server.gui
+        with gui.add_folder("Observed points"):
+            self.box = gui.add_checkbox("show", True)
+            self._size = gui.add_slider("size (%)", 0.05, 4.0, 0.05, 100 * CLOUD_SIZES[0])
+        self._cloud: Any = None
+        self.box.on_update(lambda _: self._update())
+        self._size.on_update(lambda _: self._update())
 
-    def visible(self) -> list[bool]:
-        """Whether each segment is shown: its box is checked, and it is not wholly transparent."""
-        return [bool(box.value) and value > 0 for box, value in zip(self._boxes, self.opacity(), strict=True)]
+    def show(self, cloud: PointCloud, shift: Float[np.ndarray, "3"] | None = None) -> None:
+        """Replace the points; the first ones set the size. ``shift`` is on the stage."""
+        points = self.stage.place(cloud.points) + (np.zeros(3) if shift is None else shift)
+        if self._cloud is None:
+            self._size.value = round(100 * point_size(points), 2)
+        self._cloud = self.stage.server.scene.add_point_cloud(
+            "/cloud", points, CLOUD_COLOR, point_size=0.01, point_shape="circle", precision="float32"
+        )
+        self._update()
 
-    def opacity(self) -> list[float]:
-        """Opacity of each segment, 0 to 1: its own slider's times that of all."""
-        return [float(self._all.value * slider.value) for slider in self._sliders]
+    def _update(self) -> None:
+        if self._cloud is not None:
+            self._cloud.visible, self._cloud.point_size = bool(self.box.value), self._size.value / 100
+
+
+def enlarged(picture: Picture) -> Picture:
+    """Picture for the panel, of ``PICTURE_PX`` pixels across at least."""
+    return picture if picture.shape[1] >= PICTURE_PX else enlarge(picture, PICTURE_PX)

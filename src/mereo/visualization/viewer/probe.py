@@ -1,20 +1,17 @@
-"""Probe of an answer, in the input's frame: what is known of a place, and which place a look meets."""
+"""Probe of an answer or of surfaces, in the input's frame: what is known of a place, and which place a look meets."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mereo.fitting.registration.answer import Answer as FrameAnswer
-from mereo.fitting.registration.recognition import Recognition, recognize
-from mereo.fitting.registration.registration import Registration, nearest_labels
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.mesh import Color, SegmentedMesh
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.registration import nearest_labels
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
-from mereo.geometry.solids import Solids
+from mereo.geometry.solids import Solids, signed_distance_and_direction
 from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
-from mereo.models.trained import Answer, EncodedCloud, Trained
+from mereo.models.trained import Answer as NetworkAnswer
 
 ON_SURFACE = 1e-6
 """Distance, as a share of a place's coordinates, that is none: a click meets the surface up to rounding."""
@@ -28,7 +25,7 @@ class Probed:
         label: 0 for empty space, i + 1 for segment i.
         distance: to the nearest segment surface, negative inside; NaN where that is not known.
         direction: unit vector towards it; NaN where that is not known.
-        probability: of empty space and each segment, by the network; None where no frame was given to it.
+        probability: of empty space and each segment, by the network; None where there is none.
         rest: where the point was at rest, scene units; None where no model is registered.
         radius95: radius around the point that holds the true place of what is registered there with probability 0.95;
             None where that is not known.
@@ -37,134 +34,62 @@ class Probed:
     label: UInt8[np.ndarray, " n"]
     distance: Float[np.ndarray, " n"]
     direction: Float[np.ndarray, "n 3"]
-    probability: Float[np.ndarray, "n c"] | None
-    rest: Float[np.ndarray, "n 3"] | None
+    probability: Float[np.ndarray, "n c"] | None = None
+    rest: Float[np.ndarray, "n 3"] | None = None
     radius95: Float[np.ndarray, " n"] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Inspection:
-    """Answer to a frame, and who is asked for more.
-
-    Attributes:
-        surfaces: all segments, in the input's frame.
-        T_camera_input: from the input's frame to the camera frame.
-        model: the weights; None of an object without.
-        source: where the answer comes from, in a phrase.
-        cloud: the object's points, in the input's frame; None for a state without its frame.
-        code: what the weights made of the cloud, camera frame.
-        registration: of the object's own model, camera frame, where the surfaces are that model.
-        radii: how sure its vertices are, as files say it, in the input's frame; None where the registration knows it.
-    """
-
-    surfaces: SegmentedMesh
-    T_camera_input: Float[np.ndarray, "4 4"]
-    model: Trained | None
-    source: str
-    cloud: PointCloud | None = None
-    code: EncodedCloud | None = None
-    registration: Registration | None = None
-    radii: Radii | None = None
-
-    @classmethod
-    def of_answer(cls, found: FrameAnswer) -> "Inspection":
-        """Answer that is there already, with what it was asked from."""
-        result = found.reconstruction
-        return cls(
-            surfaces=result.surfaces,
-            T_camera_input=result.T_camera_input,
-            model=found.model,
-            source=source_of(found),
-            cloud=result.reading.cloud,
-            code=result.code,
-            registration=found.registration if found.taken else None,
-        )
-
-    @classmethod
-    def of_registration(
-        cls,
-        registration: Registration,
-        model: Trained | None,
-        T_camera_input: Float[np.ndarray, "4 4"],
-        cloud: PointCloud | None = None,
-    ) -> "Inspection":
-        """Registration as a file has it, with the cloud that it belongs to, where that is at hand."""
-        seen = None if cloud is None else PointCloud(transform_points(T_camera_input, cloud.points))
-        return cls(
-            surfaces=registration.mesh.transformed(inverse_rigid(T_camera_input)),
-            T_camera_input=T_camera_input,
-            model=model,
-            source=explained(registration, recognize(registration, None if model is None else model.calibration)),
-            cloud=cloud,
-            code=None if seen is None or model is None else model.encode(seen),
-            registration=registration,
-        )
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of empty space and the segments, by label."""
-        return ("empty space", *self.surfaces.names)
-
-    @property
-    def colors(self) -> tuple[Color, ...]:
-        """Colours of the segments."""
-        return self.surfaces.colors
-
-    def network(self, points: Float[np.ndarray, "n 3"]) -> Answer:
-        """Answers of the network at points of the input's frame, in that frame; ``ValueError`` without a frame."""
-        if self.code is None or self.model is None:
-            raise ValueError("there is no frame that the network has seen; name its depth image or point cloud")
-        found = self.model.query(self.code, transform_points(self.T_camera_input, points))
-        return Answer(found.label, found.probability, found.distance, self._turned(found.direction))
-
-    def ask(self, points: Float[np.ndarray, "n 3"]) -> Probed:
-        """Facts about points of the input's frame: those of the registered model where it is the answer."""
-        told = None if self.code is None else self.network(points)
-        if self.registration is not None:
-            seen = transform_points(self.T_camera_input, points)
-            found = self.registration.query(seen)
-            # a click on a segment asks about it, whichever side rounding has put the place on
-            on_it = (found.label == 0) & (np.abs(found.distance) <= ON_SURFACE * np.abs(points).max(axis=1))
-            label = np.where(on_it, nearest_labels(self.registration.solids, seen), found.label).astype(np.uint8)
-            chances = None if told is None else told.probability
-            radius = self.registration.radius95(seen, at="camera")
-            return Probed(label, found.distance, self._turned(found.direction), chances, found.rest, radius)
-        told = self.network(points) if told is None else told
-        return Probed(told.label, told.distance, told.direction, told.probability, None)
-
-    @cached_property
-    def here(self) -> Registration | None:
-        """The registration in the input's frame, where it can say how sure it is."""
-        if self.registration is None or self.registration.uncertainty is None:
-            return None
-        return self.registration.moved(inverse_rigid(self.T_camera_input))
-
-    @property
-    def sure(self) -> Radii | None:
-        """Radii of 95 % of the surfaces' vertices, in the input's frame; None where they are not known."""
-        here = self.here
-        if here is None or here.uncertainty is None:
-            return self.radii
-        return here.uncertainty.radii(here.material)
-
-    def _turned(self, direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Directions of the camera frame in the input's."""
-        return direction @ self.T_camera_input[:3, :3]
-
-
-def source_of(found: FrameAnswer) -> str:
-    """Where an answer comes from, in a phrase for people."""
-    if found.registrar is None:
+def source_of(answer: Answer) -> str:
+    """Where an answer comes from, and whether its frame shows the object, in a phrase for people."""
+    if answer.registrar is None:
         return "network alone: the weights carry no statistical model"
-    if found.registration is not None and found.taken:
-        return explained(found.registration, found.recognition)
-    told = None if found.registration is None else found.recognition.told
-    return found.source if told is None else f"{found.source}; {told}"
+    doubt = None if answer.registration is None else answer.recognition.told
+    return answer.source if doubt is None else f"{answer.source}; {doubt}"
 
 
-def explained(registration: Registration, recognition: Recognition) -> str:
-    """How well a registration explains its frame, and whether that shows the object, in a phrase for people."""
-    return registration.told if recognition.told is None else f"{registration.told}; {recognition.told}"
+def ask_network(answer: Answer, points: Float[np.ndarray, "n 3"]) -> NetworkAnswer:
+    """Answers of the network at points of the input's frame, in that frame; it must have been given the frame."""
+    result = answer.reconstruction
+    assert answer.model is not None and result.code is not None
+    found = answer.model.query(result.code, transform_points(result.T_camera_input, points))
+    direction = found.direction @ result.T_camera_input[:3, :3]
+    return NetworkAnswer(found.label, found.probability, found.distance, direction)
+
+
+def probe_answer(answer: Answer, points: Float[np.ndarray, "n 3"]) -> Probed:
+    """Facts about points of the input's frame: those of the registered model where it is the answer."""
+    network = None if answer.reconstruction.code is None else ask_network(answer, points)
+    if answer.registered is None:
+        assert network is not None
+        return Probed(network.label, network.distance, network.direction, network.probability)
+    found = answer.registered.query(points)
+    return Probed(
+        _with_surface(answer.registered.solids, found.label, found.distance, points),
+        found.distance,
+        found.direction,
+        None if network is None else network.probability,
+        found.rest,
+        answer.registered.radius95(points, at="camera"),
+    )
+
+
+def probe_surfaces(solids: Solids, radii: Radii | None, points: Float[np.ndarray, "n 3"]) -> Probed:
+    """Facts about points that closed surfaces alone say."""
+    inside = solids.label(points)
+    distance, direction = signed_distance_and_direction(solids, points, inside)
+    label = _with_surface(solids, inside, distance, points)
+    radius = None
+    if radii is not None and label.all():
+        radius = np.concatenate([radii.at(point[None], int(one)) for point, one in zip(points, label, strict=True)])
+    return Probed(label, distance, direction, radius95=radius)
+
+
+def _with_surface(
+    solids: Solids, label: UInt8[np.ndarray, " n"], distance: Float[np.ndarray, " n"], points: Float[np.ndarray, "n 3"]
+) -> UInt8[np.ndarray, " n"]:
+    """Labels, where a place on a surface is its segment's, whichever side rounding has put it on."""
+    on_surface = (label == 0) & (np.abs(distance) <= ON_SURFACE * np.abs(points).max(axis=1))
+    return np.where(on_surface, nearest_labels(solids, points), label).astype(np.uint8)
 
 
 def first_hit(

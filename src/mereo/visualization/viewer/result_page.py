@@ -1,28 +1,353 @@
-"""Page of an answer that is there already: what ``Result.show`` opens."""
+"""Page of a result: surfaces and what was observed, their colours, and a probe.
+
+Answer -content_of_answer-> Content -ResultPage-> page
+folder of results, or any GLB file -content_of_files-> Content
+"""
+
+import json
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
 
 from mereo.fitting.registration.answer import Answer
-from mereo.visualization.units import Unit
-from mereo.visualization.viewer.display import import_viser, start_server
-from mereo.visualization.viewer.frame_page import FramePage
-from mereo.visualization.viewer.guard import Entry
-from mereo.visualization.viewer.open_page import OpenPage
-from mereo.visualization.viewer.panels import DepthPicture
-from mereo.visualization.viewer.probe import Inspection
-from mereo.visualization.viewer.tab_title import tab_title
+from mereo.fitting.registration.state import STATE
+from mereo.geometry.brief import counted
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.radii import Radii
+from mereo.geometry.solids import Solids
+from mereo.io.glb_scene import GlbScene, is_glb, read_glb
+from mereo.io.writers.formats import WRITERS
+from mereo.io.writers.glb import viewer_rotation
+from mereo.visualization.contact_sheets import Picture
+from mereo.visualization.depth_picture import depth_data, depth_picture
+from mereo.visualization.result_files import radii_of
+from mereo.visualization.units import UNKNOWN, Unit, rounded
+from mereo.visualization.vertex_colors import (
+    CONFIDENCE,
+    ColorScale,
+    confidence,
+    distance_scale,
+    observed_distance,
+    radius_scale,
+)
+from mereo.visualization.viewer import html
+from mereo.visualization.viewer.display import Display, PointLayer, SegmentControls, SegmentLayer, enlarged
+from mereo.visualization.viewer.probe import Probed, ask_network, first_hit, probe_answer, probe_surfaces, source_of
+from mereo.visualization.viewer.server import OpenPage, import_viser, start_server
+from mereo.visualization.written_report import REPORT, read_report
+
+EMPTY_COLOR = (150, 156, 168)
+
+SEGMENT, OWN, SURE = "segment", "own", "how sure"
+"""Colourings: by segment; by the colours of a file's vertices; by the radius that holds each vertex's true place."""
+
+Colors = list[UInt8[np.ndarray, "_ 3"]]
+"""Colours of the vertices of each segment."""
+
+Coloring = Callable[[], tuple[Colors, ColorScale | None]]
+"""Function that colours the vertices, and says by which scale."""
 
 
-def open_answer(answer: Answer, *, port: int, host: str) -> OpenPage:
-    """Page of an answer, on the frame that it was given to.
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What a page of a result shows.
+
+    Attributes:
+        title, facts: heading.
+        verdict: where the surfaces come from, and whether to trust them.
+        mesh: surfaces, in the input's frame.
+        unit: of that frame.
+        rotation: from it to x right, y up, z toward the eye.
+        cloud: observed points, in that frame.
+        depth: picture of the depth image, and the nearest and farthest depth in words.
+        colorings: other colours than those of the segments, by name; the first shown first where it is ``OWN``.
+        ask: what is known of places; None where there is nothing to probe.
+        is_doubtful: whether the verdict is that the surfaces are not to be trusted.
+        first_view: name of the view from ahead.
+    """
+
+    title: str
+    facts: str
+    verdict: str
+    mesh: SegmentedMesh
+    unit: Unit
+    rotation: Float[np.ndarray, "3 3"]
+    cloud: PointCloud | None = None
+    depth: tuple[Picture, Sequence[str]] | None = None
+    colorings: Mapping[str, Coloring] = field(default_factory=dict)
+    ask: Callable[[Float[np.ndarray, "n 3"]], Probed] | None = None
+    is_doubtful: bool = False
+    first_view: str = "camera"
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """Box of surfaces and points."""
+        clouds = [] if self.cloud is None else [self.cloud.points]
+        joint = np.concatenate([*clouds, *(segment.vertices for segment in self.mesh.segments)])
+        return np.stack([joint.min(axis=0), joint.max(axis=0)])
+
+
+# --- contents ---------------------------------------------------------------------------------------------------------
+
+
+def open_answer(answer: Answer, port: int) -> OpenPage:
+    """Open the page of an answer.
 
     Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
     """
     import_viser()
-    seen = answer.seen
-    inspection = Inspection.of_answer(answer)
-    entry = Entry.of(host)
-    server = start_server(port, tab_title(seen.frame.source), entry)
+    return _opened(content_of_answer(answer), port)
+
+
+def open_files(path: Path, port: int) -> OpenPage:
+    """Open the page of a GLB file, or of a folder of results by its files alone.
+
+    Raises as ``open_answer`` and ``content_of_files`` do.
+    """
+    import_viser()
+    return _opened(content_of_files(path), port)
+
+
+def _opened(content: Content, port: int) -> OpenPage:
+    server = start_server(port)
+    ResultPage(server, content)
+    return OpenPage(server)
+
+
+def content_of_answer(answer: Answer) -> Content:
+    """Content of an answer; raises ``ValueError`` where there are no surfaces."""
+    frame, mesh, cloud = answer.seen.frame, answer.reconstruction.surfaces, answer.reconstruction.reading.cloud
+    unit, radii = Unit(frame.unit_m), radii_of(answer.registered)
     made_with = "no weights" if answer.model is None else f"weights {answer.model.name or 'of this program'}"
-    facts = f"{len(seen.cloud):,} points · {made_with}"
-    unit = Unit(seen.frame.unit_m)
-    FramePage(server, inspection, seen.frame.source, facts, unit, DepthPicture.of(seen.frame.depth, unit))
-    return OpenPage(server, entry)
+    depth = None if frame.depth is None else (depth_picture(frame.depth), depth_data(frame.depth, unit)["ends"])
+    colorings: dict[str, Coloring] = {}
+    if answer.reconstruction.code is not None:
+        colorings["confidence"] = lambda: _painted(confidence(mesh, partial(ask_network, answer)), CONFIDENCE)
+    colorings |= _measured_colorings(mesh, unit, cloud, radii)
+    return Content(
+        title=frame.source,
+        facts=f"{len(answer.seen.cloud):,} points · {made_with}",
+        verdict=source_of(answer),
+        mesh=mesh,
+        unit=unit,
+        rotation=viewer_rotation(frame.axes),
+        cloud=cloud,
+        depth=depth,
+        colorings=colorings,
+        ask=partial(probe_answer, answer),
+    )
+
+
+def are_files(path: Path) -> bool:
+    """Whether a path names a GLB file, a folder of results, or the state in one."""
+    if is_glb(path) or path.name == STATE:
+        return True
+    return any((path / name).is_file() for name in (STATE, WRITERS["glb"].file, WRITERS["json"].file))
+
+
+def content_of_files(path: Path) -> Content:
+    """Content of a GLB file, or of a folder of results: surfaces, observed points, depth image and verdict.
+
+    Raises ``FileNotFoundError`` where the surfaces are not there, and ``ValueError`` for a damaged file.
+    """
+    folder = path.parent if path.name == STATE else path
+    if is_glb(path):
+        scene, report = read_glb(path), None
+        # glTF's metres; a file of ours has the same number where the unit of its input was not known
+        unit = UNKNOWN if scene.is_own and scene.unit_m == 1.0 else Unit(scene.unit_m)
+    else:
+        surfaces = folder / WRITERS["glb"].file
+        if not surfaces.is_file():
+            raise FileNotFoundError(
+                f"{folder} has no {surfaces.name}, which the page of a result shows: write it again with --formats glb"
+            )
+        scene, report = read_glb(surfaces), read_report(folder / REPORT)
+        scene = replace(scene, mesh=_nested(scene.mesh, folder / WRITERS["json"].file))
+        unit = Unit(scene.unit_m) if report is not None and report.unit_known else UNKNOWN
+    cloud = None if report is None else report.cloud
+    colorings: dict[str, Coloring] = {}
+    if any(colors is not None for colors in scene.colors):
+        colorings[OWN] = lambda: (_own_colors(scene), None)
+    colorings |= _measured_colorings(scene.mesh, unit, cloud, scene.radii)
+    return Content(
+        title=path.name if report is None else report.title,
+        facts=_facts(scene, unit, None if report is None else report.count),
+        verdict="" if report is None else report.verdict,
+        mesh=scene.mesh,
+        unit=unit,
+        rotation=scene.rotation,
+        cloud=cloud,
+        depth=None if report is None or report.depth is None else (report.depth, report.ends),
+        colorings=colorings,
+        ask=partial(probe_surfaces, Solids(scene.mesh), scene.radii) if scene.is_own else None,
+        is_doubtful=report is not None and report.level == "no",
+        first_view="camera" if scene.is_own else "front",
+    )
+
+
+def _nested(mesh: SegmentedMesh, summary: Path) -> SegmentedMesh:
+    """The mesh with the nesting of its segments, which a GLB file does not say, where the summary does."""
+    try:
+        pairs = json.loads(summary.read_bytes())["nested"]
+        return SegmentedMesh(mesh.segments, tuple((inner, outer) for inner, outer in pairs))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return mesh
+
+
+def _facts(scene: GlbScene, unit: Unit, points: int | None) -> str:
+    sides = np.ptp(scene.mesh.bounds, axis=0) * unit.length_factor
+    size = f"{' x '.join(rounded(float(side)) for side in sides)} {unit.length_name}"
+    parts = counted(len(scene.mesh.segments), "segment" if scene.is_own else "part")
+    faces = sum(len(segment.faces) for segment in scene.mesh.segments)
+    return " · ".join([*([] if points is None else [f"{points:,} points"]), parts, f"{faces:,} faces", size])
+
+
+# --- colours ----------------------------------------------------------------------------------------------------------
+
+
+def _painted(values: Sequence[Float[np.ndarray, " _"]], scale: ColorScale) -> tuple[Colors, ColorScale]:
+    return [scale.colors(value) for value in values], scale
+
+
+def _measured_colorings(
+    mesh: SegmentedMesh, unit: Unit, cloud: PointCloud | None, radii: Radii | None
+) -> dict[str, Coloring]:
+    """Colourings by the distance to what was observed, and by how sure the surfaces are."""
+    name = f" {unit.length_name}"
+
+    def by_distance() -> tuple[Colors, ColorScale]:
+        assert cloud is not None
+        values = [value * unit.length_factor for value in observed_distance(mesh, cloud.points)]
+        return _painted(values, distance_scale(values, name))
+
+    def by_radius() -> tuple[Colors, ColorScale]:
+        assert radii is not None
+        told = radii.scaled(unit.length_factor)
+        return _painted(told.vertices, radius_scale(told, name))
+
+    result: dict[str, Coloring] = {} if cloud is None else {"distance": by_distance}
+    return result if radii is None else {**result, SURE: by_radius}
+
+
+def _own_colors(scene: GlbScene) -> Colors:
+    pairs = zip(scene.mesh.segments, scene.colors, strict=True)
+    return [np.tile(np.array(s.color, dtype=np.uint8), (len(s.vertices), 1)) if c is None else c for s, c in pairs]
+
+
+# --- page -------------------------------------------------------------------------------------------------------------
+
+
+class ResultPage:
+    """Page that shows a ``Content`` and answers clicks, check boxes and sliders until its server stops."""
+
+    def __init__(self, server: Any, content: Content) -> None:
+        self.server, self.content = server, content
+        self._drawing = threading.Lock()
+        self._known_colors: dict[str, tuple[Colors, ColorScale | None]] = {}
+        self.stage = Display(server, content.bounds, content.rotation.T @ [0.0, 1.0, 0.0])
+        self.layer = SegmentLayer(self.stage, "/segments")
+        self._build()
+        self._draw()
+
+    def _build(self) -> None:
+        gui, content = self.server.gui, self.content
+        gui.add_html(html.heading(content.title, content.facts))
+        if content.verdict:
+            gui.add_html(html.message(content.verdict, bad=content.is_doubtful))
+        gui.add_html(html.chips(content.mesh.names, content.mesh.colors))
+        colorings = (SEGMENT, *content.colorings)
+        first = OWN if OWN in colorings else SEGMENT
+        self.coloring = gui.add_dropdown("Colour", colorings, initial_value=first, visible=len(colorings) > 1)
+        self.legend = gui.add_html("", visible=False)
+        self.coloring.on_update(lambda _: self._draw())
+        self.controls = SegmentControls(gui, content.mesh, self._draw)
+        if content.cloud is not None:
+            points = PointLayer(self.stage)
+            points.show(content.cloud)
+            # white points would hide the colours that are looked at
+            self.coloring.on_update(lambda _: setattr(points.box, "value", self.coloring.value == SEGMENT))
+        toward = content.rotation.T @ [0.0, 0.0, 1.0]
+        self.stage.add_views(lambda: toward, lambda: content.bounds, content.first_view)
+        if content.ask is not None:
+            self._build_probe()
+        if content.depth is not None:
+            with gui.add_folder("Depth image"):
+                gui.add_image(enlarged(content.depth[0]), format="png")
+                if len(content.depth[1]) == 2:
+                    gui.add_html(html.message("bright: {}; dark: {}".format(*content.depth[1])))
+
+    def _build_probe(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Probe"):
+            self.probing = gui.add_checkbox("ask at a point", False)
+            self.told = gui.add_html(html.message("Click a surface, or drag the arrows of the probe."))
+        self.gizmo = self.server.scene.add_transform_controls(
+            "/probe", scale=0.35, disable_rotations=True, depth_test=False, visible=False
+        )
+        self.gizmo.on_update(lambda _: self.probe(self.stage.back(np.array(self.gizmo.position))))
+        self.probing.on_update(lambda _: self._switch_probe())
+        self.server.scene.on_click()(self._clicked)
+        self._arrow: Any = None
+
+    def _draw(self) -> None:
+        """Callbacks run in several threads; one of them draws at a time."""
+        with self._drawing, self.server.atomic():
+            name = self.coloring.value
+            if name != SEGMENT and name not in self._known_colors:
+                self._known_colors[name] = self.content.colorings[name]()
+            colors, scale = (None, None) if name == SEGMENT else self._known_colors[name]
+            self.legend.content = "" if scale is None else html.color_bar(scale)
+            self.legend.visible = scale is not None
+            self.layer.show(self.content.mesh, self.controls, colors)
+
+    # --- probing ------------------------------------------------------------------------------------------------------
+
+    def _clicked(self, event: Any) -> None:
+        origin, direction = (np.array(ray, dtype=float) for ray in (event.ray_origin, event.ray_direction))
+        point = first_hit(self.content.mesh, self.stage.back(origin), direction, self.controls.visible())
+        if point is not None:
+            self.move_probe(point)
+            self.probing.value = True
+
+    def _switch_probe(self) -> None:
+        if self.probing.value and self._arrow is None:
+            self.move_probe(self.stage.center)
+        self._show_probe(bool(self.probing.value))
+
+    def _show_probe(self, is_shown: bool) -> None:
+        self.gizmo.visible = is_shown
+        if self._arrow is not None:
+            self._arrow.visible = is_shown
+
+    def move_probe(self, point: Float[np.ndarray, "3"]) -> None:
+        """Show the probe at a point of the input's frame."""
+        self.gizmo.position = tuple(self.stage.place(point))
+        self._show_probe(True)
+        self.probe(point)
+
+    def probe(self, point: Float[np.ndarray, "3"]) -> None:
+        """Say what is known of a point of the input's frame, and draw the way to the nearest surface."""
+        assert self.content.ask is not None
+        answer, mesh = self.content.ask(point[None]), self.content.mesh
+        names, colors = ("empty space", *mesh.names), (EMPTY_COLOR, *mesh.colors)
+        self.told.content = html.answer(answer, names, colors, point, self.content.unit)
+        distance, direction = float(answer.distance[0]), answer.direction[0]
+        if np.isnan(distance) or np.isnan(direction).any():
+            return
+        start = self.stage.place(point)
+        end = start + max(abs(distance) * self.stage.scale, 0.03) * direction
+        self._arrow = self.server.scene.add_arrows(
+            "/arrow",
+            np.stack([start, end])[None].astype(np.float32),
+            colors[int(answer.label[0])],
+            shaft_radius=0.008,
+            head_radius=0.022,
+            head_length=min(0.06, 0.5 * float(np.linalg.norm(end - start))),
+        )
