@@ -41,15 +41,6 @@ def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shards, "SHARD_SIZE", 4)
 
 
-@pytest.fixture
-def place(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Folder for the files of this test's clusters alone."""
-    with TemporaryDirectory(prefix="m", dir="/tmp") as folder:
-        monkeypatch.setenv("TMPDIR", folder)  # of a command
-        monkeypatch.setattr("tempfile.tempdir", folder)
-        yield Path(folder)
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The dataset as one process makes it: 24 shards."""
@@ -97,10 +88,20 @@ def parent(process: int) -> int:
         return 0
 
 
-def working(place: str | Path) -> list[int]:
+def working(place: str) -> list[int]:
     """Workers at a task, of the cluster whose files lie in a folder."""
-    nodes = processes("raylet", str(place))
+    nodes = processes("raylet", place)
     return [process for process in processes("ray::_apply") if parent(process) in nodes]
+
+
+def folder_of_ray(process: int) -> str:
+    """Beginning of the folder in which a process has Ray's files."""
+    return f"/tmp/mereo-ray-{process}-"
+
+
+def is_left(process: int) -> bool:
+    """Whether there are Ray's files of a process."""
+    return any(str(place).startswith(folder_of_ray(process)) for place in Path("/tmp").iterdir())
 
 
 def gone(*words: str, within_s: float = 15.0) -> bool:
@@ -112,10 +113,10 @@ def gone(*words: str, within_s: float = 15.0) -> bool:
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
-def test_workers_change_no_bit(workers: int, whole: dict[str, bytes], tmp_path: Path, place: Path) -> None:
+def test_workers_change_no_bit(workers: int, whole: dict[str, bytes], tmp_path: Path) -> None:
     generate(TOY, tmp_path / "data", SMALL, examples=EXAMPLES, seed=3, workers=workers, ray="local")
     assert contents(tmp_path / "data") == whole
-    assert gone(str(place)) and not list(place.iterdir())
+    assert gone(folder_of_ray(os.getpid())) and not is_left(os.getpid())
 
 
 def test_nodes_that_die_lose_nothing(
@@ -147,7 +148,7 @@ def test_nodes_that_die_lose_nothing(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path, place: Path) -> None:
+def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path) -> None:
     """Ctrl-C reaches all processes of a terminal; TERM and KILL the command alone."""
     output = tmp_path / "data"
     line = f"generate shapes --examples 6400 --test --seed 1000003 --output {output} --ray local --workers 2"
@@ -160,7 +161,7 @@ def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path
     )
     try:
         until = time.monotonic() + 300
-        while not working(place) and time.monotonic() < until and command.poll() is None:
+        while not working(folder_of_ray(command.pid)) and time.monotonic() < until and command.poll() is None:
             time.sleep(0.1)
         if number == signal.SIGINT:
             os.killpg(command.pid, number)
@@ -170,13 +171,13 @@ def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path
     finally:
         command.kill()
     assert command.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[number], said
-    assert gone(str(place))
+    assert gone(folder_of_ray(command.pid))
     if number != signal.SIGKILL:
         assert said.splitlines()[-1] == (
             "mereo: interrupted" if number == signal.SIGINT else "mereo: stopped by SIGTERM"
         )
         assert not [place for place in output.iterdir() if place.name.endswith(".partial")]
-        assert not list(place.iterdir())
+        assert not is_left(command.pid)
 
 
 def without_seconds(value: Any) -> Any:
