@@ -27,8 +27,8 @@ def list_objects(folder: Path) -> list[Learnable]:
     Raises ``ValueError`` for a folder without objects, with two of one name, or with meshes of its own.
     """
     found: list[Learnable] = []
-    for path in sorted(folder.iterdir()):
-        files = sorted(path.iterdir()) if path.is_dir() else [path]
+    for path in sorted(folder.glob("[!.]*")):
+        files = sorted(path.glob("[!.]*")) if path.is_dir() else [path]
         scenes = [file for file in files if is_yaml(file) or file.suffix == ".py"]
         shapes = [file for file in files if file.suffix.lower() in MESH_SUFFIXES or is_volume(file)]
         if path in shapes:

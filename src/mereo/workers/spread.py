@@ -181,7 +181,8 @@ def connect(cluster: Cluster) -> Iterator[None]:
     quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL}
     handler = signal.getsignal(signal.SIGTERM)
     # in /tmp, as paths of sockets must be shorter than some systems' folders for temporary files allow
-    with TemporaryDirectory(prefix="mereo-ray-", dir="/tmp" if os.name == "posix" else None) as folder:
+    place = "/tmp" if os.name == "posix" else None
+    with TemporaryDirectory(prefix=f"mereo-ray-{os.getpid()}-", dir=place) as folder:
         try:
             if cluster.address == LOCAL:
                 count = cluster.local_cpus or cores()
