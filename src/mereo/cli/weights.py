@@ -172,7 +172,7 @@ class WeightsPull:
         from tempfile import TemporaryDirectory
 
         from mereo.io.atomic_files import atomic_file, check_file_place
-        from mereo.io.size_limits import check_bytes
+        from mereo.io.errors import check_bytes
         from mereo.models.weights import load_model
 
         repo, revision, file = _repository(self.repository)

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from mereo.evaluation.metrics import format_score
+from mereo.io.atomic_files import check_place
 from mereo.io.foreseen import words_of
 from mereo.io.mesh_formats import MESH_SUFFIXES
-from mereo.io.scratch_folders import check_place
 from mereo.io.volume_files import is_volume
 from mereo.learning.learn import learn
 from mereo.scenes.registry import is_yaml

@@ -17,9 +17,9 @@ import torch.distributed as dist
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mereo.io.atomic_files import check_place
 from mereo.io.object_storage import Place
 from mereo.io.progress import Progress, progress
-from mereo.io.scratch_folders import check_place
 from mereo.models.config import Device
 from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
 from mereo.models.encoders.encoding import CODES, Autodecoder
