@@ -179,7 +179,7 @@ def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path
         assert said.splitlines()[-1] == (
             "mereo: interrupted" if number == signal.SIGINT else "mereo: stopped by SIGTERM"
         )
-        assert not [place for place in output.iterdir() if place.name.endswith(".partial")]
+        assert not [place for place in output.iterdir() if place.name.endswith(".mereo")]
     assert not list(place.iterdir())
 
 

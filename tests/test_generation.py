@@ -14,7 +14,6 @@ from toy_data import SMALL
 from toy_scene import toy_scene
 
 from mereo.io import progress
-from mereo.io.scratch_folders import LOCK
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
@@ -244,9 +243,8 @@ def test_a_full_disk_is_one_sentence_and_leaves_no_half_file(
 
 def test_what_a_killed_run_was_writing_is_removed_on_resume(whole: Path, tmp_path: Path) -> None:
     generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(0, 2))
-    leftover = tmp_path / "data" / ".shard-00001.safetensors.1a2b3c4d.partial"
+    leftover = tmp_path / "data" / ".shard-00001.safetensors.1a2b3c4d.mereo"
     leftover.mkdir()
-    (leftover / LOCK).touch()
     (leftover / "shard-00001.safetensors").write_bytes(b"half")
     generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(1, 2))
     assert contents(tmp_path / "data") == contents(whole)

@@ -118,7 +118,7 @@ def test_an_experiment_says_what_to_do_with_older_results(tmp_path: Path, capsys
     (older / "table.md").write_text("precious")
     assert command_line.main(["experiment", "noise", "--output", str(tmp_path)]) == 2
     assert capsys.readouterr().err == (
-        f"mereo: error: {older} has no .mereo.json, so its content is not mereo's, or an earlier version's; it is not "
+        f"mereo: error: {older} holds table.md, not written by this version of mereo or changed since; it is not "
         "replaced: move it away or delete it, and run the same command again, which keeps the datasets, runs and "
         "scores and writes these results anew\n"
     )

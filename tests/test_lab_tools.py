@@ -21,7 +21,7 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.io.config import InputConfig
-from mereo.io.output_folders import strangers
+from mereo.io.output_folders import unexpected_files
 from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
 from mereo.scenes.parameters import random_state
@@ -157,7 +157,7 @@ def test_a_saved_result_is_what_reconstruct_writes(tmp_path: Path) -> None:
     view = laboratory.look(random_state(scene, 3), laboratory.first_place())
     result = laboratory.answer(view, 16)
     folder = unpacked(result_archive(scene, result), tmp_path)
-    assert folder.name == "rope-result" and not strangers(folder)
+    assert folder.name == "rope-result" and not unexpected_files(folder)
     plain = mereo.reconstruct(view.depth, replace(model, statistical_model=None), "network", resolution=16)
     plain.save(tmp_path / "plain")
     names = {file.name for file in (tmp_path / "plain").iterdir()}

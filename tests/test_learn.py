@@ -291,7 +291,7 @@ def test_killed_at_any_stage_it_ends_with_the_same_weights(small: None, tmp_path
         with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(owner, name, stop)
             learn([scene], parts, minutes=0.05, init="rope", train="always")
-        assert not [place for place in parts.rglob(".*") if place.name.endswith(".partial")]
+        assert not [place for place in parts.rglob(".*") if place.name.endswith(".mereo")]
     learn([scene], parts, minutes=0.05, init="rope", train="always")
     ours, theirs = learnt(whole), learnt(parts)
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)

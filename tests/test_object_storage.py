@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from mereo.io import object_storage
+from mereo.io.atomic_files import check_place
 from mereo.io.object_cache import CACHE_VARIABLE, read_cached
 from mereo.io.object_storage import ObjectPath, StorageError, place_of
 from mereo.io.places import claim, names_in, sha256, write_whole
-from mereo.io.scratch_folders import check_place
 
 
 @pytest.fixture

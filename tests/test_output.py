@@ -126,7 +126,7 @@ def test_a_directory_is_claimed_once(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_process_left_is_in_nobodys_way(tmp_path: Path) -> None:
-    (tmp_path / ".settings.json.1a2b3c4d.partial").mkdir()
+    (tmp_path / ".settings.json.1a2b3c4d.mereo").mkdir()
     assert claim_directory(tmp_path, "settings.json", {"a": 1}, "a run") is None
     assert json.loads((tmp_path / "settings.json").read_text()) == {"a": 1}
 

@@ -107,7 +107,7 @@ def test_nobodys_files_are_replaced(result: Result, tmp_path: Path) -> None:
         (tmp_path / "one.glb").write_text("keep")
         with pytest.raises(FileExistsError, match="not overwritten"):
             result.save(tmp_path / place)
-    with pytest.raises(FileExistsError, match="its content is not mereo's"):
+    with pytest.raises(FileExistsError, match="not written by this version of mereo"):
         result.save(tmp_path / "out", overwrite=True)
     assert (tmp_path / "out/mine.txt").read_text() == (tmp_path / "one.glb").read_text() == "keep"
     result.save(tmp_path / "one.glb", overwrite=True)

@@ -85,7 +85,7 @@ def test_results_that_are_there_are_kept_without_force(
     assert run(folder, "--output", out) == 2
     assert "exists and is not empty" in capsys.readouterr().err
     assert run(folder, "--output", out, "--force") == 2
-    assert "its content is not mereo's" in capsys.readouterr().err
+    assert "not written by this version of mereo" in capsys.readouterr().err
     assert [path.name for path in (out / "a").iterdir()] == ["mine.txt"]
 
 

@@ -130,7 +130,7 @@ def check_full_disk(commands: Commands, case: Case, inputs: Path, place: Path, r
     if arguments.startswith(("train", "generate", "scene check")):  # whole files stay, and the work is continued
         after = {name: after[name] for name in before}
     assert after == before
-    assert not list(place.rglob("*.partial"))
+    assert not list(place.rglob("*.mereo"))
     if case.only_once:
         return
     done = commands.run(place, arguments)
@@ -138,7 +138,7 @@ def check_full_disk(commands: Commands, case: Case, inputs: Path, place: Path, r
         assert case.again and case.again in done.said, done.said
         done = commands.run(place, f"{arguments} {case.again}")
     assert done.code == 0, done.said
-    assert not list(place.rglob("*.partial"))
+    assert not list(place.rglob("*.mereo"))
 
 
 @pytest.mark.parametrize("name", [pytest.param("release over another", marks=pytest.mark.slow), "scene export"])

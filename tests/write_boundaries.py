@@ -8,9 +8,7 @@ from pathlib import Path
 
 from failpoints import MOVES, Commands
 
-from mereo.io.scratch_folders import LOCK
-
-FOREIGN = ("thesis.tex", ".out.mine.partial/mine.txt", ".out.00000000.partial/mine.txt")
+FOREIGN = ("thesis.tex", ".out.mine.mereo/mine.txt", ".out.00000000.partial/mine.txt")
 """Files of somebody else beside an output, two in folders that look like mereo's own."""
 
 TIMES = re.compile(rb'"timings_s": {[^}]*}|"seconds": [0-9.e+-]+')
@@ -68,7 +66,7 @@ def _kind(function: str, place: Path) -> str:
         return re.sub("[0-9a-f]{8}|[0-9]+", "0", place.name)
     if place.is_absolute():
         return "what is not mereo's, such as a cache of torch"
-    return place.suffix if place.suffix == ".partial" else "lock" if place.name == LOCK else "file or folder"
+    return place.suffix if place.suffix == ".mereo" else "file or folder"
 
 
 def check_boundaries(commands: Commands, case: Case, inputs: Path, folder: Path, *, every_call: bool) -> None:
@@ -122,11 +120,11 @@ def _names(folder: Path) -> set[str]:
 
 
 def _content(folder: Path, case: Case) -> dict[str, bytes]:
-    """Bytes of all files, without durations; the list of digests, which differs with them, says no more."""
+    """Bytes of all files, without durations; the list of times says no more."""
     return {
         name: TIMES.sub(b"", path.read_bytes()) if path.name in case.timed else path.read_bytes()
         for name, path in _files(folder)
-        if not (case.timed and path.name == ".mereo.json")
+        if path.name != ".mereo.json"
     }
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import uvicorn
 
 from mereo.fitting.config import AnswerMethod
-from mereo.io.scratch_folders import scratch_folder
+from mereo.io.atomic_files import scratch_folder
 from mereo.models.config import InferenceConfig
 from mereo.visualization.viewer.guard import LOOPBACK, Entry, bound_socket
 from mereo_serving.app import Service, make_app

@@ -26,10 +26,10 @@ from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view, shipped_frame
 from mereo.evaluation.scans import BUNNY_SCAN_POSES
 from mereo.fitting.config import AnswerMethod
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.atomic_files import check_place
 from mereo.io.extras import has_network
 from mereo.io.output_folders import check_new_directory, new_directory
 from mereo.io.progress import shown_stages
-from mereo.io.scratch_folders import check_place
 from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.stl import write_surface_stl
 from mereo.models.weights_place import statistical_model_in

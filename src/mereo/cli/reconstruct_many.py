@@ -16,11 +16,11 @@ from mereo.cli import outcome as command
 from mereo.cli.reconstruct import FrameJob, outcome_of, reconstruct_file
 from mereo.cli.reconstruct_tasks import answer_in_tasks
 from mereo.cli.reconstruct_told import KNOWN, Told
+from mereo.io.atomic_files import check_place
 from mereo.io.config import InputConfig
 from mereo.io.output_folders import MARKER
 from mereo.io.progress import duration
 from mereo.io.ros_recordings import is_recording
-from mereo.io.scratch_folders import check_place
 from mereo.reconstruction.observation import FrameWarning
 from mereo.reconstruction.stream import frame_error
 from mereo.reconstruction.stream_sources import frames_in

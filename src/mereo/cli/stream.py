@@ -14,9 +14,8 @@ from mereo.cli.stream_answers import Answering, FrameAnswer, Seen
 from mereo.cli.stream_rerun import RerunLog, RerunTarget
 from mereo.fitting.tracking.config import StreamMethod
 from mereo.geometry.conventions import CloudAxes
-from mereo.io.atomic_files import atomic_file, to_json
+from mereo.io.atomic_files import atomic_file, check_place, remove_all_abandoned, to_json
 from mereo.io.config import InputConfig
-from mereo.io.scratch_folders import check_place, remove_all_abandoned
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig

@@ -1,19 +1,186 @@
-"""Files that appear whole or not at all, and values as JSON.
+"""Files that appear whole or not at all, the scratch folders in which they are made, and values as JSON.
 
-Everything is first written in a scratch folder beside its destination and renamed at the end, so that a reader never
-sees half a file and an error, Ctrl-C or a full disk leaves nothing behind.
+An output is first made in a scratch folder beside its destination and renamed at the end, so that a reader never sees
+half of it and an error, Ctrl-C or a full disk leaves nothing behind. A scratch folder (``.NAME.1a2b3c4d.mereo``) is
+locked by its process; the system frees locks when a process dies, however it does, so the next one that writes there
+can tell what a killed one left from work in progress.
 """
 
+import errno
 import json
 import os
+import re
+import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mereo.io.scratch_folders import check_place, remove_abandoned, scratch_folder
+try:
+    import fcntl
+
+    HAS_LOCKS = True
+except ImportError:  # Windows, where what a killed process left stays until its user deletes it
+    HAS_LOCKS = False
+
+OLD = ".mereo-old"
+"""Name under which an output that is being replaced waits in the scratch folder of its successor."""
+
+PROTOCOL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
+"""First part of what a path makes of a URL."""
+
+MOST_BYTES = 255 - len("..1a2b3c4d.mereo")
+"""Length of a name in bytes that leaves room for that of its scratch folder on every usual file system."""
+
+
+# --- scratch folders --------------------------------------------------------------------------------------------------
+
+
+def check_place(path: Path, may_be_link: bool = False) -> None:
+    """Raise ``ValueError`` for what cannot be replaced by renaming: links, devices, and names that are none.
+
+    With ``may_be_link`` a link to a directory will do.
+    """
+    name = repr(str(path))
+    if re.search("[\0\ud800-\udfff]", str(path)):
+        raise ValueError(f"the output {name} has a zero byte, or bytes that are no UTF-8 text: choose another name")
+    if len(path.parts) > 1 and PROTOCOL.fullmatch(path.parts[0]) and not Path(path.parts[0]).exists():
+        raise ValueError(
+            f"the output {path.parts[0]}//{'/'.join(path.parts[1:])} is a URL, and a local path is needed here; only "
+            "datasets go to an object storage: name a folder or file of this machine"
+        )
+    if path.name in ("", ".."):
+        raise ValueError(f"the output {name} has no name of its own, which it needs: name it, as in {path / 'out'}")
+    if max(len(part.encode()) for part in path.parts) > MOST_BYTES:
+        raise ValueError(f"the output {name[:40]}... has a name of over {MOST_BYTES} bytes: choose a shorter one")
+    if path.is_symlink() and not (may_be_link and path.is_dir()):
+        raise ValueError(f"{path} is a link, which would be lost; an output is written in its own place: name that")
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ValueError(f"{path} is a device or pipe; an output is a file or folder: choose another --output")
+    above = next((place for place in path.parents if place.exists()), path.parent)
+    if above.exists() and not above.is_dir():
+        raise ValueError(f"{above} is no folder, so {path.name} cannot be made in it: choose another --output")
+
+
+@contextmanager
+def scratch_folder(path: Path) -> Iterator[Path]:
+    """Yield a fresh folder beside ``path``, and remove it at the end, whatever happens; missing parents are made.
+
+    Where the block fails (Ctrl-C too) the parents are removed again. What killed processes left here for ``path`` goes.
+
+    Raises:
+        OSError: the disk is full.
+        PermissionError: the place cannot be written to.
+    """
+    remove_abandoned(path)
+    missing = [place for place in path.parents if not place.exists()]
+    try:
+        scratch, lock = _new_scratch(path)
+        try:
+            yield scratch
+        finally:
+            _clear(scratch, path)
+            if lock is not None:
+                os.close(lock)
+    except BaseException as error:
+        for directory in missing:
+            with suppress(OSError):  # another process may have written there meanwhile
+                directory.rmdir()
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            full = OSError(f"the disk is full while writing {path}: free space or choose another place")
+            full.errno = errno.ENOSPC  # alone: of an error with a system's text the command line shows that
+            raise full from error
+        raise
+
+
+def _new_scratch(path: Path) -> tuple[Path, int | None]:
+    """A new scratch folder and the descriptor of its lock, if there are locks."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".mereo", dir=path.parent))
+            with suppress(FileNotFoundError):  # another process took it for a leftover, as it was not locked yet
+                lock = _lock(scratch, wait=True)
+                if scratch.exists():
+                    return scratch, lock
+                if lock is not None:
+                    os.close(lock)
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise
+        raise PermissionError(f"{path} cannot be written; its directory is read-only: choose another place") from error
+
+
+def remove_abandoned(path: Path) -> None:
+    """Remove what killed processes left for ``path``; an output that one of them had taken away is put back."""
+    for scratch, is_dead in _scratches(path.parent, re.escape(path.name)):
+        if is_dead:
+            _clear(scratch, path)
+
+
+def remove_all_abandoned(directory: Path) -> None:
+    """Remove what killed processes left for any file of a directory in which work is continued."""
+    for scratch, is_dead in _scratches(directory, ".+"):
+        if is_dead:
+            _clear(scratch, directory / scratch.name[1 : -len(".1a2b3c4d.mereo")])
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a process that lives, this one too, has a scratch folder for ``path``."""
+    return any(not is_dead for _, is_dead in _scratches(path.parent, re.escape(path.name)))
+
+
+def _scratches(directory: Path, names: str) -> Iterator[tuple[Path, bool]]:
+    """Scratch folders for a pattern of names, each with whether its process is dead; none where there are no locks."""
+    pattern, found = re.compile(rf"\.(?:{names})\.[0-9a-z_]{{8}}\.mereo"), list[Path]()
+    with suppress(OSError):  # it may be missing, or be no one's to list
+        found = [place for place in directory.iterdir() if pattern.fullmatch(place.name) and not place.is_symlink()]
+    for scratch in found:
+        try:
+            lock = _lock(scratch)
+        except BlockingIOError:
+            yield scratch, False
+            continue
+        except OSError:  # another user's, or gone by now
+            continue
+        if lock is not None:
+            yield scratch, True
+            os.close(lock)
+
+
+def _lock(scratch: Path, *, wait: bool = False) -> int | None:
+    """Lock a scratch folder; the lock is free again when the descriptor is closed. None where there are no locks."""
+    if not HAS_LOCKS:
+        return None
+    lock = os.open(scratch, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError as error:
+        os.close(lock)
+        if isinstance(error, BlockingIOError):
+            raise
+        return None  # some network file systems
+    return lock
+
+
+def _clear(scratch: Path, path: Path) -> None:
+    """Remove a scratch folder; an output that was to be replaced and was not goes back to its place.
+
+    While that place is taken, the output waits.
+    """
+    old = scratch / OLD
+    if old.exists() and (scratch / path.name).exists():  # its successor was not put in its place
+        try:
+            os.rename(old, path)
+        except OSError:
+            return
+    shutil.rmtree(scratch, ignore_errors=True)
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -82,6 +249,9 @@ def _place_new(partial: Path, path: Path) -> None:
         if path.exists():
             raise FileExistsError(f"{path} {EXISTS}") from None
         os.rename(partial, path)
+
+
+# --- JSON -------------------------------------------------------------------------------------------------------------
 
 
 def write_json(path: str | Path, value: Any, *, force: bool = True) -> None:

@@ -1,30 +1,28 @@
 """Folders of results: they appear whole or not at all, and replace only what mereo itself wrote.
 
-Each holds ``.mereo.json``, a list of its files with their SHA-256. A folder is replaced where all of its content is in
-that list, unchanged: what somebody has put there, or has edited, stays.
+Each holds ``.mereo.json``, a list of all that is in it with the size and time of each file. A folder is replaced where
+its content is that list's, unchanged: what somebody has put there, or has edited, stays.
 """
 
-import errno
-import hashlib
 import json
 import os
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
-from mereo.io.atomic_files import write_json
-from mereo.io.object_storage import ObjectPath
-from mereo.io.scratch_folders import (
-    ASIDE,
-    REMOVED,
-    abandoned,
+from mereo.io.atomic_files import (
+    OLD,
     check_place,
     is_being_written,
+    json_text,
     remove_abandoned,
     remove_all_abandoned,
     scratch_folder,
+    write_json,
 )
+from mereo.io.object_storage import ObjectPath
 
 MARKER = ".mereo.json"
 """Name of the list in each folder of results."""
@@ -46,22 +44,32 @@ def new_directory(path: str | Path, force: bool = False, inputs: Sequence[str | 
         OSError: the disk is full, or the place cannot be written to.
     """
     path = Path(path)
-    replaced = check_new_directory(path, force, inputs)
+    check_new_directory(path, force, inputs)
     with scratch_folder(path) as scratch:
         content = scratch / path.name
         content.mkdir()
         yield content
-        _write_marker(content)
-        if replaced is None or not path.exists():
-            _place(content, path)
-        else:
-            _replace(content, path, replaced, scratch / ASIDE)
+        (content / MARKER).write_text(json_text({"written_by": "mereo", "files": _stamps(content)}), "utf-8")
+        if force and _has_content(path):
+            os.rename(path, scratch / OLD)  # from here on nobody finds it to put something into it
+            _check_ours(scratch / OLD, path)  # where this raises, ``scratch_folder`` puts it back
+        with suppress(OSError):  # Windows renames nothing to an empty folder
+            path.rmdir()
+        try:
+            os.rename(content, path)
+        except OSError:
+            if not path.exists():
+                raise
+            raise FileExistsError(
+                f"{path} was written by another while this ran; it is kept and this result is dropped: run again with "
+                "another --output"
+            ) from None
 
 
-def check_new_directory(path: Path, force: bool, inputs: Sequence[str | Path] = ()) -> bytes | None:
-    """Check what ``new_directory`` may do, before the work; the list of what it will replace, None for nothing.
+def check_new_directory(path: Path, force: bool, inputs: Sequence[str | Path] = ()) -> None:
+    """Check what ``new_directory`` may do, before the work; raises as it does.
 
-    Raises as it does. An output that a killed process was just replacing is put back.
+    An output that a killed process was just replacing is put back.
     """
     check_place(path)
     if path.exists() and not path.is_dir():
@@ -70,9 +78,9 @@ def check_new_directory(path: Path, force: bool, inputs: Sequence[str | Path] = 
         raise ValueError(f"{path} is a mount point, which cannot be renamed: name a folder in it")
     if is_being_written(path):
         raise FileExistsError(f"{path} is being written by another process: wait for it, or choose another --output")
-    _put_back(path)
-    if not path.is_dir() or not any(path.iterdir()):
-        return None
+    remove_abandoned(path)
+    if not _has_content(path):
+        return
     if not force:
         raise FileExistsError(
             f"{path} exists and is not empty; it is not overwritten: choose another --output or pass --force"
@@ -80,131 +88,46 @@ def check_new_directory(path: Path, force: bool, inputs: Sequence[str | Path] = 
     for place in map(Path, inputs):
         if place.exists() and place.resolve().is_relative_to(path.resolve()):
             raise FileExistsError(f"{path} holds {place}, which is read; it is not replaced: choose another --output")
-    _check_own(path, path)
-    return (path / MARKER).read_bytes()
+    _check_ours(path, path)
 
 
-def _check_own(folder: Path, path: Path) -> None:
+def _has_content(path: Path) -> bool:
+    return path.is_dir() and any(path.iterdir())
+
+
+def _check_ours(folder: Path, path: Path) -> None:
     """Raise ``FileExistsError`` where ``folder``, which is or was ``path``, holds what mereo did not write."""
-    others = strangers(folder)
-    if not others:
-        return
-    if not (folder / MARKER).is_file():
+    others = unexpected_files(folder)
+    if others:
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise FileExistsError(
-            f"{path} has no {MARKER}, so its content is not mereo's, or an earlier version's; it is not replaced: "
-            "choose another --output, or delete it yourself"
+            f"{path} holds {others[0]}{more}, not written by this version of mereo or changed since; it is not "
+            "replaced: move that away, or choose another --output"
         )
-    more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-    raise FileExistsError(
-        f"{path} holds {others[0]}{more}, not written by mereo or changed since; it is not replaced: move that away, "
-        "or choose another --output"
-    )
 
 
-# --- the list of what was written -------------------------------------------------------------------------------------
+def unexpected_files(folder: Path) -> list[str]:
+    """Names in a folder of what its list does not have as it is; links are never in it."""
+    try:
+        listed = json.loads((folder / MARKER).read_text("utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        listed = {}
+    known = listed if isinstance(listed, dict) else {}
+    return [
+        name
+        for name, stamp in _stamps(folder).items()
+        if name != MARKER and (stamp is None or known.get(name) != stamp)
+    ]
 
 
-def strangers(folder: Path) -> list[str]:
-    """What of a folder's content, by its name in it, the list does not have as it is; links are never in it."""
-    written = _read_marker(folder)
-    parents = {str(parent) for name in written for parent in PurePosixPath(name).parents}
-    found = []
+def _stamps(folder: Path) -> dict[str, list[int] | None]:
+    """Size and time of each file in a folder, by its name there; of a folder nothing, and None for all else."""
+    found = dict[str, list[int] | None]()
     for place in sorted(folder.rglob("*")):
-        name = place.relative_to(folder).as_posix()
-        if (
-            place.is_symlink()
-            or not (place.is_file() or place.is_dir())
-            or (name not in parents if place.is_dir() else name != MARKER and written.get(name) != _digest(place))
-        ):
-            found.append(name)
+        facts = place.lstat()
+        stamp = [facts.st_size, facts.st_mtime_ns] if stat.S_ISREG(facts.st_mode) else None
+        found[place.relative_to(folder).as_posix()] = [] if stat.S_ISDIR(facts.st_mode) else stamp
     return found
-
-
-def _write_marker(folder: Path) -> None:
-    files = {p.relative_to(folder).as_posix(): _digest(p) for p in sorted(folder.rglob("*")) if p.is_file()}
-    write_json(folder / MARKER, {"written_by": "mereo", "files": files})
-
-
-def _read_marker(folder: Path) -> dict[str, Any]:
-    """Digests of the files that a folder's list names; none where it has no list."""
-    try:
-        files = json.loads((folder / MARKER).read_text("utf-8"))["files"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-    return files if isinstance(files, dict) else {}
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-# --- putting it in its place ------------------------------------------------------------------------------------------
-
-
-def _place(content: Path, path: Path) -> None:
-    """Rename ``content`` to ``path``, which is absent or empty; the system refuses where it no longer is."""
-    if os.name == "nt":  # which refuses an empty one too
-        with suppress(OSError):
-            path.rmdir()
-    try:
-        os.rename(content, path)
-    except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
-            raise
-        raise FileExistsError(f"{path} {CAME}") from None
-
-
-CAME = "was written by another while this ran; it is kept and this result is dropped: run again with another --output"
-
-
-def _replace(content: Path, path: Path, replaced: bytes, old: Path) -> None:
-    """Put ``content`` in the place of ``path``, if that is still what ``replaced`` lists; all else goes back."""
-    os.rename(path, old)  # from here on nobody finds it to put something into it
-    try:
-        if not (old / MARKER).is_file() or (old / MARKER).read_bytes() != replaced:
-            raise FileExistsError(f"{path} {CAME}")
-        _check_own(old, path)
-        _place(content, path)
-    except BaseException:
-        with suppress(OSError):  # there is something again: the old one waits until that has gone
-            os.rename(old, path)
-        raise
-    _remove_old(old)
-
-
-def _put_back(path: Path) -> None:
-    """Finish what processes did that were killed between taking an old output away and removing it."""
-    for scratch in abandoned(path):
-        old = scratch / ASIDE
-        if old.is_dir() and not path.exists():
-            os.rename(old, path)
-        elif old.is_dir() and not strangers(old):
-            _remove_old(old)
-        _remove_written(scratch / REMOVED)
-    remove_abandoned(path)
-
-
-def _remove_old(old: Path) -> None:
-    """Remove an output that waits in a scratch folder, first of all its name, so that no part of it is put back."""
-    removed = old.with_name(REMOVED)
-    with suppress(OSError):  # it is in nobody's way
-        os.rename(old, removed)
-        _remove_written(removed)
-
-
-def _remove_written(folder: Path) -> None:
-    """Remove the files of a folder that its list names, and then what is empty."""
-    written, places = _read_marker(folder), sorted(folder.rglob("*"), reverse=True)
-    folders = [place for place in places if place.is_dir() and not place.is_symlink()]
-    with suppress(OSError):  # what remains is in nobody's way
-        for place in places:
-            if place.relative_to(folder).as_posix() in written:
-                place.unlink()
-        for place in folders:
-            place.rmdir()
-        (folder / MARKER).unlink(missing_ok=True)  # the last one, for whoever must go on with this
-        folder.rmdir()
 
 
 # --- folders in which work is continued -------------------------------------------------------------------------------

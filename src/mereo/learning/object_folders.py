@@ -18,11 +18,11 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.evaluation.metrics import format_score
+from mereo.io.atomic_files import check_place
 from mereo.io.foreseen import words_of
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.output_folders import claim_directory
 from mereo.io.progress import duration
-from mereo.io.scratch_folders import check_place
 from mereo.io.volume_files import is_volume
 from mereo.learning.learn import learn
 from mereo.learning.search_stage import TrainChoice

@@ -16,8 +16,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from mereo.io.atomic_files import check_place
 from mereo.io.object_storage import Place
-from mereo.io.scratch_folders import check_place
 from mereo.models.config import Device
 from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
 from mereo.models.encoders.encoding import Autodecoder

@@ -20,8 +20,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
+from mereo.io.atomic_files import scratch_folder
 from mereo.io.cores import cores
-from mereo.io.scratch_folders import scratch_folder
 from mereo.workers.config import LOCAL, Cluster
 from mereo.workers.installation import Installation, installation
 

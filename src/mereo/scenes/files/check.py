@@ -19,8 +19,7 @@ from mereo.geometry.mesh_repair import repaired, without_overlaps
 from mereo.geometry.overlap import Overlap, grid_volume, overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
-from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.io.scratch_folders import remove_abandoned
+from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read, read_segments
 from mereo.scenes.files.defaults import motion
