@@ -16,15 +16,15 @@ from pathlib import Path
 from traceback import extract_tb
 from types import FrameType
 
+from mereo.io.errors import LIMIT_VARIABLE
 from mereo.io.foreseen import PACKAGE, is_foreseen, words_of
-from mereo.io.size_limits import LIMIT_VARIABLE
 
 MOST_SECONDS, MOST_GB = 60.0, 2.0
 """An input that takes longer hangs: what is taken here takes a second on a slow machine."""
 
 MOST_CHARACTERS = 3000
-UNPACKED_GB = "0.2"
-"""Limit on what files may unpack to while the rule is checked; the default of 4 alone is more than the rule allows."""
+READING_GB = "1"
+"""Limit on the memory of reading while the rule is checked; the default alone is more than the rule allows."""
 
 SILENT = (DeprecationWarning, PendingDeprecationWarning, ResourceWarning, ImportWarning)
 """Warnings that Python shows to nobody."""
@@ -83,7 +83,7 @@ def fault_of(read: Callable[[Path], object], path: Path, names: tuple[str, ...] 
     before = listing(path.parent)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        os.environ[LIMIT_VARIABLE] = UNPACKED_GB
+        os.environ[LIMIT_VARIABLE] = READING_GB
         try:
             with limits():
                 read(path)

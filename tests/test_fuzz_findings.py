@@ -97,11 +97,11 @@ def of_python_2(content: bytes) -> bytes:
 EMPTY = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (2147483647, 0, 3), }\n")
 CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
-    "a chunk of 4 GB": ("mesh.glb", second_chunk, r"truncated: \d+ of 4294967295 bytes"),
-    "a header of 4 GB": ("cloud.npy", at(6, b"\2\0" + b"\xff" * 4), "of 4294967295 bytes of its header"),
+    "a chunk of 4 GB": ("mesh.glb", second_chunk, "chunk was not expected length"),
+    "a header of 4 GB": ("cloud.npy", at(6, b"\2\0" + b"\xff" * 4), "expected 4294967295 bytes"),
     "no array": ("surfaces.npz", lambda c: npz(a=b"text"), "its entry 'a' is no array"),
     "no array in a view": ("view.npz", lambda c: npz(depth=b"text"), "its entry 'depth' is no array"),
-    "no values, and two billion rows": ("tetrahedra.npz", lambda c: npz(**{"nodes.npy": EMPTY}), "cannot"),
+    "no values, and two billion rows": ("tetrahedra.npz", lambda c: npz(**{"nodes.npy": EMPTY}), "states of 'nodes'"),
     "a name of two lines": ("surfaces.npz", lambda c: npz(**{"b\n.npy": npy_of(1.0)}), r"states of 'b\\n' but not of"),
     "an image of another size": ("depth.npy", lambda c: npy_of(np.ones((12, 17), "u2")), "depth.npy cannot be used: "),
     "negative depth": ("depth.npy", lambda c: npy_of(-np.ones((12, 16))), "depth.npy cannot be used: "),

@@ -18,7 +18,7 @@ pytest.importorskip("python_multipart", reason="python-multipart (extra `serve`)
 from fuzz_mutations import damaged
 from serving_parts import ADDRESS, CLOUD, NPY, balls, figures, npy, run, running, setup, until
 
-from mereo.io.size_limits import LIMIT_VARIABLE
+from mereo.io.errors import LIMIT_VARIABLE
 from mereo_serving.config import ServeConfig
 
 PLY = {"Content-Type": "application/ply"}
@@ -169,16 +169,16 @@ def test_a_body_that_does_not_come_is_not_waited_for(root: Path) -> None:
 
 
 def test_what_unpacks_to_too_much_is_refused(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(LIMIT_VARIABLE, "0.01")
+    monkeypatch.setenv(LIMIT_VARIABLE, "0.5")
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("points.npy", bytes(30_000_000))
-    assert len(packed.getvalue()) < 100_000
+        archive.writestr("points.npy", bytes(1_000_000_000))
+    assert len(packed.getvalue()) < 1_100_000
 
     async def ask() -> None:
         async with running(root) as server:
             found = await server.post(packed.getvalue(), f"{ADDRESS}?format=npz")
-            assert found.status_code == 413 and "frame.npz unpacks to 0.03 GB" in found.json()["error"]
+            assert found.status_code == 413 and "frame.npz takes more than 0.5 GB" in found.json()["error"]
 
     run(ask())
 

@@ -11,12 +11,12 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any, Protocol, runtime_checkable
 
-from mereo.io.size_limits import LIMIT_VARIABLE
+from mereo.io.errors import LIMIT_VARIABLE
 from mereo.workers.processes import exit_with_parent, one_thread_each, start_resource_tracker
 from mereo_serving.messages import FrameRequest, Ready, Reply, Setup
 
-POINT_BYTES = 256
-"""Bytes in which a file may state a point: coordinates, normal, colour, and what else there is of it, in doubles."""
+POINT_BYTES = 2048
+"""Bytes of memory that reading a point may take: of a text, what Python makes of its row."""
 
 END_S = 5.0
 """Seconds that a process has to end by itself."""

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.io.errors import reason
-from mereo.io.size_limits import check_bytes
+from mereo.io.errors import check_bytes, reason
 from mereo.models.weights import load_model
 from mereo.models.weights_place import find_weights
 

@@ -12,10 +12,9 @@ from mereo.evaluation.ground_truth import TruthGrid, truth_grid
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.labels import LabelGrid
 from mereo.io.atomic_files import atomic_file
-from mereo.io.errors import quiet, reason
-from mereo.io.readers import read_point_cloud
+from mereo.io.errors import SizeError, quiet, reason
+from mereo.io.readers import read_arrays, read_point_cloud
 from mereo.io.sensor_frame import SensorFrame
-from mereo.io.size_limits import read_arrays
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -120,7 +119,7 @@ def load_view(name: str | Path) -> SampleView:
     try:
         with quiet():
             return _view_of(read_arrays(path))
-    except MemoryError:
+    except SizeError:
         raise
     except Exception as error:  # whatever a damaged archive makes of zlib, tokenize and numpy
         raise ValueError(f"{path} is not a sample view of mereo ({reason(error)}); write it with `save_view`") from None

@@ -7,13 +7,14 @@ floats are metres.
 
 from collections.abc import Callable
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Real
+from PIL import Image
 
 from mereo.io.errors import quiet, readable, without_output
-from mereo.io.size_limits import check_arrays, check_bytes, open_image
 
 MILLIMETRES, METRES = 1000.0, 1.0
 """Depth scales of integer and of floating images where nothing else is said, in units per metre."""
@@ -70,15 +71,30 @@ def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:
     return np.where(np.isfinite(values) & (values < NOTHING_M), values, 0.0) / depth_scale
 
 
+def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -> Image.Image:
+    """Open an image, which is to be closed by the caller; Pillow does not compare the checksums of a PNG by itself.
+
+    Args:
+        source: the file.
+        formats: those that Pillow may take it for.
+    """
+    with Image.open(source, formats=formats) as image:
+        if image.format == "PNG":
+            image.verify()
+    if isinstance(source, BytesIO):
+        source.seek(0)
+    return Image.open(source, formats=formats)
+
+
 def _png(path: Path) -> Raw:
-    with open_image(path, path) as image:
+    with open_image(path) as image:
         if image.format != "PNG" or image.mode not in ("I;16", "I;16B", "I"):
             raise ValueError(f"it is {image.format} of mode {image.mode}, not a 16-bit grey PNG")
         return _native(np.asarray(image))
 
 
 def _tiff(path: Path) -> Raw:
-    with without_output(), open_image(path, path) as image:  # libtiff prints what Pillow says again
+    with without_output(), open_image(path) as image:  # libtiff prints what Pillow says again
         if image.format != "TIFF" or image.mode not in ("I;16", "I;16B", "I", "F"):
             raise ValueError(f"it is {image.format} of mode {image.mode}, not a grey TIFF of 16-bit or float values")
         if getattr(image, "n_frames", 1) != 1:
@@ -103,10 +119,6 @@ def _exr(path: Path) -> Raw:
         raise ImportError(f"{path} needs OpenEXR, which is not installed: pip install 'mereo[sensors]'")
     import OpenEXR
 
-    with without_output(), OpenEXR.File(str(path), header_only=True) as file:  # it prints what it raises
-        low, high = file.header()["dataWindow"]
-        width, height = (int(side) for side in np.asarray(high, dtype=np.int64) - low + 1)
-        check_bytes(path, width * height * 4 * len(file.header()["channels"]))
     with without_output(), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {str(name): np.array(channel.pixels) for name, channel in file.channels().items()}
     found = [name for last in EXR_CHANNELS for name in channels if name.lower().split(".")[-1] == last]
@@ -118,7 +130,6 @@ def _exr(path: Path) -> Raw:
 
 
 def _npy(path: Path) -> Raw:
-    check_arrays(path)
     array = np.load(path, allow_pickle=False)
     if array.dtype.kind not in "fiu":
         raise ValueError(f"its type is {array.dtype}, not a number")

@@ -17,7 +17,6 @@ from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.io.errors import readable
 from mereo.io.mesh_formats import VIEWER_ROOT
-from mereo.io.mesh_headers import check_mesh
 
 MOST_PARTS = 200
 """Meshes that are shown one by one; the others become one part, as labels are few."""
@@ -70,7 +69,6 @@ def read_glb(path: str | Path) -> GlbScene:
     """
     path = Path(path)
     with readable(path, "GLB file"):
-        check_mesh(path)
         scene: Any = trimesh.load_scene(path, process=False)
         own = VIEWER_ROOT in scene.graph.nodes
         base = VIEWER_ROOT if own else scene.graph.base_frame

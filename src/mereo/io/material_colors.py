@@ -6,7 +6,6 @@ A library is no part of the shape: where it is missing or damaged, there are no 
 from pathlib import Path
 
 from mereo.geometry.mesh import Color
-from mereo.io.size_limits import SizeError, check_bytes
 
 
 def material_colors(mesh: Path, library: str) -> dict[str, Color]:
@@ -21,9 +20,8 @@ def material_colors(mesh: Path, library: str) -> dict[str, Color]:
     if not library or Path(library).name != library or not path.is_file():
         return {}
     try:
-        check_bytes(path, path.stat().st_size)
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except (OSError, SizeError):
+    except (OSError, MemoryError):
         return {}
     colors: dict[str, Color] = {}
     textured: set[str] = set()

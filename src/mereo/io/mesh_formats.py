@@ -1,5 +1,7 @@
 """Segmented meshes from files: one file with named parts, several files, or a directory with one file per segment."""
 
+import re
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -9,9 +11,9 @@ import trimesh
 from jaxtyping import Float, Int
 
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
-from mereo.io.errors import readable
+from mereo.io.errors import check_count, readable
 from mereo.io.material_colors import material_colors
-from mereo.io.mesh_headers import check_mesh, stl_segment_name
+from mereo.io.point_cloud_formats import check_ply
 
 VIEWER_ROOT = "camera_frame"
 """Name of the root node of our own GLB files; below it, vertices are in the input's camera frame."""
@@ -64,11 +66,43 @@ def _parts(path: Path) -> list[Part]:
     if path.suffix.lower() == ".3mf" and find_spec("lxml") is None:
         raise ImportError(f"{path} needs lxml, which reads 3MF files and is not installed: pip install 'mereo[cad]'")
     with readable(path, "mesh"):
-        check_mesh(path)
+        if path.suffix.lower() in CHECKS:
+            CHECKS[path.suffix.lower()](path)
         parts = _obj_parts(path) if path.suffix.lower() == ".obj" else _scene_parts(path)
         if not parts:
             raise ValueError("it has no faces")
     return parts
+
+
+def _check_off(path: Path) -> None:
+    """Raise ``ValueError`` for an OFF file that was cut short, of which trimesh would return a part."""
+    lines = (line.partition("#")[0].strip() for line in path.read_text("utf-8", errors="replace").splitlines())
+    rows = [line for line in lines if line]
+    keyword = re.match(r"[A-Za-z0-9]*OFF\b", rows[0]) if rows else None
+    if keyword is None:
+        raise ValueError("it has no OFF header")
+    rest = rows[0][keyword.end() :].split()
+    counts, body = (rest, rows[1:]) if rest else (rows[1].split(), rows[2:])
+    vertices, faces = int(counts[0]), int(counts[1])
+    check_count(vertices, len(body), "vertices")
+    check_count(faces, len(body) - vertices, "faces")
+
+
+CHECKS: dict[str, Callable[[Path], None]] = {".ply": check_ply, ".off": _check_off}
+"""Check of the formats of which trimesh returns a part where a text file was cut short."""
+
+
+STL_NAME = b"written by mereo: "
+"""What the header of our own STL files says before the name of the segment."""
+
+
+def stl_segment_name(path: Path) -> str | None:
+    """Name of the segment in an STL file that mereo wrote; None for another one."""
+    with path.open("rb") as file:
+        header = file.read(80)
+    if not header.startswith(STL_NAME):
+        return None
+    return header.removeprefix(STL_NAME).decode("utf-8", errors="replace").strip() or None
 
 
 def _obj_parts(path: Path) -> list[Part]:

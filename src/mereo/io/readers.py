@@ -12,10 +12,9 @@ from jaxtyping import Bool, Float
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
-from mereo.io.depth_formats import DEPTH_READERS, Raw, metres, read_raw_depth
-from mereo.io.errors import readable
+from mereo.io.depth_formats import DEPTH_READERS, Raw, metres, open_image, read_raw_depth
+from mereo.io.errors import limited_memory, readable
 from mereo.io.point_cloud_formats import CLOUD_READERS
-from mereo.io.size_limits import open_image
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
 """Range of an image's median depth, unless the caller says otherwise; beyond it the unit is wrong."""
@@ -158,7 +157,7 @@ def usable_depth(
 def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
     """Pixels of an image that are not 0 (in any channel but alpha); ``size`` is the expected (width, height)."""
     path = Path(path)
-    with readable(path, "mask image"), open_image(path, path) as image:
+    with readable(path, "mask image"), open_image(path) as image:
         # a 1-bit or palette image is taken by what it shows, anything else by its stored values
         pixels = np.asarray(image.convert("RGB") if image.mode in ("1", "P", "RGBA", "LA", "CMYK") else image)
     mask = np.asarray(pixels.reshape(*pixels.shape[:2], -1).any(axis=-1))
@@ -168,3 +167,13 @@ def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Bool[np.
             f"{size[0]} x {size[1]}; they must agree: export the mask at the depth image's size"
         )
     return mask
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an NPZ file; raises ``SizeError``, and whatever damage makes of the parser."""
+    # by its name, numpy would leave a damaged file open
+    with limited_memory(path), path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+        arrays = {key: file[key] for key in file.files}
+    if strange := [key for key, value in arrays.items() if not isinstance(value, np.ndarray)]:
+        raise ValueError(f"its entry {strange[0]!r} is no array")
+    return arrays

@@ -19,11 +19,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.io.depth_formats import metres
-from mereo.io.errors import reason
+from mereo.io.depth_formats import metres, open_image
+from mereo.io.errors import SizeError, check_count, limited_memory, reason
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
-from mereo.io.recording_limits import bound_chunks
-from mereo.io.size_limits import SizeError, check_count, open_image
 
 IMAGE, CLOUD, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -95,6 +93,8 @@ def recorded_frames(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a ROS bag is needed: check the path")
+    if not (path.is_dir() or path.is_file()):
+        raise ValueError(f"{path} is not a regular file; a ROS bag is needed: save it to a file and name that")
     if find_spec("rosbags") is None:
         raise ImportError(f"{path} needs rosbags, which is not installed: pip install 'mereo[sensors]'")
     with closing(_open(path)) as reader, _undamaged(path):
@@ -108,7 +108,7 @@ def recorded_frames(
             image = _depth_image if connections[0].msgtype == IMAGE else _compressed_depth
             decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=depth_scale)
         store, ros2 = reader.typestore, reader.is2
-        for connection, stamp_ns, data in reader.messages(connections):
+        for connection, stamp_ns, data in _messages(reader, connections, path):
             message = partial(store.deserialize_cdr if ros2 else store.deserialize_ros1, data, connection.msgtype)
             yield RecordedFrame(topic, stamp_ns, partial(_read, decode, message, f"{path}, {topic} at {stamp_ns} ns"))
 
@@ -138,8 +138,8 @@ def _open(path: Path) -> Any:
     try:
         # older ROS 2 bags do not hold their message definitions; those used here are the same in all distributions
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        bound_chunks()
-        reader.open()
+        with limited_memory(path):
+            reader.open()
     except SizeError:
         raise
     except Exception as error:  # a damaged bag raises whatever its storage format does
@@ -152,10 +152,21 @@ def _undamaged(path: Path) -> Iterator[None]:
     """One sentence of whatever a bag raises that could be opened but is damaged farther in."""
     try:
         yield
-    except (ValueError, ImportError, MemoryError):
+    except (ValueError, ImportError):
         raise
     except Exception as error:
         raise ValueError(f"{path} cannot be read any farther ({reason(error)}): record or copy it again") from error
+
+
+def _messages(reader: Any, connections: list[Any], source: str | Path) -> Iterator[Any]:
+    """Messages one after the other, each unpacked in limited memory; nothing is held between them."""
+    messages = reader.messages(connections)
+    while True:
+        with limited_memory(source):
+            found = next(messages, None)
+        if found is None:
+            return
+        yield found
 
 
 def _depth_topic(reader: Any, path: Path) -> str:
@@ -180,7 +191,7 @@ def _depth_topic(reader: Any, path: Path) -> str:
 
 def _first(reader: Any, topic: str) -> Any:
     connections = [c for c in reader.connections if c.topic == topic]
-    connection, _, data = next(iter(reader.messages(connections)))
+    connection, _, data = next(_messages(reader, connections, topic))
     return reader.deserialize(data, connection.msgtype)
 
 
@@ -243,7 +254,7 @@ def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -
             f"its format is {message.format!r}, not PNG-compressed depth ('16UC1; compressedDepth png' or 32FC1)"
         )
     data = np.asarray(message.data, dtype=np.uint8).tobytes()
-    with open_image(BytesIO(data[COMPRESSED_HEADER:]), "its image", ("PNG",)) as image:
+    with open_image(BytesIO(data[COMPRESSED_HEADER:]), ("PNG",)) as image:
         raw = np.asarray(image).astype(np.uint16)
     if DEPTH_ENCODINGS[encoding] == "u2":
         return DepthImage(metres(raw, depth_scale), camera)

@@ -13,7 +13,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from mereo.io.errors import readable
-from mereo.io.size_limits import read_arrays
+from mereo.io.readers import read_arrays
 
 FRAME_SUFFIXES = (".npz", ".ply", ".obj", ".stl", ".off")
 """Suffixes of files that hold a state each."""

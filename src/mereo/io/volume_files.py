@@ -5,7 +5,6 @@ by NIfTI's convention). NRRD files say which frame they are in; those of 3D Slic
 space they stay as they are.
 """
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -17,7 +16,6 @@ from jaxtyping import Bool, Float, Shaped
 
 from mereo.geometry.transforms import transform_points
 from mereo.io.errors import readable
-from mereo.io.size_limits import ENGINES, check_bytes, check_stream
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
 
@@ -106,11 +104,8 @@ def _library(name: str, kind: str) -> Any:
 
 
 def _nifti(nibabel: Any, path: Path) -> Volume:
-    try:
-        image = nibabel.load(path)
-    except MemoryError:  # nibabel asks for what an extension states, before it is read
-        raise ValueError("an extension of its header is larger than the memory") from None
-    _check_voxels(path, image.shape)
+    image = nibabel.load(path)
+    _check_sides(image.shape)
     values = _in_memory(image.dataobj.get_unscaled())
     values = values[..., 0] if values.ndim == 4 and values.shape[3] == 1 else values
     slope, intercept = float(image.dataobj.slope), float(image.dataobj.inter)
@@ -119,13 +114,7 @@ def _nifti(nibabel: Any, path: Path) -> Volume:
 
 def _nrrd(nrrd: Any, path: Path) -> Volume:
     with path.open("rb") as file:
-        header, start = nrrd.read_header(file), file.tell()
-    _check_voxels(path, header["sizes"])
-    detached = header.get("data file", header.get("datafile"))
-    data, start = (path, start) if detached is None else (path.parent / detached, 0)
-    # pynrrd unpacks all there is, whatever the header says
-    if header["encoding"] in ENGINES and not header.get("line skip", header.get("lineskip")) and data.is_file():
-        check_stream(data, start, header["encoding"], math.prod(map(int, header["sizes"])) * WIDEST)
+        _check_sides(nrrd.read_header(file)["sizes"])
     values, header = nrrd.read(str(path))
     transform = np.eye(4)
     directions = header.get("space directions")
@@ -142,12 +131,11 @@ def _in_memory(values: np.ndarray) -> np.ndarray:
     return np.array(values, dtype=values.dtype.newbyteorder("="))
 
 
-def _check_voxels(path: Path, sizes: Iterable[Any]) -> None:
-    """Refuse the sizes in a header that are none, or too large as the 64-bit numbers that labels become."""
+def _check_sides(sizes: Iterable[Any]) -> None:
+    """Raise ``ValueError`` (its reason only) for sizes in a header that are none."""
     sides = [int(side) for side in sizes]
     if min(sides, default=0) < 1:
         raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
-    check_bytes(path, math.prod(sides) * WIDEST)
 
 
 def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:

@@ -26,10 +26,10 @@ from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import write_json
 from mereo.io.config import InputConfig
-from mereo.io.errors import first_problem, quiet, reason
+from mereo.io.errors import SizeError, first_problem, quiet, reason
 from mereo.io.intrinsics import written_intrinsics
+from mereo.io.readers import read_arrays
 from mereo.io.sensor_frame import read_frame
-from mereo.io.size_limits import read_arrays
 from mereo.scenes.draw_recorder import Call
 from mereo.scenes.parameters import Played
 from mereo.scenes.scene import Scene
@@ -477,7 +477,7 @@ def read_recording(path: str | Path) -> Recording:
             kept = {name: arrays[name] for name in Recording.__dataclass_fields__ if name in arrays}
             result = Recording(folder, index, **kept)
             _check(result)
-    except MemoryError:
+    except SizeError:
         raise
     except Exception as error:  # whatever a damaged archive makes of zlib, tokenize and numpy
         raise ValueError(

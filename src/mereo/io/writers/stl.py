@@ -10,7 +10,7 @@ import numpy as np
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
-from mereo.io.mesh_headers import STL_NAME
+from mereo.io.mesh_formats import STL_NAME
 from mereo.io.output_folders import new_directory
 from mereo.io.writers.segment_table import with_faces
 
