@@ -187,7 +187,9 @@ def test_what_takes_too_much_memory_is_refused(name: str, tmp_path: Path, monkey
     path = bomb(tmp_path / name)
     before = resource.getrlimit(resource.RLIMIT_AS)
     monkeypatch.setenv(LIMIT_VARIABLE, "0.7")
-    with pytest.raises(ValueError, match=r"takes more than 0\.7 GB of memory to read|cannot be read as a mesh") as caught:
+    with pytest.raises(
+        ValueError, match=r"takes more than 0\.7 GB of memory to read|cannot be read as a mesh"
+    ) as caught:
         BOMBS[name](path)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
     assert resource.getrlimit(resource.RLIMIT_AS) == before

@@ -4,7 +4,6 @@ import importlib.metadata
 import io
 import os
 import sys
-import time
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext, redirect_stderr, redirect_stdout, suppress
@@ -30,33 +29,18 @@ from mereo.cli.stop_signals import Stopped, stop_signals
 from mereo.cli.usage import noted_events, usage_sentence
 from mereo.cli.view_command import ViewCommand
 from mereo.io.bounds import check_bounds
-from mereo.io.cores import FreeCores, use_free_cores, use_threads
+from mereo.io.cores import use_threads
 from mereo.io.foreseen import is_foreseen, printable_line, words_of
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.training.config import PRESETS, TrainConfig
 
 Choice = TypeVar("Choice")
 
-BEGUN, BRIEF_S = FreeCores(), 5.0
-"""Count of free cores from the process's first moments on, which no command need wait for, and how long it serves."""
-
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 """Environment variable that shows where an error comes from."""
 
 CONFIGURABLE = ("generate", "train", "evaluate", "reconstruct", "learn")
 """Commands with the option --config."""
-
-ANSWERING = (
-    commands.Demo,
-    commands.Evaluate,
-    ReconstructCommand,
-    tool_commands.Align,
-    tool_commands.BenchCommand,
-    tool_commands.StreamCommand,
-    ViewCommand,
-)
-"""Commands that compute on the cores that are free. Not what trains: it outlives what is busy as it starts, and the
-same command gives the same weights."""
 
 AS_JSON = (commands.Demo, commands.Evaluate, ReconstructCommand)
 """Commands that leave an outcome, which ``--json`` prints; others print their own."""
@@ -84,12 +68,8 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="replace")
     try:
         with option_words(), stop_signals():
-            watch = BEGUN if time.monotonic() - BEGUN.at_s < BRIEF_S else FreeCores()
             command = parse(arguments)
-            if threads := getattr(command, "threads", 0):
-                use_threads(threads)
-            elif isinstance(command, ANSWERING):
-                use_free_cores(watch)
+            use_threads(getattr(command, "threads", 0))
             status = _run(command)
             sys.stdout.flush()
     except Stopped as stopped:

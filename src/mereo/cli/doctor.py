@@ -8,7 +8,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 
-from mereo.io.cores import cores, threads_for
+from mereo.io.cores import cores
 
 PURPOSES: dict[str, str] = {
     "network": "weights: training them, and fits that start from them",
@@ -117,7 +117,7 @@ def _device() -> Iterator[str]:
 
 
 def describe_load(load: float, cores: int, threads: int) -> str:
-    """Sentence on how busy the machine is, and the OMP_NUM_THREADS that would help where it is.
+    """Sentence on how busy the machine is, and what may help where it is.
 
     Args:
         load: processes that ran or wanted to, mean of the last minute.
@@ -127,13 +127,7 @@ def describe_load(load: float, cores: int, threads: int) -> str:
     found = f"{load:.1f} on {cores} cores"
     if load < cores / 2:
         return found
-    fewer = threads_for(cores - load, cores)
-    if threads <= fewer:
-        return f"{found}, which is crowded: everything waits for a core" if load >= 1.5 * cores else found
-    return (
-        f"{found}, which is busy: commands that answer take {fewer} thread{'' if fewer == 1 else 's'} while it is so; "
-        f"OMP_NUM_THREADS={fewer} would help others, as all threads wait for the one that shares a core"
-    )
+    return f"{found}, which is busy: {threads} threads wait for cores that others hold; fewer (--threads) may be faster"
 
 
 def _bfloat16() -> str:

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.io.plots import CURE, has_plots
+from mereo.io.extras import CURE, has_plots
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import LEAST_STATES, scene_model
 from mereo.scenes.registry import files_of, load_scene

@@ -54,7 +54,7 @@ class ReconstructCommand:
             point there is and what leaves it unsure, and write the observed points coloured by how much each decides it
             (explained/1.ply, those that the model does not explain in red); once for each. The report has all segments.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
-        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        threads: of torch and all else that computes; 0 means one per core.
         ray: answer each of several frames in a task of a Ray cluster: local, one of so many --threads for this run;
             auto or HOST:PORT, the one that this machine is a node of.
         task: what each task has for itself.

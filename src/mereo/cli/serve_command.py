@@ -37,8 +37,7 @@ class ServeCommand:
         resolution: grid cells along the longest side, where a request does not say.
         limits: so that no client, and no crowd of them, takes more than the machine has.
         inference: where and how exactly the networks compute.
-        workers: processes that answer, each with all weights and one thread; 0 means one per core that is free, on half
-            of them at least.
+        workers: processes that answer, each with all weights and one thread; 0 means one per core.
     """
 
     object: UseAppendAction[tuple[str, ...]] = ()
@@ -56,7 +55,7 @@ class ServeCommand:
         """Serve until a signal asks for the end."""
         if missing := [name for name in NEEDED if find_spec(name) is None]:
             raise ImportError(f"{missing[0]} is not installed; `mereo serve` needs it: run pip install 'mereo[serve]'")
-        from mereo.io.cores import FreeCores, cores, threads_for
+        from mereo.io.cores import cores
         from mereo_serving.server import serve
 
         serve(
@@ -67,7 +66,7 @@ class ServeCommand:
             resolution=self.resolution,
             host=self.host,
             port=self.port,
-            workers=self.workers or threads_for(FreeCores().now(), cores()),
+            workers=self.workers or cores(),
             config=self.limits,
             inference=self.inference,
         )
