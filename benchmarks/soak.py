@@ -32,7 +32,7 @@ import numpy as np
 
 from mereo.evaluation.sample_views import load_view
 from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.io.plots import pyplot
+from mereo.io.extras import pyplot
 
 FRAMES = 8
 """Files in the watched folder; each is another random part of one frame."""

@@ -55,7 +55,7 @@ def test_settings_are_light(mereo: Package) -> None:
 
 def test_only_charts_ask_for_the_extra_plots(mereo: Package) -> None:
     asking = {found.source for found in mereo if found.target == "matplotlib"}
-    assert asking == {"io/plots"}
+    assert asking == {"io/extras"}
 
 
 def test_no_module_needs_itself(mereo: Package) -> None:

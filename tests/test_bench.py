@@ -106,11 +106,10 @@ def test_the_table_names_ratio_and_floor() -> None:
         "gigaflops": 200.0,
         "gigabytes_per_second": 10.0,
         "load": 0.25,
-        "free_cores": 1.9,
     }
     told = table([replace(stage, differing=0.0), replace(stage, rival=None)], facts)
     assert "| encoder | 20 | 30 | 5 | 4.0 | 100 | 5.0 | 0.000% |" in told
-    assert "before it began, 1.9 cores were free (load 0.2)" in told
+    assert "load 0.2 before it began" in told
 
 
 def test_a_stage_says_how_many_labels_the_straightforward_way_gives_otherwise() -> None:
@@ -133,7 +132,6 @@ def test_the_fair_share_is_what_an_even_division_of_the_cores_gives() -> None:
 
 
 def test_work_beside_busy_processes_takes_the_threads_that_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo_experiments.speed.beside.FreeCores.now", lambda _: 0.0)
     monkeypatch.setattr("mereo_experiments.speed.beside.cores", lambda: 2)
     before, used = torch.get_num_threads(), []
     shares = measure_beside(lambda: used.append(torch.get_num_threads()), beside=1, rounds=2)

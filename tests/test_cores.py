@@ -1,47 +1,15 @@
-"""How many cores there are and are free, and how many threads a command takes of them."""
+"""How many cores there are, and how many threads a command takes of them."""
 
 import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from mereo import __main__ as command_line
-from mereo.cli import training
 from mereo.io import cores
-from mereo.io.cores import THREAD_VARIABLES, FreeCores, one_blas_thread, threads_for, use_free_cores, workers_for
-
-
-@pytest.mark.parametrize(
-    ("free", "there", "threads"),
-    [(2.0, 2, 2), (1.6, 2, 2), (1.4, 2, 1), (-3.0, 2, 1), (12.2, 16, 12), (3.0, 16, 8), (9.0, 4, 4), (0.0, 1, 1)],
-)
-def test_threads_are_as_many_as_cores_are_free_and_half_of_them_at_least(free: float, there: int, threads: int) -> None:
-    assert threads_for(free, there) == threads
-
-
-def test_free_cores_are_idle_ones_and_those_that_this_process_uses(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Of the cores that it may use: the third one here is another's."""
-    counts = "cpu  0 0 0 9 9\n" + "".join(
-        f"cpu{core} 70 80 90 {idle} 5 0\n" for core, idle in enumerate((700, 440, 99))
-    )
-    monkeypatch.setattr(cores, "STATISTICS", tmp_path / "stat")
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
-    monkeypatch.setattr(os, "sysconf", lambda _: 100, raising=False)
-    (tmp_path / "stat").write_text(counts)
-    assert FreeCores().idle_s == 11.5
-    monkeypatch.setattr(cores, "time", SimpleNamespace(monotonic=lambda: 9.0, process_time=lambda: 3.5))
-    monkeypatch.setattr(cores.time, "sleep", lambda _: None, raising=False)
-    before = FreeCores(7.0, 3.0, 10.0)
-    assert before.now() == 1.0
-    monkeypatch.setattr(cores, "STATISTICS", tmp_path / "none")
-    monkeypatch.setattr(os, "getloadavg", lambda: (1.5, 0.0, 0.0), raising=False)
-    assert FreeCores().now() == cores.cores() - 1.5
+from mereo.io.cores import THREAD_VARIABLES, one_blas_thread, use_threads, workers_for
 
 
 @pytest.mark.parametrize(
@@ -59,43 +27,16 @@ def test_a_containers_quota_bounds_its_cores(
     assert cores.cores() == count
 
 
-@pytest.mark.parametrize(
-    ("own", "free", "taken", "told"),
-    [(None, 0.9, 1, [1]), (None, 2.0, 2, []), ("2", 0.1, 2, []), ("", 0.1, 1, [1])],
-)
-def test_what_is_free_is_taken_unless_the_user_has_said(
-    own: str | None, free: float, taken: int, told: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    said: list[int] = []
-    monkeypatch.setattr(cores, "use_threads", said.append)
-    monkeypatch.setattr(cores, "cores", lambda: 2)
+def test_threads_are_as_many_as_cores_unless_the_user_has_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cores, "cores", lambda: 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(FreeCores, "now", lambda _: free)
-    monkeypatch.delenv("OMP_NUM_THREADS") if own is None else monkeypatch.setenv("OMP_NUM_THREADS", own)
-    assert use_free_cores(FreeCores()) == taken and said == told
-
-
-def test_a_moment_of_other_work_takes_no_core_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What starts beside a command, a shell's own listing for one, is over before the command has loaded anything."""
-    counted = iter([1.2, 1.9])
-    monkeypatch.setattr(cores, "use_threads", lambda count: pytest.fail(f"{count} threads"))
-    monkeypatch.setattr(cores, "cores", lambda: 2)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(FreeCores, "now", lambda _: next(counted))
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    assert use_free_cores(FreeCores()) == 2
-
-
-def test_commands_that_answer_take_free_cores_and_those_that_train_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen: list[object] = []
-    monkeypatch.setattr(command_line, "use_free_cores", chosen.append)
-    monkeypatch.setattr(command_line, "use_threads", chosen.append)
-    for command in (training.Evaluate, training.Train):
-        monkeypatch.setattr(command, "run", lambda self: None)
-    assert command_line.main(["train", "data", "--output", "out"]) == 0 and chosen == []
-    assert command_line.main(["evaluate", "rope", "--output", "out"]) == 0
-    assert command_line.main(["evaluate", "rope", "--output", "out", "--threads", "3"]) == 0
-    assert isinstance(chosen[0], FreeCores) and chosen[1:] == [3]
+    for own, count, then in (("2", 0, "2"), (None, 0, "1"), (None, 2, "2"), ("1", 2, "2")):
+        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+        if own is not None:
+            monkeypatch.setenv("OMP_NUM_THREADS", own)
+        with threadpool_limits(2):
+            use_threads(count)
+        assert os.environ["OMP_NUM_THREADS"] == then
 
 
 THREADS = """

@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
@@ -27,15 +26,12 @@ from mereo.cli.doctor import Doctor
 from mereo.cli.options import Outcome
 from mereo.cli.view_command import ViewCommand
 from mereo.io.bounds import check_bounds
-from mereo.io.cores import FreeCores, use_free_cores, use_threads
+from mereo.io.cores import use_threads
 from mereo.io.foreseen import is_foreseen, printable_line, words_of
 from mereo.synthesis.config import SENSORS, GenerateConfig
 from mereo.training.config import PRESETS
 
 Choice = TypeVar("Choice")
-
-BEGUN, BRIEF_S = FreeCores(), 5.0
-"""Count of free cores from the process's first moments on, which no command need wait for, and how long it serves."""
 
 TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 """Environment variable that shows where an error comes from."""
@@ -92,18 +88,6 @@ COMMANDS: dict[str, Any] = {
 CONFIGURABLE = ("generate", "train", "evaluate", "reconstruct", "learn")
 """Commands with the option --config."""
 
-ANSWERING = (
-    Demo,
-    training.Evaluate,
-    answers.ReconstructCommand,
-    tools.Align,
-    tools.BenchCommand,
-    answers.StreamCommand,
-    ViewCommand,
-)
-"""Commands that compute on the cores that are free. Not what trains: it outlives what is busy as it starts, and the
-same command gives the same weights."""
-
 NO_MEMORY = ("out of memory", "can't allocate memory", "bad_alloc")
 """What torch and compiled libraries say where Python has a ``MemoryError``."""
 
@@ -136,12 +120,8 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="replace")
     try:
         with option_words(), stop_signals():
-            watch = BEGUN if time.monotonic() - BEGUN.at_s < BRIEF_S else FreeCores()
             command = parse(arguments)
-            if threads := getattr(command, "threads", 0):
-                use_threads(threads)
-            elif isinstance(command, ANSWERING):
-                use_free_cores(watch)
+            use_threads(getattr(command, "threads", 0))
             status = _run(command)
             sys.stdout.flush()
     except Stopped as stopped:

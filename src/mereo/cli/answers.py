@@ -59,7 +59,7 @@ class ReconstructCommand:
             point there is and what leaves it unsure, and write the observed points coloured by how much each decides it
             (explained/1.ply, those that the model does not explain in red); once for each. The report has all segments.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
-        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        threads: of torch and all else that computes; 0 means one per core.
         ray: answer each of several frames in a task of a Ray cluster: local, one of so many --threads for this run;
             auto or HOST:PORT, the one that this machine is a node of.
         task: what each task has for itself.
@@ -135,7 +135,7 @@ class StreamCommand:
         reading: how a frame is read.
         isolation: what is left out of it.
         inference: where and how exactly the network computes.
-        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        threads: of torch and all else that computes; 0 means one per core.
     """
 
     input: InputName
@@ -223,7 +223,7 @@ class ServeCommand:
         """Serve until a signal asks for the end."""
         if missing := [name for name in SERVE_MODULES if find_spec(name) is None]:
             raise ImportError(f"{missing[0]} is not installed; `mereo serve` needs it: run pip install 'mereo[serve]'")
-        from mereo.io.cores import FreeCores, cores, threads_for
+        from mereo.io.cores import cores
         from mereo_serving.server import serve
 
         serve(
@@ -234,7 +234,7 @@ class ServeCommand:
             resolution=self.resolution,
             host=self.host,
             port=self.port,
-            workers=self.workers or threads_for(FreeCores().now(), cores()),
+            workers=self.workers or cores(),
             config=self.limits,
             inference=self.inference,
         )

@@ -134,7 +134,7 @@ class SceneModes:
     def run(self) -> None:
         """Print how many modes are needed, and write the picture."""
         from mereo.io.atomic_files import atomic_file, check_file_place
-        from mereo.io.plots import CURE, has_plots
+        from mereo.io.extras import CURE, has_plots
         from mereo.scenes.registry import files_of
         from mereo.visualization.mode_pictures import preview_modes
 

@@ -159,7 +159,7 @@ class Experiment:
 
             list_experiments(self.output)
             return
-        from mereo.io.plots import pyplot
+        from mereo.io.extras import pyplot
 
         pyplot()  # before the hours that it takes
         from mereo_experiments.paper.registry import run_experiment
@@ -182,7 +182,7 @@ class BenchCommand:
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
         beside: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
-        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        threads: of torch and all else that computes; 0 means one per core.
         output: a JSON file for the figures.
         force: replace an existing file, unless the weights are read from it.
     """

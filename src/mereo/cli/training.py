@@ -190,7 +190,7 @@ class Evaluate:
         method: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the
             modes' and the draws' own scores beside it; network the network alone; modes leaves the draws out.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
-        threads: of torch and all else that computes; 0 means one per core that is free, on half of them at least.
+        threads: of torch and all else that computes; 0 means one per core.
         ray: score each view in a task of a Ray cluster: local, one of so many --threads for this run; auto or
             HOST:PORT, the one that this machine is a node of.
         task: what each task has for itself.

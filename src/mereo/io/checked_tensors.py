@@ -15,7 +15,6 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from mereo.io.errors import reason
-from mereo.io.object_cache import read_cached
 from mereo.io.object_storage import ObjectPath, Place
 
 HEADER, CHECKSUM = "mereo", "sha256"
@@ -29,14 +28,12 @@ def pack_tensors(tensors: Tensors, facts: Mapping[str, Any]) -> bytes:
     return save(whole, metadata={HEADER: json.dumps({**facts, CHECKSUM: _digest(whole, facts)})})
 
 
-def read_content(path: Place, recorded: str | None = None) -> bytes:
-    """Bytes of a file of a dataset; where its SHA-256 is ``recorded``, a local copy will do (``object_cache``).
+def read_content(path: Place) -> bytes:
+    """Bytes of a file of a dataset.
 
     Raises ``FileNotFoundError``, ``ValueError`` (its reason only) where a disk cannot read it, and ``StorageError``.
     """
     try:
-        if isinstance(path, ObjectPath):
-            return read_cached(path, recorded) if recorded else path.read_bytes()
         return path.read_bytes()
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path} does not exist; it is part of a dataset: check the path") from None

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from typing import Any
 
 NEEDED = (
     "PyTorch is not installed; networks and their training need the extra `network`: run pip install 'mereo[network]', "
@@ -32,3 +33,27 @@ def has_network() -> bool:
 def is_torch(error: BaseException) -> bool:
     """Whether an error says that torch is not installed."""
     return isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "torch"
+
+
+# --- matplotlib -------------------------------------------------------------------------------------------------------
+
+# matplotlib, which the extra `plots` brings: training curves and charts need it, and no answer does.
+
+CURE = "is not installed: pip install 'mereo[plots]'"
+
+
+def has_plots() -> bool:
+    """Whether matplotlib is installed."""
+    return find_spec("matplotlib") is not None
+
+
+def pyplot() -> Any:
+    """``matplotlib.pyplot``, which draws into files; ``ImportError`` without the extra `plots`."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise ImportError(f"matplotlib, which draws charts, {CURE}") from None
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    return plt

@@ -55,7 +55,7 @@ def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict
         raise FileExistsError(f"{folder} is not empty and holds no {name}; choose another --output")
     content = json_text(settings).encode()
     try:
-        path.write_new(content)
+        path.write_bytes(content, force=False)
     except FileExistsError:  # another process came first
         return read_settings(path)
     found = read_settings(path)  # a storage without conditional puts took both, and keeps the last

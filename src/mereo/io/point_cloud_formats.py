@@ -18,47 +18,16 @@ from mereo.io.errors import check_count
 
 PLY_ORDERS = ("ascii", "binary_little_endian", "binary_big_endian")
 
-PLY_TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
-"""Numpy type of each of PLY's."""
-
 
 def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Vertices of a PLY file only: faces and scanner grids, which may be larger, are not read."""
-    content = path.read_bytes()
-    order, elements, start = _ply_header(content)
-    count = next((count for name, count, _ in elements if name == "vertex"), 0)
+    """Vertices of a PLY file; trimesh returns those it finds, so a file cut short is only noticed by counting them."""
+    check_ply(path)
+    count = ply_counts(path).get("vertex", 0)
     if count == 0:
         raise ValueError("it has 0 vertices")
-    first, _, properties = elements[0]
-    if first != "vertex" or any(kind == "list" for kind, *_ in properties):
-        return _ply_by_trimesh(path, count)
-    names = [name for _, name in properties]
-    if order == "ascii":
-        rows = [row for row in content[start:].decode("ascii").splitlines() if row.strip()]
-        check_count(count, len(rows), "points")
-        return np.loadtxt(rows[:count], usecols=[names.index(axis) for axis in "xyz"], ndmin=2)
-    end = "<>"[order == "binary_big_endian"]
-    record = np.dtype([(name, end + PLY_TYPES[kind]) for kind, name in properties])
-    check_count(count, (len(content) - start) // record.itemsize, "points")
-    vertices = np.frombuffer(content, record, count, start)
-    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    loaded: Any = trimesh.load(path, file_type="ply", process=False)
+    check_count(count, len(loaded.vertices), "points")
+    return np.asarray(loaded.vertices, dtype=np.float64)
 
 
 def ply_counts(path: Path) -> dict[str, int]:
@@ -95,14 +64,6 @@ def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str
     if order not in PLY_ORDERS:
         raise ValueError(f"its format is {order!r}, not one of {', '.join(PLY_ORDERS)}")
     return order, elements, match.end()
-
-
-def _ply_by_trimesh(path: Path, count: int) -> Float[np.ndarray, "n 3"]:
-    """Vertices of unusual PLY files, where something stands before the vertices."""
-    loaded: Any = trimesh.load(path, file_type="ply", process=False)
-    # trimesh returns the rows it finds; a file cut short is only noticed by counting them
-    check_count(count, len(loaded.vertices), "points")
-    return np.asarray(loaded.vertices, dtype=np.float64)
 
 
 def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:

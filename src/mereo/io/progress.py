@@ -17,8 +17,6 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
-from mereo.io.busy_machine import BusyWatch
-
 LINE_EVERY_S = 10.0
 """Seconds between two plain lines."""
 
@@ -44,7 +42,6 @@ class Progress:
         self.started = self.shown = time.monotonic()
         self.paused_s = 0.0
         self.past = deque([(0.0, 0)])
-        self.watch = BusyWatch()
 
     def advance(self, count: int = 1, note: str = "", tail_s: float = 0.0) -> None:
         """Count ``count`` units as done.
@@ -63,8 +60,6 @@ class Progress:
         self.past.append((worked_s, self.done))
         rate = (self.done - then) / max(worked_s - then_s, 1e-9)
         self._show(self._text(rate, (self.total - self.done) / max(rate, 1e-9) + tail_s, note), now)
-        if (busy := self.watch.look()) is not None:
-            print(f"mereo: warning: {busy}", file=sys.stderr, flush=True)
 
     @contextmanager
     def paused(self) -> Iterator[None]:

@@ -393,7 +393,7 @@ def load_statistical_model(path: Place, dataset: str | None = None, recorded: st
     ``recorded`` is its SHA-256 in the dataset's manifest. Raises ``StorageError`` where nothing is known of the file.
     """
     try:
-        return read_statistical_model(read_content(path, recorded), dataset, recorded)
+        return read_statistical_model(read_content(path), dataset, recorded)
     except (FileNotFoundError, ValueError) as error:
         raise ValueError(
             f"{path} is no statistical model of mereo ({error}); delete it and run `mereo generate ... --resume`"

@@ -334,7 +334,7 @@ def read_shard(
     Raises ``FileNotFoundError``, ``ValueError`` (its reason only) where it is damaged, another's or not the recorded
     one, and ``StorageError`` where nothing is known of it.
     """
-    return unpack_shard(read_content(path, recorded), key, first, end, recorded)
+    return unpack_shard(read_content(path), key, first, end, recorded)
 
 
 def unpack_shard(
@@ -352,7 +352,7 @@ def unpack_shard(
 
 def read_template(path: Place, key: str, segments: int, recorded: str | None = None) -> Float16[np.ndarray, "s n n n"]:
     """Signed distances of a dataset's template for an object of so many segments; raises as ``read_shard`` does."""
-    return unpack_template(read_content(path, recorded), key, segments, recorded)
+    return unpack_template(read_content(path), key, segments, recorded)
 
 
 def unpack_template(content: bytes, key: str, segments: int, recorded: str | None) -> Float16[np.ndarray, "s n n n"]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mereo.io.atomic_files import atomic_file
-from mereo.io.plots import CURE, has_plots, pyplot
+from mereo.io.extras import CURE, has_plots, pyplot
 
 FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "code", "val_iou", "val_miou")
 SENSOR_FIELDS = ("sensor_iou", "sensor_miou")

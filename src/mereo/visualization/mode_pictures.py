@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.io.plots import has_plots, pyplot
+from mereo.io.extras import has_plots, pyplot
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.visualization.contact_sheets import Picture, contact_sheet, save_png
 from mereo.visualization.previews import SCENE_VIEWS, common_viewpoint

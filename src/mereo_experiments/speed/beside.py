@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from mereo.io.cores import FreeCores, cores, threads_for
+from mereo.io.cores import cores
 from mereo_experiments.speed.roofline import seconds
 
 LIMIT = 1.5
@@ -71,15 +71,13 @@ def fair_share(alone: float, threads: int, beside: int, there: int) -> float:
 
 
 def measure_beside(work: Callable[[], object], beside: int, rounds: int) -> list[Share]:
-    """Shares of ``work`` on the CPU, in the threads that are chosen beside busy processes and in one per core.
+    """Shares of ``work`` on the CPU, in a thread for each core that busy processes leave free and in one per core.
 
     Both take turns with the work alone, so that what else runs meets all.
     """
     there, before = cores(), torch.get_num_threads()
     alone: list[float] = []
-    with busy_processes(beside):
-        chosen = threads_for(FreeCores().now(), there)
-    rules = {"as many as are free": chosen, "one per core": there}
+    rules = {"as many as are free": max(1, there - beside), "one per core": there}
     busy: dict[str, list[float]] = {rule: [] for rule in rules}
     cpu = torch.device("cpu")
     try:

@@ -11,7 +11,7 @@ import torch
 
 from mereo.evaluation.sample_views import SampleView, load_view, shipped_views
 from mereo.io.atomic_files import check_file_place, write_json
-from mereo.io.cores import FreeCores, cores
+from mereo.io.cores import cores
 from mereo.models.config import Precision
 from mereo.models.device import cpu_features
 from mereo.models.model import Model
@@ -106,7 +106,6 @@ def _load() -> dict[str, Any]:
     """How busy the machine is before anything is measured."""
     return {
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "free_cores": FreeCores().now(),
     }
 
 
@@ -139,8 +138,8 @@ def table(stages: list[Stage], facts: dict[str, Any], cost: Cost | None = None) 
     lines = [
         f"{facts['model']}; {facts['device']}, {facts['threads']} threads of {facts['cores']} cores, AMX "
         f"{'yes' if facts['amx'] else 'no'}, {facts['precision']}; products {facts['gigaflops']:.0f} GFLOP/s, "
-        f"copies {facts['gigabytes_per_second']:.0f} GB/s; before it began, {facts['free_cores']:.1f} cores were free"
-        + ("" if facts["load"] is None else f" (load {facts['load']:.1f})"),
+        f"copies {facts['gigabytes_per_second']:.0f} GB/s"
+        + ("" if facts["load"] is None else f"; load {facts['load']:.1f} before it began"),
         "",
         "| stage | median, ms | 99 %, ms | floor, ms | times the floor | straightforward, ms | faster | other labels |",
         "|---|---|---|---|---|---|---|---|",

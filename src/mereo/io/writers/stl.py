@@ -6,16 +6,13 @@ The name is in the 80 bytes that STL leaves to the writer, as ``STL_NAME`` and U
 import re
 from pathlib import Path
 
-import numpy as np
+import trimesh
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.io.atomic_files import atomic_file
 from mereo.io.mesh_formats import STL_NAME
 from mereo.io.output_folders import new_directory
 from mereo.io.writers.segment_table import with_faces
-
-RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-"""Record of a triangle: 50 bytes, without padding."""
 
 
 def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bool = False) -> None:
@@ -50,11 +47,7 @@ def _header(name: str) -> bytes:
 
 
 def _binary(segment: Segment) -> bytes:
-    corners = segment.vertices[segment.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    triangles = np.zeros(len(corners), RECORD)
-    triangles["normal"] = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
-    triangles["corners"] = corners
-    # the header must not begin with "solid", which is how text files begin
-    return _header(segment.name) + np.uint32(len(corners)).astype("<u4").tobytes() + triangles.tobytes()
+    """The file as trimesh writes it, but for its header, which must not begin with "solid" as text files do."""
+    mesh = trimesh.Trimesh(segment.vertices, segment.faces, process=False)
+    content: bytes = trimesh.exchange.stl.export_stl(mesh)
+    return _header(segment.name) + content[80:]
