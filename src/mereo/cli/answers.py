@@ -204,8 +204,7 @@ class ServeCommand:
         resolution: grid cells along the longest side, where a request does not say.
         limits: so that no client, and no crowd of them, takes more than the machine has.
         inference: where and how exactly the networks compute.
-        workers: processes that answer, each with all weights and one thread; 0 means one per core that is free, on half
-            of them at least.
+        workers: processes that answer, each with all weights and one thread; 0 means one per core.
     """
 
     object: UseAppendAction[tuple[str, ...]] = ()
