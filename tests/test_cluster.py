@@ -21,8 +21,7 @@ from mereo.models.remote import settings_for, to_cpu
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.workers import spread as spreading
-from mereo.workers.config import Cluster, TaskResources
-from mereo.workers.spread import choose_cluster, connect, spread
+from mereo.workers.spread import Cluster, TaskResources, choose_cluster, connect, spread
 
 HERE = Cluster(local_cpus=2)
 

@@ -30,7 +30,7 @@ from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 from mereo.visualization.evaluation_files import evaluate_weights
-from mereo.workers.config import Cluster
+from mereo.workers.spread import Cluster
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mereo[cluster]'")
 

@@ -23,9 +23,10 @@ def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest
     calls: list[tuple[Any, ...]] = []
     monkeypatch.setattr(shards, "generate", lambda *given, **named: calls.append((*given, named)))
     assert mereo.generate(tmp_path / "mine.yaml", str(tmp_path / "data"), examples=3, workers=2) == tmp_path / "data"
-    ((scene, output, settings, named),) = calls
-    assert (scene, output, settings) == (str(tmp_path / "mine.yaml"), tmp_path / "data", GenerateConfig())
-    assert named["examples"] == 3 and named["seed"] == 0 and named["workers"] == 2 and named["shard"] == (0, 1)
+    ((scene, output, config, named),) = calls
+    assert (scene, output) == (str(tmp_path / "mine.yaml"), tmp_path / "data")
+    assert config == shards.DatasetConfig(GenerateConfig(), 3, 0)
+    assert named == {"workers": 2, "shard": (0, 1), "resume": False}
     trained: list[TrainConfig] = []
     monkeypatch.setattr(steps.trainer, "train", lambda data, run, recipe, device: trained.append(recipe) or run / "w")
     assert mereo.train("data", tmp_path, "tiny", init="rope") == tmp_path / "w"

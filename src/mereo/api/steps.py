@@ -34,8 +34,7 @@ from mereo.synthesis.config import GenerateConfig
 from mereo.training import trainer
 from mereo.training.config import PRESETS, PresetName, TrainConfig
 from mereo.visualization.evaluation_files import evaluate_weights
-from mereo.workers.config import Cluster
-from mereo.workers.spread import choose_cluster
+from mereo.workers.spread import Cluster, choose_cluster
 
 
 def train(

@@ -16,7 +16,7 @@ from mereo.io.bounds import Cells, Port, Positive, Threads, Workers
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
-from mereo.workers.config import ONE_CPU, RayAddress, TaskResources
+from mereo.workers.spread import ONE_CPU, RayAddress, TaskResources
 from mereo_serving.config import ServeConfig
 
 SERVE_MODULES = ("fastapi", "uvicorn", "prometheus_client", "python_multipart")

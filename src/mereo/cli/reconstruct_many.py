@@ -35,8 +35,7 @@ from mereo.reconstruction.observation import FrameWarning
 from mereo.reconstruction.stream import frame_error
 from mereo.reconstruction.stream_sources import frames_in
 from mereo.visualization.result_files import summary_of
-from mereo.workers.config import Cluster
-from mereo.workers.spread import spread
+from mereo.workers.spread import Cluster, spread
 
 KNOWN: Mapping[Known, str] = {True: "yes", False: "no", "unsure": "unsure"}
 """Words of a table for whether a frame shows the object."""

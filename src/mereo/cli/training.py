@@ -16,7 +16,7 @@ from mereo.io.cores import workers_for
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.training.config import PresetName, TrainConfig
-from mereo.workers.config import ONE_CPU, RayAddress, TaskResources
+from mereo.workers.spread import ONE_CPU, RayAddress, TaskResources, choose_cluster
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,6 @@ class Evaluate:
         """Write scores and pictures of their errors, and print the table."""
         from mereo.api.steps import evaluate
         from mereo.evaluation.tables import read_metrics
-        from mereo.workers.spread import choose_cluster
 
         settings = GenerateConfig(
             image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms, workspace=self.workspace

@@ -45,8 +45,7 @@ from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
-from mereo.workers.config import Cluster
-from mereo.workers.spread import spread
+from mereo.workers.spread import Cluster, spread
 
 KEPT_VIEWS = 4
 """Number of examples, the first ones, that keep their labels and are drawn with their errors."""

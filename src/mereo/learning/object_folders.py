@@ -15,8 +15,7 @@ from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.volume_files import is_volume
 from mereo.learning.learn import learn
 from mereo.scenes.registry import is_yaml
-from mereo.workers.config import Cluster
-from mereo.workers.spread import spread
+from mereo.workers.spread import Cluster, spread
 
 Learnable = tuple[str, list[Path]]
 
@@ -53,7 +52,7 @@ def learn_objects(folder: Path, output: Path, settings: Mapping[str, Any], clust
     objects = list_objects(folder.absolute())
     check_place(output, may_be_link=True)
     output.mkdir(parents=True, exist_ok=True)
-    learn_one = partial(_learn_one, output.absolute(), dict(settings), cluster is not None)
+    learn_one = partial(_learn_one, output.absolute(), settings, cluster is not None)
     lines, failed = list[str](), list[str]()
     with closing(spread(learn_one, objects, cluster or 1, lambda _, error: error)) as results:
         for (name, _), result in results:
@@ -62,9 +61,9 @@ def learn_objects(folder: Path, output: Path, settings: Mapping[str, Any], clust
                     raise result
                 failed.append(name)
                 print(f"mereo: error: {name}: {words_of(result)}", file=sys.stderr, flush=True)
-            else:
-                scores = f"IoU {format_score(result['iou'])}, mIoU {format_score(result['miou'])}"
-                lines.append(f"{output / name}: {scores}, method {result['method']}")
+                continue
+            scores = f"IoU {format_score(result['iou'])}, mIoU {format_score(result['miou'])}"
+            lines.append(f"{output / name}: {scores}, method {result['method']}")
     print("", *lines, sep="\n", flush=True)
     if failed:
         raise ValueError(
@@ -73,7 +72,7 @@ def learn_objects(folder: Path, output: Path, settings: Mapping[str, Any], clust
         )
 
 
-def _learn_one(output: Path, settings: dict[str, Any], in_task: bool, item: Learnable) -> dict[str, Any] | Exception:
+def _learn_one(output: Path, settings: Mapping[str, Any], in_task: bool, item: Learnable) -> Any:
     if in_task and not output.is_dir():
         raise FileNotFoundError(f"a node does not see {output}: put objects and --output where all nodes see them")
     print(f"\n{item[0]}: {', '.join(map(str, item[1]))}", flush=True)

@@ -9,7 +9,7 @@ from mereo.models.config import InferenceConfig
 from mereo.models.device import find_device, pick_precision
 from mereo.models.model import Model
 from mereo.models.trained import Trained
-from mereo.workers.config import Cluster
+from mereo.workers.spread import Cluster
 
 
 def settings_for(inference: InferenceConfig, workers: int | Cluster | None) -> InferenceConfig:

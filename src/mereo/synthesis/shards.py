@@ -47,8 +47,7 @@ from mereo.scenes.statistical_model import statistical_model_bytes
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
 from mereo.synthesis.dataset_contents import FILES, MANIFEST, DatasetContents, check_space, dataset_key, shard_name
 from mereo.synthesis.examples import Clouds, Example, synthesize
-from mereo.workers.config import Cluster
-from mereo.workers.spread import spread
+from mereo.workers.spread import Cluster, spread
 
 SHARD_SIZE = 64
 LIBRARIES = ("numpy", "scipy", "embreex", "libigl", "manifold3d", "trimesh")

@@ -19,7 +19,7 @@ from mereo.scenes.registry import files_of
 from mereo.scenes.scene import Scene
 from mereo.visualization.error_maps import error_picture
 from mereo.visualization.evaluation_report import write_evaluation_report
-from mereo.workers.config import Cluster
+from mereo.workers.spread import Cluster
 
 
 def evaluate_weights(

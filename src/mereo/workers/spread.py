@@ -11,32 +11,77 @@ import pickle
 import signal
 import socket
 import sys
-import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import islice
 from tempfile import TemporaryDirectory
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
+from tyro.conf import arg
+
+from mereo.io.bounds import Count, NotNegative
 from mereo.io.cores import cores, use_threads
-from mereo.workers.config import LOCAL, ONE_CPU, Cluster, TaskResources
 from mereo.workers.processes import pickled, process_pool
+
+LOCAL = "local"
+"""Address of a cluster of this machine alone, started for the run."""
+
+RayAddress = Annotated[str | None, arg(metavar="local|auto|HOST:PORT")]
+"""Option that names a Ray cluster."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class TaskResources:
+    """What a task of a cluster has for itself.
+
+    Attributes:
+        cpus_per_task: CPUs of a task, and threads in which it computes; only with --ray.
+        gpus_per_task: GPUs of a task, as 0.25 for a share of one; 0 computes on CPUs. Only with --ray.
+    """
+
+    cpus_per_task: Count = 1
+    gpus_per_task: NotNegative = 0
+
+
+ONE_CPU = TaskResources()
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Ray cluster, and what each task there may use.
+
+    Attributes:
+        address: "local" for one of this machine that is started for the run, "auto" for the one that this machine is a
+            node of, or HOST:PORT of that one; a cluster that was there before stays.
+        cpus: of a task, which computes in as many threads.
+        gpus: of a task.
+        local_cpus: of a cluster that is started; 0 means one per core.
+    """
+
+    address: str = LOCAL
+    cpus: int = 1
+    gpus: float = 0.0
+    local_cpus: int = 0
+
+    @property
+    def device(self) -> str:
+        """Kind of device on which a task computes: "cuda" or "cpu"."""
+        return "cuda" if self.gpus else "cpu"
+
 
 AHEAD = 2
 """Items on their way for each that can be computed at a time: no worker waits for its next one."""
 
 DEATHS = 20
 """Workers and nodes that may die of one item: then it is the item that kills them."""
-
-ANSWER_S = 5.0
-"""Seconds in which an address must take a connection; Ray itself would try for a minute."""
 
 
 def spread(
@@ -122,11 +167,9 @@ def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources
         ValueError: resources of tasks without a cluster, or something that is no address.
         ConnectionError: nothing answers at the address.
     """
+    if address is None and task != ONE_CPU:
+        raise ValueError("--cpus-per-task and --gpus-per-task are for tasks of a cluster: give --ray local")
     if address is None:
-        if task != ONE_CPU:
-            raise ValueError(
-                "--cpus-per-task and --gpus-per-task are for tasks of a cluster: give --ray local, or its address"
-            )
         return None
     import_ray()
     if address not in (LOCAL, "auto"):
@@ -138,11 +181,9 @@ def import_ray() -> ModuleType:
     """Import Ray, which then sends no statistics; ``ImportError`` where it is not installed."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
-        import ray
+        return import_module("ray")
     except ImportError:
         raise ImportError("Ray, which --ray needs, is not installed: run pip install 'mereo[cluster]'") from None
-    library: ModuleType = ray
-    return library
 
 
 def _check_reachable(address: str) -> None:
@@ -152,7 +193,7 @@ def _check_reachable(address: str) -> None:
             f"--ray is {address!r}; it must be local, auto, or the HOST:PORT that `ray start --head` prints: correct it"
         )
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
+        socket.create_connection((host.strip("[]"), int(port)), timeout=5.0).close()
     except (OSError, OverflowError) as error:
         raise ConnectionError(
             f"there is no Ray cluster at {address} ({getattr(error, 'strerror', None) or error}): correct the address, "
@@ -181,8 +222,7 @@ def connect(cluster: Cluster) -> Iterator[None]:
     quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL}
     handler = signal.getsignal(signal.SIGTERM)
     # in /tmp, as paths of sockets must be shorter than some systems' folders for temporary files allow
-    place = "/tmp" if os.name == "posix" else None
-    with TemporaryDirectory(prefix=f"mereo-ray-{os.getpid()}-", dir=place) as folder:
+    with TemporaryDirectory(prefix=f"mereo-ray-{os.getpid()}-", dir="/tmp" if os.name == "posix" else None) as folder:
         try:
             if cluster.address == LOCAL:
                 count = cluster.local_cpus or cores()
@@ -194,7 +234,7 @@ def connect(cluster: Cluster) -> Iterator[None]:
                     )
             else:
                 ray.init(cluster.address, **quiet)
-            if threading.current_thread() is threading.main_thread():
+            with suppress(ValueError):  # outside the main thread, where Ray takes none
                 signal.signal(signal.SIGTERM, handler)  # which Ray has taken for itself
             yield
         except (ConnectionError, RuntimeError) as error:
@@ -208,25 +248,6 @@ def connect(cluster: Cluster) -> Iterator[None]:
             ray.shutdown()
 
 
-@dataclass(frozen=True, eq=False)
-class _Work:
-    """What all tasks have in common.
-
-    Attributes:
-        function: pickled, as libraries that it imports must find the number of threads set.
-        threads: in which a task computes.
-        gpu: whether tasks have a GPU, or a share of one.
-        folder: working directory of this process, and of tasks where it exists.
-        path: where this process finds modules.
-    """
-
-    function: bytes
-    threads: int
-    gpu: bool
-    folder: str
-    path: tuple[str, ...]
-
-
 @contextmanager
 def _ray_pool(function: Callable[[Any], Any], cluster: Cluster) -> Iterator[Callable[[Any], Future[Any]]]:
     """Connect to a cluster; yields what submits an item to ``function`` there."""
@@ -234,9 +255,10 @@ def _ray_pool(function: Callable[[Any], Any], cluster: Cluster) -> Iterator[Call
     from ray import cloudpickle
 
     with connect(cluster):
-        path = tuple(map(os.path.abspath, sys.path))
-        content = pickled(function, cloudpickle.dumps)
-        shared, running = ray.put(_Work(content, cluster.cpus, cluster.gpus > 0, os.getcwd(), path)), set[Any]()
+        path = [os.path.abspath(place) for place in sys.path]
+        # pickled here, as libraries that the function imports must find the number of threads set
+        shared = ray.put((pickled(function, cloudpickle.dumps), cluster, os.getcwd(), path))
+        running = set[Any]()
         task = ray.remote(_apply).options(num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=DEATHS)
 
         def submit(item: Any) -> Future[Any]:
@@ -262,12 +284,12 @@ def _apply(shared: list[Any], item: Any) -> Any:
     global _loaded
     (reference,) = shared
     if _loaded is None or _loaded[0] != reference.hex():
-        work: _Work = import_ray().get(reference)
-        use_threads(work.threads)
-        if not work.gpu:  # Ray shows all of a node's GPUs to a task without any
+        function, cluster, folder, path = import_ray().get(reference)
+        use_threads(cluster.cpus)
+        if not cluster.gpus:  # Ray shows all of a node's GPUs to a task without any
             os.environ["CUDA_VISIBLE_DEVICES"] = ""
         with suppress(OSError):
-            os.chdir(work.folder)
-        sys.path.extend(place for place in work.path if place not in sys.path)
-        _loaded = reference.hex(), pickle.loads(work.function)
+            os.chdir(folder)
+        sys.path.extend(place for place in path if place not in sys.path)
+        _loaded = reference.hex(), pickle.loads(function)
     return _loaded[1](item)
