@@ -166,8 +166,9 @@ def test_its_result_shows_itself(
 
 def test_without_a_frame_its_laboratory_opens(meshes: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[tuple[Scene, object, Registrar]] = []
-    kept = SimpleNamespace(stay=lambda _: None)
-    monkeypatch.setattr("mereo.api.view.open_laboratory", lambda *given: opened.append(given[:3]) or kept)
+    page = OpenPage(SimpleNamespace(get_port=lambda: 1, stop=lambda: None))
+    monkeypatch.setattr(OpenPage, "stay", lambda page, _: page)
+    monkeypatch.setattr("mereo.api.view.open_laboratory", lambda *given: opened.append(given[:3]) or page)
     assert command_line.main(["view", "--object", *meshes, "--units", "mm"]) == 0
     scene, network, registrar = opened[0]
     assert scene.rest.names == registrar.model.rest.names and network is None and registrar.network is None

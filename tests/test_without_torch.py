@@ -112,3 +112,18 @@ def test_a_command_that_needs_torch_says_which_extra(tmp_path: Path) -> None:
 def test_the_doctor_speaks_without_torch(tmp_path: Path) -> None:
     ran = hidden("from mereo.cli.doctor import Doctor\nDoctor().run()\nHidden.asked.clear()", tmp_path)
     assert ran.returncode == 0 and "objects are found by search" in ran.stdout
+
+
+def test_a_laboratory_without_weights_needs_no_torch(folder: Path) -> None:
+    program = """
+import mereo
+from mereo.scenes.parameters import random_state
+from mereo.visualization.viewer.laboratory import Laboratory
+known = mereo.load_object(["long.stl", "short.stl"], units="mm")
+laboratory = Laboratory(known.scene, known.network, known.registrar())
+trial = laboratory.answer(laboratory.look(random_state(known.scene, 0), laboratory.first_place))
+print(trial.scores.iou > 0.7, trial.source.split()[0])
+"""
+    ran = hidden(program, folder)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.split() == ["True", "registered"]
