@@ -47,10 +47,12 @@ class Demo:
     def run(self) -> Outcome:
         """Reconstruct every input, and print its scores, seconds and where to look."""
         from mereo.api.reconstruct import reconstruct
+        from mereo.io.atomic_files import check_place
         from mereo.io.extras import has_network
         from mereo.io.output_folders import check_new_directory
         from mereo.io.progress import shown_stages
 
+        check_place(self.output, may_be_link=True)
         scores, began = dict[str, Any](), time.perf_counter()
         for name, title, known, frame, truth in _inputs(self.output):
             folder, started = self.output / name, time.perf_counter()
