@@ -109,8 +109,8 @@ def _packages(folder: Path) -> Iterator[Path]:
 
 
 def _rooms(folder: Path) -> list[Any]:
-    """The navigation of the folders below this one, in the README's order; a room with rooms in it is a section."""
-    order = re.findall(r"^\| `(\w+)/` \|", (ROOT / "README.md").read_text(), re.MULTILINE)
+    """The navigation of the folders below this one, in the order of the page on architecture; a room with rooms in it is a section."""
+    order = re.findall(r"^\| `(\w+)/` \|", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE)
     found: list[Any] = []
     rooms = (package for package in _packages(folder) if package.parent == folder)
     for package in sorted(rooms, key=lambda room: order.index(room.name) if room.name in order else len(order)):

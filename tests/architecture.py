@@ -53,11 +53,11 @@ SATELLITES = {
 }
 """Packages beside mereo, in the same wheel, and the modules of mereo that may import each."""
 
-BUDGET = {"src/mereo": (51_700, 322), "tests": (37_500, 255)}
+BUDGET = {"src/mereo": (46_200, 258), "tests": (35_400, 245)}
 """Lines and files that a folder may have at most; they fall to 35,000 and 200, and to 25,000 lines of tests."""
 
 ROOM_ROW = re.compile(r"^\| *\[?`(\w+)/`", re.MULTILINE)
-"""How a row of the README's table of rooms begins; the room's name may be a link."""
+"""How a row of the table of rooms in docs/architecture.md begins; the room's name may be a link."""
 
 
 # --- rules of imports -------------------------------------------------------------------------------------------------
@@ -179,11 +179,11 @@ def _folders(package: Package) -> list[str]:
     return sorted({parts[0] for parts in files if len(parts) > 1 and "__pycache__" not in parts})
 
 
-def rooms_unlike_readme(package: Package, readme: str) -> list[str]:
-    """Rooms that the README's table of rooms leaves out, and rows of it that are no room of the package."""
-    named, there = set(ROOM_ROW.findall(readme)), {f for f in _folders(package) if f in ROOMS}
-    missing = [f"the README's table of rooms leaves out {room}/" for room in sorted(there - named)]
-    return missing + [f"the README's table of rooms names {room}/, which is no room" for room in sorted(named - there)]
+def rooms_unlike_page(package: Package, page: str) -> list[str]:
+    """Rooms that the page's table of rooms leaves out, and rows of it that are no room of the package."""
+    named, there = set(ROOM_ROW.findall(page)), {f for f in _folders(package) if f in ROOMS}
+    missing = [f"the table of rooms leaves out {room}/" for room in sorted(there - named)]
+    return missing + [f"the table of rooms names {room}/, which is no room" for room in sorted(named - there)]
 
 
 def satellite_imports(package: Package) -> list[str]:

@@ -16,7 +16,7 @@ from architecture import (
     heavy_settings,
     misplaced,
     over_budget,
-    rooms_unlike_readme,
+    rooms_unlike_page,
     satellite_imports,
     torch_imports,
     upward_imports,
@@ -70,8 +70,8 @@ def test_everything_lies_in_a_room(mereo: Package) -> None:
     assert_none(misplaced(mereo))
 
 
-def test_readme_names_the_rooms(mereo: Package) -> None:
-    assert_none(rooms_unlike_readme(mereo, (TOP / "README.md").read_text("utf-8")))
+def test_the_page_names_the_rooms(mereo: Package) -> None:
+    assert_none(rooms_unlike_page(mereo, (TOP / "docs" / "architecture.md").read_text("utf-8")))
 
 
 def test_the_core_does_without_its_satellites(mereo: Package) -> None:
@@ -239,12 +239,11 @@ def test_another_table_of_rooms_is_found(tmp_path: Path) -> None:
     package = package_of(tmp_path, {"io/readers.py": "", "cli/demo.py": ""})
     table = "| room | what it holds |\n|---|---|\n| `io/` | files |\n"
     assert (
-        rooms_unlike_readme(package, table + "| [`cli/`](src/mereo/cli) | commands |\n\n| other | `geometry/` |\n")
-        == []
+        rooms_unlike_page(package, table + "| [`cli/`](src/mereo/cli) | commands |\n\n| other | `geometry/` |\n") == []
     )
-    assert rooms_unlike_readme(package, table + "| `bench/` | speed |\n") == [
-        "the README's table of rooms leaves out cli/",
-        "the README's table of rooms names bench/, which is no room",
+    assert rooms_unlike_page(package, table + "| `bench/` | speed |\n") == [
+        "the table of rooms leaves out cli/",
+        "the table of rooms names bench/, which is no room",
     ]
 
 
