@@ -104,7 +104,7 @@ def test_bad_weights(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     save_file({"x": torch.zeros(1)}, bad)
     refused(capsys, tmp_path, "no mereo header", *command)
     save_file({"x": torch.zeros(1)}, bad, metadata={"mereo": json.dumps({"version": 99})})
-    refused(capsys, tmp_path, "weights format 99; this mereo reads formats up to 3", *command)
+    refused(capsys, tmp_path, "weights format 99; this mereo reads format 3:", *command)
 
 
 def test_an_existing_output_is_kept(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

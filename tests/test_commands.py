@@ -12,6 +12,8 @@ from mereo.cli.options import Outcome
 from mereo.cli.reconstruct import FrameJob
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.shards import DatasetConfig
 from mereo.training.config import PRESETS
 
 
@@ -22,7 +24,13 @@ from mereo.training.config import PRESETS
             "generate rope --examples 7 --seed 3 --output out --workers 2 --shard 1/4 --resume",
             "mereo.synthesis.shards",
             "generate",
-            {"examples": 7, "seed": 3, "output": Path("out"), "workers": 2, "shard": (1, 4), "resume": True},
+            {
+                "config": DatasetConfig(GenerateConfig(), 7, 3),
+                "output": Path("out"),
+                "workers": 2,
+                "shard": (1, 4),
+                "resume": True,
+            },
         ),
         (
             "train data --output run --preset tiny",

@@ -85,7 +85,7 @@ def test_made_shared_damaged_continued_and_read(
         Dataset.load(folder)
     assert main(["dataset", "check", str(folder)]) == 2
     assert "shard-00001.safetensors: it begins with example 0 instead of 2" in capsys.readouterr().out
-    with pytest.raises(FileExistsError, match="holds a dataset; continue it with --resume"):
+    with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume"):
         generate(TOY, folder, SMALL, examples=4, seed=3)
     generate(TOY, folder, SMALL, examples=4, seed=3, resume=True)
     assert contents(folder) == whole
