@@ -109,7 +109,7 @@ def _packages(folder: Path) -> Iterator[Path]:
 
 
 def _rooms(folder: Path) -> list[Any]:
-    """The navigation of the folders below this one, in the order of docs/architecture.md; a room of rooms is a section."""
+    """The navigation of the folders below this one, in the order of architecture.md; a room of rooms is a section."""
     order = re.findall(r"^\| `(\w+)/` \|", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE)
     found: list[Any] = []
     rooms = (package for package in _packages(folder) if package.parent == folder)
