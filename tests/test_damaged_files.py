@@ -23,6 +23,7 @@ from mereo.io.label_volumes import read_label_volume
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import read_mask, read_point_cloud
 from mereo.io.ros_recordings import recorded_frames
+from mereo.io.sensor_frame import read_frame
 from mereo.io.simulation_states import read_states
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
@@ -219,6 +220,9 @@ def test_a_pipe_or_device_that_is_named_like_a_file_is_refused_at_once(tmp_path:
         ".png": read_raw_depth, ".nrrd": read_label_volume, ".json": read_intrinsics,
         ".bag": lambda p: next(recorded_frames(p)), ".npz": lambda p: read_states(p, ("a",)),
     }  # fmt: skip
+    os.mkfifo(path := tmp_path / "frame.npy")
+    with pytest.raises(ValueError, match=r"frame\.npy is not a regular file; "):
+        read_frame(path)
     for suffix, read in readers.items():
         os.mkfifo(path := tmp_path / f"a{suffix}")
         with pytest.raises(ValueError, match=f"a{suffix} is not a regular file; "):

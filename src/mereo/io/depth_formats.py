@@ -42,6 +42,8 @@ def is_depth_image(path: Path) -> bool:
     """Whether a file is read as a depth image and not as a point cloud: by suffix, and NPY files by their shape."""
     if path.suffix.lower() != ".npy":
         return path.suffix.lower() in DEPTH_READERS
+    if not path.is_file():  # a pipe would be waited for
+        return False
     try:
         with quiet():
             array = np.lib.format.open_memmap(path, mode="r")
