@@ -53,7 +53,7 @@ SATELLITES = {
 }
 """Packages beside mereo, in the same wheel, and the modules of mereo that may import each."""
 
-BUDGET = {"src/mereo": (46_200, 258), "tests": (35_400, 236)}
+BUDGET = {"src/mereo": (46_100, 258), "tests": (35_400, 236)}
 """Lines and files that a folder may have at most; they fall to 35,000 and 200, and to 25,000 lines of tests."""
 
 ROOM_ROW = re.compile(r"^\| *\[?`(\w+)/`", re.MULTILINE)

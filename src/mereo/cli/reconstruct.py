@@ -1,11 +1,10 @@
 """``mereo reconstruct``: one frame of a sensor to a folder of results."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -21,7 +20,6 @@ from mereo.cli.options import NOT_RECOGNIZED, Outcome, check_named, files_read, 
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried, Placed, place
 from mereo.fitting.registration.carry import carry as carry_one
-from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
 from mereo.io.atomic_files import write_json
 from mereo.io.attachments import Attachment, read_attachments
@@ -38,9 +36,6 @@ from mereo.scenes.registry import files_of
 from mereo.visualization.report_words import confidence_title
 from mereo.visualization.result_files import summary_of, write_answer
 from mereo.visualization.units import Unit
-
-KNOWN: Mapping[Known, str] = {True: "yes", False: "no", "unsure": "unsure"}
-"""Words of a table for whether a frame shows the object."""
 
 
 @dataclass(frozen=True)
@@ -228,40 +223,3 @@ def print_segments(answered: Result) -> None:
     console.print(f"seconds: {stages}", highlight=False, soft_wrap=True)
     if result.clipped:
         console.print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")
-
-
-# --- a table of many frames -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Told:
-    """Row of a table about a frame, but for its name and folder.
-
-    Attributes:
-        answer: who answers.
-        explained: share of the cloud that the registered model explains; "" without one.
-        known: whether it shows the object.
-        segments: how many of them were found.
-        seconds: that the answer took.
-        summary: content of its summary.json.
-    """
-
-    answer: str
-    explained: str
-    known: str
-    segments: str
-    seconds: float
-    summary: Mapping[str, Any] = field(compare=False, repr=False)
-
-    @classmethod
-    def of(cls, found: Answer) -> "Told":
-        """Row about an answer."""
-        registration, segments = found.registration, found.reconstruction.segments
-        return cls(
-            answer="registered model" if found.taken else "network",
-            explained="" if registration is None else f"{registration.explained:.1%}",
-            known=KNOWN[found.recognition.known],
-            segments=f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}",
-            seconds=found.reconstruction.seconds,
-            summary=summary_of(found),
-        )

@@ -117,11 +117,6 @@ def _kinds(settings: type) -> dict[str, Any]:
     return get_type_hints(settings, include_extras=True)
 
 
-def rule_of(kind: Any) -> str | None:
-    """Rule for the values of an annotated kind: "a whole number, from 1 to 65536"; None where there is none."""
-    return _broken_rule(kind, math.nan)
-
-
 def _broken_rule(kind: Any, value: Any) -> str | None:
     """Rule that a value breaks; None where it breaks none, or its kind has none."""
     if get_origin(kind) is Literal:

@@ -19,9 +19,6 @@ from mereo.io.errors import readable
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
 
-WIDEST = 8
-"""Bytes of a value in memory, and of the widest one in a file."""
-
 
 FEW = 32
 """Distinct values of whole numbers up to which they are labels whatever they look like."""

@@ -23,7 +23,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CURE, other_mesh
 from mereo.fitting.registration.registration import BELIEVED, Method, Registration
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.transforms import fit_rigid, inverse_rigid, transform_points
+from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.atomic_files import write_json
 from mereo.scenes.draw_recorder import SMOOTH
 from mereo.scenes.parameters import Played, draw_names, played_back
@@ -144,11 +144,6 @@ class RegistrationState(Block):
         if self.draws is not None and not sum(self.draws.sizes) == len(self.draws.names) == len(self.z):
             raise ValueError("`z`, `draws.names` and the sum of `draws.sizes` must be of one length")
         return self
-
-    @property
-    def T_input_camera(self) -> Float[np.ndarray, "4 4"]:
-        """Transform from the camera frame to the input's."""
-        return inverse_rigid(np.array(self.T_camera_input))
 
 
 def is_state(path: Path | None) -> bool:
