@@ -140,12 +140,12 @@ def arrays(**named: np.ndarray) -> Callable[[Path], object]:
 
 
 def bag(path: Path) -> None:
-    import test_recordings
+    import recorded_bags
 
     def topics(make: Any) -> dict[str, list[Any]]:
-        return {"/cloud": [make.cloud(POINTS)], **test_recordings.depth_topics(make)}
+        return {"/cloud": [make.cloud(POINTS)], **recorded_bags.depth_topics(make)}
 
-    made = test_recordings.write_bag(path.parent / f"made{path.suffix}", 1 if path.suffix == ".bag" else 2, topics)
+    made = recorded_bags.write_bag(path.parent / f"made{path.suffix}", 1 if path.suffix == ".bag" else 2, topics)
     source = made if made.is_file() else next(made.glob("*.db3"))
     path.write_bytes(source.read_bytes())
     for file in path.parent.rglob("*"):
@@ -156,9 +156,9 @@ def bag(path: Path) -> None:
 
 
 def scene_file(path: Path) -> None:
-    import test_scene_file
+    import scene_code
 
-    write_bar(path.parent, test_scene_file.EVERYTHING)
+    write_bar(path.parent, scene_code.EVERYTHING)
 
 
 def volume_scene(path: Path) -> None:
@@ -213,7 +213,7 @@ def checkpoint() -> Checkpoint:
 
 
 def state(path: Path) -> None:
-    import test_registration_state as cases
+    import registered_states as cases
 
     from mereo.fitting.registration.state import save_state, state_of
 

@@ -13,7 +13,7 @@ from typing import Any
 import httpx2
 import numpy as np
 from analytic import AnalyticModel
-from test_reconstruction import BIG, NAMES, SMALL, front, two_balls
+from two_balls import BIG, NAMES, SMALL, front, two_balls
 
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from analytic import untrained
+from carried_cases import SCENE, T, registered
 from scipy.spatial.transform import Rotation
-from toy_scene import Lift, Shear, toy_scene
+from toy_scene import Lift, Shear
 
 from mereo.deformation.maps import Deformation
 from mereo.fitting.registration.carry import Placed, carry, local_rotations, place
@@ -14,29 +15,17 @@ from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import rigid, transform_points
+from mereo.geometry.transforms import transform_points
 from mereo.io.attachments import Attachment, Positions, Surfaces
 from mereo.io.pose_tables import PoseTable
-from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import State
 from mereo.scenes.statistical_model import StatisticalModel
-
-SCENE = toy_scene()
-T = rigid(Rotation.from_rotvec([0.4, -1.0, 0.3]).as_matrix(), np.array([5.0, -3.0, 90.0]))
-
-
-@pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=60)
 
 
 @pytest.fixture(scope="module")
 def registrar(model: StatisticalModel) -> Registrar:
     return Registrar(untrained(model.rest.names, "mine"), model)
-
-
-def registered(model: StatisticalModel, material: np.ndarray, unit: float = 1.0) -> Registration:
-    return Registration(model, unit * material, "modes", np.zeros(model.count), unit, True, 1.0, True, 0.0)
 
 
 @pytest.fixture(scope="module")

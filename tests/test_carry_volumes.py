@@ -5,13 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_carry import SCENE, Shear, T, registered, transform_points, untrained
+from analytic import untrained
+from carried_cases import SCENE, T, registered
+from toy_scene import Shear
 
 from mereo.fitting.registration import carry as carrying
 from mereo.fitting.registration.carry import CarriedVolume, carry, place, resampled
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import transform_points
 from mereo.io.attachments import Attachment, read_attachments, write_attachment
 from mereo.io.label_volumes import read_label_volume
 from mereo.io.volume_files import Volume, is_labels, read_volume

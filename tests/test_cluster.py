@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from cluster_work import die, die_once, fail_on_three, report, square, wait_long
-from scene_files import write_bar
+from object_work import folder_of_objects
 
 from mereo import __main__ as command_line
 from mereo.io.cores import THREAD_VARIABLES
@@ -187,19 +187,6 @@ def test_a_single_frame_or_object_is_no_task(tmp_path: Path, capsys: pytest.Capt
 
 
 # --- folders of objects -----------------------------------------------------------------------------------------------
-
-
-def folder_of_objects(top: Path) -> Path:
-    """Two objects: a subfolder of meshes, and a scene file."""
-    (top / "objects/bar").mkdir(parents=True)
-    write_bar(top / "objects/bar").unlink()
-    (top / "meshes").mkdir()
-    write_bar(top / "meshes")
-    scene = (top / "meshes/bar.yaml").read_text().replace("file: ", "file: ../meshes/")
-    (top / "objects/pole.yaml").write_text(scene.replace("name: bar", "name: pole"))
-    (top / "objects/notes").mkdir()
-    (top / "objects/notes/readme.txt").write_text("no object")
-    return top / "objects"
 
 
 def test_objects_of_a_folder(tmp_path: Path) -> None:

@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 from angle import write_angle
-from test_cluster import folder_of_objects
-from test_generation import SMALL, TOY, contents
-from test_reconstruct_many import content, frames, loads, run
+from folder_contents import contents
+from many_frames import content, frames, loads, run
+from object_work import folder_of_objects
+from toy_data import SMALL
+from toy_scene import toy_scene
 
 from mereo import __main__ as command_line
 from mereo.api.generate import generate
@@ -52,7 +54,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     output = tmp_path_factory.mktemp("whole") / "data"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shards, "SHARD_SIZE", 4)
-        generate(TOY, output, SMALL, examples=EXAMPLES, seed=3)
+        generate(toy_scene(), output, SMALL, examples=EXAMPLES, seed=3)
     return contents(output)
 
 
@@ -119,7 +121,7 @@ def gone(*words: str, within_s: float = 15.0) -> bool:
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_workers_change_no_bit(workers: int, whole: dict[str, bytes], tmp_path: Path) -> None:
-    generate(TOY, tmp_path / "data", SMALL, examples=EXAMPLES, seed=3, workers=workers, ray="local")
+    generate(toy_scene(), tmp_path / "data", SMALL, examples=EXAMPLES, seed=3, workers=workers, ray="local")
     assert contents(tmp_path / "data") == whole
     assert gone(folder_of_ray(os.getpid())) and not is_left(os.getpid())
 
@@ -128,7 +130,7 @@ def test_nodes_that_die_lose_nothing(nodes: tuple[Any, str], whole: dict[str, by
     """Up to ten times a worker is killed, or a node, which another one then replaces."""
     output, killed, rng = tmp_path / "data", list[str](), np.random.default_rng(7)
     made_nodes, place = nodes
-    work = partial(generate, TOY, output, SMALL, examples=EXAMPLES, seed=3, ray=made_nodes.address)
+    work = partial(generate, toy_scene(), output, SMALL, examples=EXAMPLES, seed=3, ray=made_nodes.address)
     with ThreadPoolExecutor(1) as thread:  # nodes can be started in the main thread alone
         made = thread.submit(work)
         while len(killed) < KILLS and not made.done():

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_reconstruction import scene
+from two_balls import scene
 
 from mereo import __main__ as command_line
 from mereo.cli.config_file import options_of

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from test_report import page_data, positions
+from reported_scenes import page_data, positions
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.creases import split_at_creases

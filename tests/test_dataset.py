@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from observed_views import observed
 from safetensors.torch import load_file, save_file
-from test_training_on_observations import observed
 from toy_data import write_toy_dataset
 
 from mereo.training.batches import Draws, augment_batch, choose_points

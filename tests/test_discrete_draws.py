@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from fit_cases import IN_FRONT, said, seen
 from scipy.special import ndtr
-from test_fitting_theorems import IN_FRONT, said, seen
 from toy_scene import Shear, rest_mesh, toy_scene
 
 from mereo.deformation.draw_names import named, part

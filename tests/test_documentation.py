@@ -11,13 +11,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from page_blocks import FENCE, ROOT, blocks
 
 from mereo.__main__ import parse
 
-ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "docs" / "experiments.md"
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/mereo/**/weights/*.md")])
-FENCE = re.compile(r"^ *```(\w*)[^\n]*\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 RELEASED = [page for page in PAGES if EXPERIMENTS not in (page, page.parent.with_suffix(".md"))]
 """Pages about the code as it is; an experiment is about the code of its commit."""
@@ -50,10 +49,6 @@ def broken(page: Path) -> list[str]:
         if not file.exists() or (anchor and anchor not in anchors(file)):
             found.append(target)
     return found
-
-
-def blocks(page: Path, *languages: str) -> Iterator[str]:
-    return (code for language, code in FENCE.findall(page.read_text()) if language in languages)
 
 
 def commands(page: Path) -> Iterator[str]:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_files import write_camera
-from test_python import MODEL, seen
-from test_reconstruction import scene
+from toy_frames import MODEL, seen
+from two_balls import scene
 
 import mereo
 from mereo.__main__ import main

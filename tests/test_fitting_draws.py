@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_fitting_theorems import said, shown
+from fit_cases import said, shown
 from toy_scene import toy_scene
 
 from mereo.fitting.draws.fit import fit_draws

@@ -13,11 +13,11 @@ from analytic import ball as distance_to_ball
 from answers import answer_to
 from overlapping import check_overlap
 from PIL import Image
+from reported_scenes import page_data
 from safetensors import safe_open
-from test_reconstruction import front
-from test_report import page_data
-from test_training import SMALL
+from small_training import SMALL
 from toy_data import write_toy_dataset
+from two_balls import front
 
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.camera import PointCloud

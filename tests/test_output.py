@@ -9,16 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from folder_contents import contents
 
 from mereo.io.atomic_files import atomic_file, write_json
 from mereo.io.foreseen import words_of
 from mereo.io.output_folders import claim_directory, new_directory
 
 INTERRUPTIONS = [ValueError("no"), KeyboardInterrupt(), SystemExit(1)]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else b"" for p in sorted(folder.rglob("*"))}
 
 
 def test_a_file_appears_at_the_end_with_ordinary_permissions(tmp_path: Path) -> None:

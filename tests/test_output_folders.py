@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_output import contents
+from folder_contents import contents
 
 from mereo import __main__ as command_line
 from mereo.io import atomic_files

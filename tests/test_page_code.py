@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from memory_frames import message
+from page_blocks import ROOT, blocks
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from test_documentation import ROOT, blocks
-from test_python import MODEL, NAMES, seen
+from toy_frames import MODEL, NAMES, seen
 
 import mereo
 from mereo.io.readers import read_mask

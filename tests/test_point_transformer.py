@@ -9,7 +9,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from answers import reconstruct
-from test_training import SMALL
+from small_training import SMALL
 from torch import Tensor
 from toy_data import NAMES, write_toy_dataset
 from training_runs import assert_resumes_exactly

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import AnalyticModel, ball, logits_of, untrained
+from analytic import untrained
 from PIL import Image
+from toy_frames import MODEL, seen
 from toy_scene import toy_scene
 
 import mereo
@@ -34,26 +35,10 @@ from mereo.visualization.viewer.server import OpenPage
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 
-NAMES = ("big", "<small>", "absent")
-CENTERS = ((0.02, -0.03, 0.6), (0.02, 0.0605, 0.6))
-RADII = (0.06, 0.03)
-MODEL = AnalyticModel.of(
-    lambda p: 200.0 * logits_of(ball(CENTERS[0], 0.06), ball(CENTERS[1], 0.03), lambda q: np.full(len(q), 1.0))(p),
-    NAMES,
-)
-
 
 def unchecked(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function as users have it: without the check of types that tests put before it."""
     return inspect.unwrap(function)
-
-
-def seen() -> np.ndarray:
-    """Front halves of two balls, in metres."""
-    turned = np.random.default_rng(0).normal(size=(600, 3))
-    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-    turned[:, 2] = -np.abs(turned[:, 2])
-    return np.concatenate([np.add(c, r * turned) for c, r in zip(CENTERS, RADII, strict=True)])
 
 
 @pytest.fixture(scope="module")

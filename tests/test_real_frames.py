@@ -128,7 +128,7 @@ def save_zdf(path: Path) -> None:
 
 def save_recording(path: Path) -> None:
     pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")
-    from test_recordings import write_bag
+    from recorded_bags import write_bag
 
     camera = read_camera(KINECT)
     matrix = np.array([camera.focal_x_px, 0, 319.5, 0, camera.focal_y_px, 239.5, 0, 0, 1.0])
@@ -141,7 +141,7 @@ def save_recording(path: Path) -> None:
 
 
 def save_cloud(path: Path) -> None:
-    from test_files import save_pcd, save_ply
+    from point_files import save_pcd, save_ply
 
     points = organized().reshape(-1, 3)
     points[points[:, 2] == 0] = np.nan

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 import trimesh
 from analytic import AnalyticModel, ball, logits_of, union, untrained
 from answers import answer_to, reconstruct
+from two_balls import BIG, NAMES, SMALL, front, scene, two_balls
 
 import mereo
 from mereo.api.result import Result
@@ -20,9 +20,6 @@ from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.cli.stream import stream_reconstructions
 from mereo.fitting.registration.answer import Answer
-from mereo.geometry.camera import scanner_to_camera
-from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.config import InputConfig
 from mereo.models.weights import save_model
 from mereo.reconstruction.config import IsolationConfig
@@ -31,31 +28,6 @@ from mereo.reconstruction.pipeline import Reconstruction
 from mereo.visualization.result_files import summary_of, write_answer
 
 pytestmark = pytest.mark.usefixtures("small_previews")
-
-NAMES = ("big", "small", "absent")
-BIG, SMALL = ((0.02, -0.03, 0.6), 0.06), ((0.02, 0.0605, 0.6), 0.03)
-
-
-def front(center: tuple[float, float, float], radius: float, toward: float, count: int = 600) -> np.ndarray:
-    """Points on the half of a sphere on the side of z that ``toward`` names."""
-    points = np.random.default_rng(0).normal(size=(count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    points[:, 2] = toward * np.abs(points[:, 2])
-    return np.asarray(center) + radius * points
-
-
-def two_balls(points: np.ndarray) -> np.ndarray:
-    nowhere: Callable[[np.ndarray], np.ndarray] = lambda p: np.full(len(p), 1.0)  # noqa: E731
-    return 200.0 * logits_of(ball(*BIG), ball(*SMALL), nowhere)(points)
-
-
-def scene(frame: CloudAxes) -> tuple[np.ndarray, AnalyticModel]:
-    """The two balls as given in ``frame``, and a model that knows them in the camera frame that is made of it."""
-    if frame == "camera":
-        return np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)]), AnalyticModel.of(two_balls, NAMES)
-    cloud = np.concatenate([front(*BIG, 1.0), front(*SMALL, 1.0)])
-    back = inverse_rigid(scanner_to_camera(cloud))
-    return cloud, AnalyticModel.of(lambda points: two_balls(transform_points(back, points)), NAMES)
 
 
 @pytest.fixture(scope="module", params=["camera", "scanner"])

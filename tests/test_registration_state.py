@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from toy_scene import toy_scene
+from registered_states import SCENE, T, by_modes, placed
 
 from mereo.fitting.draws.playback import Drawn, material_moved
 from mereo.fitting.registration.registration import Registration
@@ -25,7 +24,6 @@ from mereo.fitting.registration.state import (
     save_state,
     state_of,
 )
-from mereo.geometry.transforms import rigid
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model
 from mereo.scenes.parameters import random_state
@@ -33,28 +31,6 @@ from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
-
-SCENE = toy_scene()
-T = rigid(Rotation.from_rotvec([0.4, -1.1, 0.3]).as_matrix(), np.array([0.013, -0.2, 0.71]))
-UNIT = 0.0017
-"""A scan in metres, of an object of 40 scene units."""
-
-
-@pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=60)
-
-
-def placed(model: StatisticalModel, unposed: np.ndarray, **facts: Any) -> Registration:
-    material = UNIT * unposed @ T[:3, :3].T + T[:3, 3]
-    return Registration(
-        model, material, scene_unit=UNIT, unit_known=True, explained=0.97, accepted=True, seconds=0.25, **facts
-    )
-
-
-def by_modes(model: StatisticalModel) -> Registration:
-    z = np.random.default_rng(3).normal(size=model.count)
-    return placed(model, model.material(z), method="modes", z=z)
 
 
 def by_draws(model: StatisticalModel, scene: Scene = SCENE, seed: int = 5) -> Registration:

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 import re
 import subprocess
 from dataclasses import replace
@@ -10,55 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from browser import BROWSER, Page, until
 from PIL import Image
+from reported_scenes import ball, example, page_data, positions, wall
 from scipy.spatial import cKDTree
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.visualization.contact_sheets import MISSING
 from mereo.visualization.depth_picture import MOST_SIDE, depth_data
 from mereo.visualization.reconstruction_report import BUDGET_BYTES, cluster, write_report
 from mereo.visualization.units import Unit
-
-
-def ball(name: str, shift: float, color: tuple[int, int, int], level: int = 3) -> Segment:
-    mesh = trimesh.creation.icosphere(level, radius=0.1)
-    return Segment(name, color, mesh.vertices + np.array([shift, 0, 0.5]), np.array(mesh.faces))
-
-
-def example() -> tuple[PointCloud, SegmentedMesh, dict[str, object]]:
-    lost = Segment("lost", (0, 158, 115), np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
-    mesh = SegmentedMesh((ball("head", -0.1, PALETTE[0]), ball("tail </script><b>", 0.1, PALETTE[1]), lost))
-    summary = {
-        "title": "A <b>bold</b> </script> title",
-        "points": 104,
-        "frame": "camera",
-        "precision": "float32",
-        "clipped": True,
-        "spacing": 0.00201,
-        "input": Path("scan.ply"),
-        "segments": [
-            {"name": s.name, "centroid": np.array([0.1, 0.2, 0.3]), "volume": np.float64(s.volume), "confidence": 0.5}
-            for s in mesh.segments[:2]
-        ]
-        + [{"name": "lost", "centroid": None, "volume": 0.0, "confidence": float("nan")}],
-        "timings_s": {"encode": 0.1, "field": np.float32(1.5)},
-    }
-    return PointCloud(mesh.segments[0].vertices[::3]), mesh, summary
-
-
-def page_data(path: Path) -> dict:
-    found = re.search(r"const DATA = (.*);\n", path.read_text(encoding="utf-8"))
-    assert found
-    return json.loads(found[1])
-
-
-def positions(data: dict, text: str) -> np.ndarray:
-    low, high = np.asarray(data["low"]), np.asarray(data["high"])
-    steps = np.frombuffer(base64.b64decode(text), "<u2").reshape(-1, 3)
-    return low + steps / 65535 * (high - low)
 
 
 def test_the_page_holds_the_shapes_to_16_bits_of_the_box(tmp_path: Path) -> None:
@@ -123,13 +84,6 @@ def test_the_page_counts_the_points_once_and_has_no_words_of_programs(tmp_path: 
     assert words["trust"] == ["doubt", "Doubtful:", "a part is bent."]
     assert words["warnings"][0] == "Look at it." and "may be cut off there." in words["warnings"][1]
     assert words["timings_s"] == {"reading the points": 0.1, "field": 1.5}
-
-
-def wall(width: int, height: int, unit: float = 1.0) -> DepthImage:
-    """Image of a slanted wall in the middle of an empty frame, 0.5 m to 0.7 m away."""
-    depth = np.zeros((height, width))
-    depth[height // 4 : height // 2, width // 4 : width // 2] = np.linspace(0.5, 0.7, width // 2 - width // 4) * unit
-    return DepthImage(depth, Camera.from_fov(width, height, 0.7))
 
 
 @pytest.mark.parametrize("unit, ends", [(Unit(1.0), ["500 mm", "700 mm"]), (Unit(None), ["0.5 units", "0.7 units"])])

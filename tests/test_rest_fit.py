@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_fitting_theorems import IN_FRONT, SCENE, said, seen, shown
+from fit_cases import IN_FRONT, SCENE, said, seen, shown
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.playback import DrawnStates

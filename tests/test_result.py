@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from answers import answer_to
-from test_python import CENTERS, MODEL, NAMES, RADII, seen
+from toy_frames import CENTERS, MODEL, NAMES, RADII, seen
 
 import mereo
 from mereo.api.result import Result

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 from analytic import AnalyticModel
+from scene_code import CODE
 from scene_files import write_bar, write_mesh
 from shapes import ball
-from test_scene_file import CODE
 from toy_data import SMALL
 
 from mereo.api.generate import generate

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from overlapping import check_overlap
+from scene_code import CODE, EVERYTHING
 from scene_files import HEAD, write_bar, write_mesh
 from shapes import ball, box
 
@@ -21,19 +22,6 @@ from mereo.scenes.files.deformation_blocks import AnyDeformation, SceneFile
 from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES
-
-EVERYTHING = """
-deformations:
-  - {type: joint, segments: [right], pivot: [120, 5, 5], axis: [0, 0, 1], angle: [-40, 40], slide: [0, 5],
-     shift: [1, 2, 3]}
-  - {type: lattice, strength: 0.95}
-  - {type: waves, wavelength: [20, 60], strength: 0.9}
-  - {type: squash, factor: [0.5, 2]}
-  - {type: twist, origin: [100, 5, 5], axis: [1, 0, 0], length: 40, angle: [-90, 90]}
-  - {type: taper, origin: [100, 5, 5], axis: [1, 0, 0], length: 40, factor: [0.5, 2]}
-  - {type: bend, origin: [100, 5, 5], axis: [1, 0, 0], length: 40, angle: [-250, 250]}
-  - {type: push, distance: [-4, 4], tip: 1, reach: 12}
-"""
 
 
 def test_the_scene_has_the_files_segments_in_scene_units(tmp_path: Path) -> None:
@@ -239,19 +227,6 @@ def test_unknown_names_say_what_a_file_would_be() -> None:
 
 
 # --- Python -----------------------------------------------------------------------------------------------------------
-
-CODE = """
-from mereo.deformation.maps import Identity
-from mereo.geometry.mesh import SegmentedMesh
-from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.scenes.scene import Scene
-
-def still(rng):
-    return (Identity(),)
-
-def scene():
-    return Scene({name!r}, read_segmented_mesh({file!r}), still)
-"""
 
 
 def test_a_scene_from_a_python_file(tmp_path: Path) -> None:

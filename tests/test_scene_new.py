@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from label_cases import halves, write_nifti
 from scene_files import write_mesh
 from shapes import ball, box
-from test_label_volume import halves, write_nifti
 
 import mereo.__main__ as command_line
 from mereo.deformation.samplers import RandomMotion

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fit_cases import seen
 from scipy.spatial import cKDTree
-from test_fitting_theorems import seen
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence

@@ -5,10 +5,10 @@ from functools import cache
 
 import numpy as np
 import trimesh
+from fit_cases import IN_FRONT, said, seen
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 from shapes import box
-from test_fitting_theorems import IN_FRONT, said, seen
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation

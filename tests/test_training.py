@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from small_training import SMALL
 from toy_data import NAMES, write_toy_dataset
 from training_runs import assert_resumes_exactly, train_in_two_processes
 
@@ -22,16 +23,6 @@ from mereo.training.examples_seen import seen_before, seen_by, seen_in_training,
 from mereo.training.run_directory import claim_run, start_network
 
 pytestmark = pytest.mark.usefixtures("without_curves")
-
-SMALL = replace(
-    PRESETS["tiny"],
-    network=PRESETS["tiny"].network.changed(points=64, width=48, neighbors=8, mlp_global=(32, 48)),
-    batch=8,
-    queries=48,
-    epochs=2,
-    holdout=8,
-    augment=AugmentConfig(keep_points=(0.6, 1.0), hole_probability=0.3),
-)
 
 
 @pytest.fixture(scope="module")

@@ -12,16 +12,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
+import training_runs
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from test_training import SMALL
+from small_training import SMALL
 from toy_data import write_toy_dataset
+from training_commands import diverge_at
 from training_runs import kill_after
 
 from mereo import __main__ as command_line
 from mereo.training import metrics_log, trainer
-from mereo.training.batches import Batch
 
 BRIEF = replace(SMALL, epochs=0.6)  # five steps
 FILES = ("weights.safetensors", "checkpoint.safetensors", "metrics.csv", "curves.png")
@@ -102,20 +102,6 @@ def test_a_resumed_run_leaves_the_same_files(often: float, dataset: Path, finish
     assert files(tmp_path / "run") == files(finished)
 
 
-def diverge_at(monkeypatch: pytest.MonkeyPatch, step: int, loss: float, gradient: float) -> None:
-    """From ``step`` on the loss, or its gradient, is what is given here."""
-    original = trainer.Trainer._loss
-
-    def spoilt(self: trainer.Trainer, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        value, terms = original(self, batch)
-        if self.step + 1 >= step:
-            value = value + (loss if math.isnan(gradient) else 0.0)
-            value.register_hook(lambda grad: grad * gradient if not math.isnan(gradient) else grad)
-        return value, terms
-
-    monkeypatch.setattr(trainer.Trainer, "_loss", spoilt)
-
-
 @pytest.mark.parametrize(
     ("loss", "gradient", "clip", "says"),
     [
@@ -155,7 +141,10 @@ def test_a_divergence_before_anything_is_saved_is_an_error_of_the_command(
 SECOND_DIVERGES = """
 import math, os, sys
 import pytest
-from test_training_ends import command_line, diverge_at
+from mereo import __main__ as command_line
+from training_commands import diverge_at
+
+from mereo import __main__ as command_line
 if os.environ["RANK"] == "1":
     diverge_at(pytest.MonkeyPatch(), 2, math.inf, math.nan)  # with a finite gradient, so only its own loss says so
 sys.exit(command_line.main(sys.argv[1:]))
@@ -169,7 +158,7 @@ def test_where_one_process_diverges_all_stop_with_the_same_sentence(dataset: Pat
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     place = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": "1"}
-    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(Path(training_runs.__file__).parent), os.environ.get("PYTHONPATH", "")])
     processes = [
         subprocess.Popen(
             [sys.executable, "-c", SECOND_DIVERGES, *command.split()],

@@ -5,17 +5,17 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
+from observed_views import observed, rng
 from safetensors.numpy import load_file, save_file
-from test_training import SMALL
-from toy_data import half_balls, read_all, write_toy_dataset
+from small_training import SMALL
+from toy_data import read_all, write_toy_dataset
 from training_runs import assert_resumes_exactly
 
 from mereo.models.weights import load_model
 from mereo.training import trainer
-from mereo.training.batches import Batch, Draws, draw_observations
+from mereo.training.batches import Batch, draw_observations
 from mereo.training.config import PRESETS, AugmentConfig
 from mereo.training.dataset import Dataset
 from mereo.training.metrics_log import FIELDS, SENSOR_FIELDS
@@ -26,15 +26,6 @@ pytestmark = pytest.mark.usefixtures("without_curves")
 
 KINDS = 3
 FIRST = torch.zeros(8, dtype=torch.long)
-
-
-def observed(rng: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
-    """Half balls, and three halves of their cloud, of which the last has fewer points."""
-    row = half_balls(rng, points, queries)
-    cloud, half = row["cloud"], points // 2
-    parts = [cloud[:half], cloud[-half:], cloud[10:40]]
-    seen = np.stack([part[np.arange(points) % len(part)] for part in parts]).astype(np.float16)
-    return row | {"seen": seen, "seen_count": np.array([len(part) for part in parts], dtype=np.int32)}
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +39,6 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.fixture(scope="module")
 def data(folders: tuple[Path, Path]) -> tuple[Dataset, Dataset]:
     return Dataset.load(folders[0]), Dataset.load(folders[1])
-
-
-def rng(seed: int = 0) -> Draws:
-    return Draws.of(seed)
 
 
 def batch(data: Dataset, probability: float, observation: torch.Tensor | None = None, seed: int = 0) -> Batch:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_fitting_theorems import IN_FRONT, SCENE, said, shown
+from fit_cases import IN_FRONT, SCENE, said, shown
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.modes.fit import turns

@@ -14,7 +14,7 @@ import trimesh
 from answers import answer_to
 from browser import BROWSER, Page, pixels_of, until
 from PIL import Image
-from test_report import ball, example, wall
+from reported_scenes import ball, example, wall
 
 import mereo
 from mereo.__main__ import main

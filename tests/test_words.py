@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_python import MODEL, seen
+from toy_frames import MODEL, seen
 
 import mereo
 from mereo.__main__ import main

@@ -1,0 +1,43 @@
+"""Many frames through the command line."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import AnalyticModel
+from two_balls import scene
+
+from mereo import __main__ as command_line
+from mereo.models.config import InferenceConfig
+
+
+@pytest.fixture
+def loads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Weights that the command has loaded; whatever they are called, they are the analytic balls."""
+    loaded: list[str] = []
+
+    def load(weights: str, _: InferenceConfig) -> AnalyticModel:
+        loaded.append(weights)
+        return replace(scene("camera")[1], provenance={})
+
+    monkeypatch.setattr("mereo.models.weights.load_for", load)
+    return loaded
+
+
+def frames(folder: Path, *names: str) -> Path:
+    """Folder of clouds of these names, all of the two balls."""
+    folder.mkdir(parents=True)
+    for name in names:
+        np.save(folder / name, scene("camera")[0])
+    return folder
+
+
+def run(*arguments: str | Path) -> int:
+    return command_line.main(["reconstruct", *map(str, arguments), "--weights", "any", "--resolution", "12"])
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """What of a result no clock decides."""
+    timed = (".mereo.json", "summary.json", "report.html")
+    return {file.name: file.read_bytes() for file in folder.iterdir() if file.name not in timed}

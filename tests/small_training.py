@@ -1,0 +1,15 @@
+"""A training that takes seconds."""
+
+from dataclasses import replace
+
+from mereo.training.config import PRESETS, AugmentConfig
+
+SMALL = replace(
+    PRESETS["tiny"],
+    network=PRESETS["tiny"].network.changed(points=64, width=48, neighbors=8, mlp_global=(32, 48)),
+    batch=8,
+    queries=48,
+    epochs=2,
+    holdout=8,
+    augment=AugmentConfig(keep_points=(0.6, 1.0), hole_probability=0.3),
+)
