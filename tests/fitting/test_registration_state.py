@@ -1,0 +1,225 @@
+"""A registration's state as a file: the same material points again, and one sentence for what is none."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from registered_states import SCENE, T, by_modes, placed
+
+from mereo.fitting.draws.playback import Drawn, material_moved
+from mereo.fitting.registration.registration import Registration
+from mereo.fitting.registration.state import (
+    STATE,
+    RegistrationState,
+    is_state,
+    load_state,
+    model_digest,
+    played_state,
+    read_state,
+    restored,
+    save_state,
+    state_of,
+)
+from mereo.models.model import Model
+from mereo.models.weights import load_model, save_model
+from mereo.scenes.parameters import random_state
+from mereo.scenes.random_states import scene_model
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import Scene
+from mereo.scenes.statistical_model import StatisticalModel
+
+
+@pytest.fixture(scope="module")
+def model() -> StatisticalModel:
+    return scene_model(SCENE, count=60)
+
+
+def by_draws(model: StatisticalModel, scene: Scene = SCENE, seed: int = 5) -> Registration:
+    """Draws that a fit has moved away from those of their seed."""
+    drawn = Drawn.of(scene, seed)
+    z = np.where(drawn.smooth, 0.8 * drawn.z + 0.1, drawn.z)
+    deformations = drawn.deformations(scene, z)
+    assert deformations is not None
+    unposed = material_moved(scene, model, deformations)
+    return placed(model, unposed, method="draws", z=z, drawn=replace(drawn, z=z))
+
+
+def assert_same(again: Registration, before: Registration) -> None:
+    size = np.ptp(before.material, axis=0).max()
+    assert np.abs(again.material - before.material).max() <= 1e-6 * size
+    assert (again.method, again.scene_unit, again.explained) == (before.method, before.scene_unit, before.explained)
+    assert (again.accepted, again.seconds, again.unit_known) == (before.accepted, before.seconds, True)
+    np.testing.assert_array_equal(again.z, before.z)
+
+
+@pytest.mark.parametrize("make", [by_modes, by_draws])
+def test_a_state_gives_the_same_material_points_again(
+    make: Callable[[StatisticalModel], Registration], model: StatisticalModel, tmp_path: Path
+) -> None:
+    before = make(model)
+    save_state(tmp_path / STATE, state_of(before, SCENE, weights="toy", frame="scanner", unit_m=0.001))
+    again = load_state(tmp_path, model, SCENE)
+    assert_same(again, before)
+    state = read_state(tmp_path / STATE)
+    assert (state.scene, state.weights, state.frame, state.unit_m) == ("toy", "toy", "scanner", 0.001)
+    np.testing.assert_allclose(np.array(state.T_camera_model), T, atol=1e-9)
+    points = model.rest_points[::50]
+    np.testing.assert_allclose(again.to_camera(points), before.to_camera(points), atol=1e-6)
+    assert (tmp_path / STATE).stat().st_size < 5000
+
+
+def test_draws_come_back_with_their_seed_sizes_and_names(model: StatisticalModel) -> None:
+    before = by_draws(model)
+    state = state_of(before, SCENE)
+    assert state.draws is not None and before.drawn is not None
+    assert (state.draws.seed, state.draws.sizes) == (5, (3, 1))
+    assert state.draws.names == ("whole: shear x", "whole: shear y", "whole: shear z", "ball: lift")
+    drawn = restored(state, model, SCENE).drawn
+    assert drawn is not None and drawn.sizes == before.drawn.sizes
+    np.testing.assert_array_equal(drawn.smooth, before.drawn.smooth)
+
+
+def test_the_sliders_of_a_state_stand_where_its_draws_are(model: StatisticalModel) -> None:
+    drawn = Drawn.of(SCENE, 5)
+    state = state_of(placed(model, _moved(model, drawn), method="draws", z=drawn.z, drawn=drawn), SCENE)
+    played, wanted = played_state(state, SCENE), random_state(SCENE, 5)
+    for one, other in zip(played.calls, wanted.calls, strict=True):
+        np.testing.assert_allclose(one.shares, other.shares, atol=1e-12)
+
+
+def _moved(model: StatisticalModel, drawn: Drawn) -> np.ndarray:
+    deformations = drawn.deformations(SCENE, drawn.z)
+    assert deformations is not None
+    return material_moved(SCENE, model, deformations)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rope", "robot", "engine"])
+def test_a_built_in_scene_is_found_by_its_name(name: str, tmp_path: Path) -> None:
+    scene = load_scene(name)
+    model = scene_model(scene, count=20)
+    before = by_draws(model, scene)
+    save_state(tmp_path / STATE, state_of(before, scene))
+    assert_same(load_state(tmp_path, model), before)
+
+
+def test_weights_keep_the_digest_of_their_model(rope: Model, tmp_path: Path) -> None:
+    save_model(rope, tmp_path / "r.safetensors")
+    one, other = (load_model(tmp_path / "r.safetensors").statistical_model for _ in range(2))
+    assert one is not None and other is not None
+    assert model_digest(one) == model_digest(other)
+    state = state_of(by_modes(one), "rope")
+    assert_same(restored(state, other), by_modes(one))
+
+
+def test_a_state_of_other_weights_is_refused(model: StatisticalModel) -> None:
+    state = state_of(by_modes(model), "toy", weights="mine.safetensors")
+    modes = model.modes.copy()
+    modes[0, 0, 0] += 1e-3
+    with pytest.raises(ValueError, match="model of other weights .*'mine.safetensors'.* name those weights with"):
+        restored(state, replace(model, modes=modes))
+
+
+def test_a_scene_that_has_changed_since_is_said(model: StatisticalModel) -> None:
+    def wider(rng: np.random.Generator) -> Any:
+        deformations = SCENE.sample_deformations(rng)
+        shear = replace(deformations[0], a=deformations[0].a + 1.0)  # type: ignore[type-var]
+        return (shear, shear, shear, replace(deformations[3], then=shear))  # type: ignore[type-var]
+
+    state = state_of(by_draws(model), SCENE)
+    with pytest.raises(ValueError, match="scene units away from where .* 'toy' has changed since"):
+        restored(state, model, replace(SCENE, sample_deformations=wider))
+    with pytest.raises(ValueError, match="the scene 'toy' does not take these 2 draws"):
+        restored(state, model, replace(SCENE, sample_deformations=lambda rng: (rng.random(), rng.random())))
+    with pytest.raises(ValueError, match="the state is one of the scene 'toy', not of 'other'"):
+        restored(state, model, replace(SCENE, name="other"))
+
+
+def test_a_name_in_a_file_runs_no_code(model: StatisticalModel, tmp_path: Path) -> None:
+    ran = tmp_path / "ran"
+    (tmp_path / "evil.py").write_text(f"open({str(ran)!r}, 'w')\n")
+    state = state_of(by_draws(model), SCENE).model_copy(update={"scene": str(tmp_path / "evil.py")})
+    with pytest.raises(ValueError, match="which is not built in: name its file with --scene"):
+        restored(state, model)
+    assert not ran.exists()
+
+
+def test_draws_need_their_scene_to_be_written(model: StatisticalModel) -> None:
+    with pytest.raises(ValueError, match="one of draws; the scene that is played is needed, not its name 'toy'"):
+        state_of(by_draws(model), "toy")
+    with pytest.raises(ValueError, match="the state of 'toy' is one of modes; it has no draws"):
+        played_state(state_of(by_modes(model), "toy"), SCENE)
+
+
+SENTENCES: list[tuple[str, Callable[[dict[str, Any]], Any], str]] = [
+    ("key", lambda facts: {**facts, "extra": 1}, "'extra' means nothing here"),
+    ("missing", lambda facts: {k: v for k, v in facts.items() if k != "z"}, "`z` is missing"),
+    ("text", lambda facts: {**facts, "z": ["1.0"]}, "`z.0` is '1.0'; it must be a valid number"),
+    ("long", lambda facts: {**facts, "z": [1e9]}, "`z.0` is 1000000000.0; it must be less than or equal to 1000"),
+    ("format", lambda facts: {**facts, "format": 2}, "its format is 2; this mereo reads format 1"),
+    ("method", lambda facts: {**facts, "method": "draws"}, "the block `draws` belongs to the method 'draws' alone"),
+    ("unit", lambda facts: {**facts, "scene_unit": 0.0}, "`scene_unit` is 0.0; it must be greater than or equal to"),
+    ("pose", lambda facts: {**facts, "T_camera_model": [[1, 0, 0, 0]] * 4}, "it must be a rigid transform"),
+    ("mirror", lambda facts: {**facts, "T_camera_input": np.diag([1, 1, -1, 1]).tolist()}, "a rigid transform"),
+    ("ragged", lambda facts: {**facts, "T_camera_model": [[1, 0], [0, 1]]}, "`T_camera_model.0` is"),
+    ("list", lambda facts: [facts], "it must be an object"),
+    ("yes", lambda facts: {**facts, "accepted": "yes"}, "`accepted` is 'yes'; it must be a valid boolean"),
+    (
+        "sizes",
+        lambda facts: {**facts, "method": "draws", "draws": {"seed": 1, "sizes": [2, -2], "names": []}},
+        "`draws.sizes.1` is -2; it must be greater than or equal to 0",
+    ),
+    (
+        "lengths",
+        lambda facts: {**facts, "method": "draws", "draws": {"seed": 1, "sizes": [1], "names": ["a"]}},
+        "must be of one length",
+    ),
+]
+
+
+@pytest.mark.parametrize("change, sentence", [case[1:] for case in SENTENCES], ids=[case[0] for case in SENTENCES])
+def test_a_wrong_value_is_said_in_one_sentence(
+    change: Callable[[dict[str, Any]], Any], sentence: str, model: StatisticalModel, tmp_path: Path
+) -> None:
+    path = tmp_path / STATE
+    save_state(path, state_of(by_modes(model), "toy"))
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    with pytest.raises(ValueError, match="is no state of a registration") as error:
+        read_state(path)
+    assert sentence in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 400
+    assert str(error.value).endswith("give the state.json of a `mereo reconstruct`")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\xff\xfe{}", b"{", b"[" * 200_000, b'{"z": NaN}', b'{"z": 1e999}', b"null", b"{}" + b" " * 2**20],
+    ids=["empty", "bytes", "half", "deep", "nan", "infinite", "null", "large"],
+)
+def test_hostile_files_are_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / STATE
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="state") as error:
+        read_state(path)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 400
+
+
+def test_what_names_a_state(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="`mereo reconstruct` writes it where the answer is a registered model"):
+        read_state(tmp_path)
+    assert is_state(tmp_path / "a.json") and not is_state(tmp_path) and not is_state(None)
+    (tmp_path / STATE).write_text("{}")
+    assert is_state(tmp_path)
+
+
+def test_a_damaged_number_of_coefficients_is_said(model: StatisticalModel) -> None:
+    state: RegistrationState = state_of(by_modes(model), "toy")
+    short = state.model_copy(update={"z": state.z[:-1]})
+    with pytest.raises(ValueError, match=f"has {model.count - 1} coefficients, but the model has {model.count} modes"):
+        restored(short, model)
+    moved = state.model_copy(update={"z": (state.z[0] + 1, *state.z[1:])})
+    with pytest.raises(ValueError, match="has changed since, or the file: register the frame again"):
+        restored(moved, model)

@@ -1,0 +1,257 @@
+"""Scenes of a user's own, from YAML and from Python: what the file says is what the scene is, and errors name lines."""
+
+import pickle
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import trimesh
+from overlapping import check_overlap
+from scene_code import CODE, EVERYTHING
+from scene_files import HEAD, write_bar, write_mesh
+from shapes import ball, box
+
+from mereo.deformation.maps import jacobian_determinant
+from mereo.deformation.samplers import RandomMotion
+from mereo.deformation.warps import Bend, FreeFormLattice
+from mereo.geometry.mesh import PALETTE
+from mereo.scenes.files import build
+from mereo.scenes.files.defaults import motion
+from mereo.scenes.files.deformation_blocks import AnyDeformation, SceneFile
+from mereo.scenes.parameters import parameters, random_state
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES
+
+
+def test_the_scene_has_the_files_segments_in_scene_units(tmp_path: Path) -> None:
+    scene = load_scene(write_bar(tmp_path, "size: 15\ncamera: {field_of_view: 30, distance: [90, 95], roll: true}\n"))
+    assert (scene.name, scene.rest.names) == ("bar", ("left", "right"))
+    assert scene.rest.colors == (PALETTE[0], (1, 2, 3))
+    np.testing.assert_allclose(scene.rest.bounds, [[-30, -7.5, -7.5], [30, 7.5, 7.5]], atol=1e-4)
+    assert scene.unit_m == pytest.approx(0.010 / 15)
+    assert scene.workspace.fov_rad == pytest.approx(np.deg2rad(30))
+    assert (scene.workspace.distance, scene.workspace.any_roll) == ((90.0, 95.0), True)
+    scene.rest.check()
+
+
+def test_without_deformations_it_bends_as_much_as_the_default_should(tmp_path: Path) -> None:
+    scene = load_scene(write_bar(tmp_path))
+    maps = scene.sample_deformations(np.random.default_rng(0))
+    assert [type(part) for part in maps[0].parts] == [Bend, FreeFormLattice, FreeFormLattice]  # type: ignore[attr-defined]
+    assert maps[0] is maps[1]
+    assert motion(scene.rest, scene.sample_deformations).mean == pytest.approx(0.05, rel=0.1)
+    assert scene.definition != load_scene(write_bar(tmp_path, "deformations: [{type: lattice}]\n")).definition
+
+
+def test_a_scene_that_is_loaded_again_is_not_refined_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its content: not by its path, and other deformations are another scene."""
+    refined, calls = build.refined, []
+    monkeypatch.setattr(build, "refined", lambda *scene: (calls.append(1), refined(*scene))[1])
+    build._refined.cache_clear()
+    scenes = []
+    for folder, text in (("a", ""), ("b", ""), ("c", "deformations:\n  - {type: squash, factor: [0.5, 2.0]}\n")):
+        (tmp_path / folder).mkdir()
+        scenes.append(load_scene(write_bar(tmp_path / folder, text)))
+    assert len(calls) == 2
+    meshes = [scene.rest.merged()[0] for scene in scenes]
+    np.testing.assert_array_equal(meshes[0], meshes[1])
+    assert meshes[2].shape != meshes[0].shape
+
+
+def test_every_deformation_keeps_space_from_folding(tmp_path: Path) -> None:
+    scene = load_scene(write_bar(tmp_path, EVERYTHING))
+    rng = np.random.default_rng(3)
+    assert isinstance(scene.sample_deformations, RandomMotion) and len(scene.sample_deformations.steps) == 8
+    moved = 0.0
+    for _ in range(40):
+        for segment, deformation in zip(scene.rest.segments, scene.sample_deformations(rng), strict=True):
+            vertices = rng.choice(segment.vertices, 200)
+            weights = rng.dirichlet([1, 1], size=len(vertices))
+            inner = weights[:, :1] * vertices + weights[:, 1:] * segment.bounds.mean(axis=0)
+            assert jacobian_determinant(deformation, np.concatenate([inner, vertices])).min() > 0
+            moved = max(moved, float(np.abs(deformation(inner) - inner).max()))
+    assert moved > 10
+
+
+def test_sliders_are_named_after_the_files_deformations(tmp_path: Path) -> None:
+    found = parameters(random_state(load_scene(write_bar(tmp_path, EVERYTHING)), 0))
+    assert list(dict.fromkeys(f.group for f in found)) == [
+        *("1 joint of right", "2 lattice", "3 waves", "4 squash", "5 twist", "6 taper", "7 bend", "8 push")
+    ]
+    names = [(f.group, f.name) for f in found]
+    assert len(set(names)) == len(names)
+    joint = [(f.name, f.unit) for f in found if f.group.startswith("1")]
+    assert joint == [("angle", "°"), ("slide", ""), ("shift x", ""), ("shift y", ""), ("shift z", "")]
+
+
+def test_a_joint_turns_about_the_place_that_the_file_names(tmp_path: Path) -> None:
+    joint = "- {type: joint, segments: [right], pivot: [120, 5, 0], axis: [0, 0, 2], angle: [90, 90]}"
+    scene = load_scene(write_bar(tmp_path, f"deformations:\n  {joint}\n"))
+    left, right = scene.sample_deformations(np.random.default_rng(0))
+    pivot = np.array([[0.0, 0.0, -10.0]])  # 120, 5, 0 in scene units: the box is centred at 120, 5, 5 and doubled
+    np.testing.assert_allclose(right(pivot), pivot, atol=1e-4)
+    np.testing.assert_allclose(right(pivot + np.array([10, 0, 0])), pivot + np.array([0, 10, 0]), atol=1e-4)
+    np.testing.assert_array_equal(left(pivot + 1), pivot + 1)
+
+
+def test_segments_with_the_same_deformations_stay_in_contact(tmp_path: Path) -> None:
+    tail = "deformations:\n  - {type: waves, wavelength: [20, 60], strength: 0.8}\n  - {type: lattice}\n"
+    scene = load_scene(write_bar(tmp_path, tail))
+    given = len(trimesh.load_mesh(tmp_path / "left.stl").vertices)  # others divide long edges, to each side its own
+    touching = [np.isclose(s.vertices[:, 0], 0) & (np.arange(len(s.vertices)) < given) for s in scene.rest.segments]
+    before = [s.vertices[rows] for s, rows in zip(scene.rest.segments, touching, strict=True)]
+    mesh = scene.sample_state(np.random.default_rng(0)).mesh
+    faces = [moved.vertices[rows] for moved, rows in zip(mesh.segments, touching, strict=True)]
+    order = [np.lexsort(np.round(points, 5).T) for points in before]
+    assert len(order[0]) > 20
+    np.testing.assert_allclose(faces[0][order[0]], faces[1][order[1]], atol=1e-9)
+    check_overlap(mesh)
+
+
+def test_a_scene_file_can_be_sent_to_workers(tmp_path: Path) -> None:
+    scene = load_scene(write_bar(tmp_path, EVERYTHING))
+    states = [one.sample_state(np.random.default_rng(1)).mesh for one in (scene, pickle.loads(pickle.dumps(scene)))]
+    np.testing.assert_array_equal(states[0].merged()[0], states[1].merged()[0])
+
+
+def test_parts_of_a_model_are_renamed_joined_and_left_out(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for name, part in {
+        "Lid": box((0, 0, 2), (2, 2, 3)),
+        "Body": box((0, 0, 0), (2, 2, 2)),
+        "Bolt": ball((9, 9, 9), 1),
+    }.items():
+        scene.add_geometry(trimesh.Trimesh(part.vertices, part.faces), node_name=name, geom_name=name)
+    scene.export(tmp_path / "box.glb")
+    path = tmp_path / "box.yaml"
+    path.write_text(
+        "name: box\nunits: m\nmodel: box.glb\n"
+        "parts:\n  - {name: Body, nested_in: all}\n  - {name: all, parts: [Lid, Body]}\n"
+    )
+    rest = load_scene(path).rest
+    assert (rest.names, rest.nested) == (("Body", "all"), (("Body", "all"),))
+    # scaled to a shortest side of 20: the union of lid and body, which touch, is 2 x 2 x 3 metres
+    assert [segment.volume for segment in rest.segments] == pytest.approx([8000, 12000])
+    path.write_text("name: box\nunits: m\nmodel: box.glb\nparts: [{name: Bold}]\n")
+    with pytest.raises(ValueError, match=r"box.yaml:4: the model has no part 'Bold': did you mean 'Bolt'\?"):
+        load_scene(path)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "parts"),
+    [
+        ("units: mm\n", "", 1, ("`units` is missing", "add a line `units: ...`")),
+        ("units: mm", "unitz: mm", 2, ("`unitz` means nothing here", "did you mean 'units'?")),
+        ("units: mm", "units: furlong", 2, ("'furlong'", "mm, cm, m, in")),
+        ("units: mm", "units: -1", 2, ("`units` is -1", "must be greater than 0")),
+        ("name: bar", "name: rope", 1, ("built-in scene", "choose another name")),
+        ("name: bar", "name: a b", 1, ("'a b'", "letters, digits")),
+        ("left.stl", "lift.stl", 5, ("lift.stl does not exist", "check the path")),
+        ("[1, 2, 3]", "[1, 2, 300]", 8, ("300", "less than or equal to 255")),
+        ("[1, 2, 3]", "[1, 2]", 8, ("`color` has too few entries",)),
+        ("    color", "    nested_in: lefd\n    color", 8, ("'lefd'", "did you mean 'left'?")),
+        ("    color", "    nested_in: left\n    color", 3, ("put 'right' first",)),
+        ("size: 20", "size: big", 9, ("'big'", "valid number")),
+        ("size: 20", "size: 20\nsize: 10", 10, ("`size` is given twice", "remove one")),
+        ("size: 20", "size: 20: 10", 9, ("not YAML",)),
+        ("size: 20", "size: 20\nmodel: a.glb", 1, ("segments and model", "exactly one")),
+        ("size: 20", "size: 20\nparts: [{name: a}]", 1, ("parts", "belongs to model")),
+        ("size: 20", "size: 20\ncamera: {distance: [30, 200]}", 10, ("`distance` starts at 30", "outside the object")),
+        ("type: lattice", "type: latice", 11, ("'latice'", "did you mean 'lattice'?")),
+        ("type: lattice", "strength: 0.1", 11, ("`type` is missing", "bend", "waves")),
+        ("type: lattice", "type: lattice\n    strength: 1", 12, ("`strength` is 1", "less than 1")),
+        ("type: lattice", "type: lattice\n    segments: [rigth]", 12, ("'rigth'", "did you mean 'right'?")),
+        ("angle: [0, 100]", "angle: [100, 0]", 16, ("[least, most]",)),
+        ("angle: [0, 100]", "angle: [0, 300]", 16, ("reaches 300 degrees", "folds over beyond", "bend less")),
+        ("axis: [1, 0, 0]", "axis: [0, 0, 0]", 14, ("direction",)),
+        ("    angle: [0, 100]", "    angle: [0, 100]\n    toward: [3, 0, 0]", 17, ("along the axis",)),
+        ("type: lattice", "{type: push, distance: [0, 5], tip: 1, reach: 6}", 11, ("reach must be above 10.8",)),
+    ],
+)
+def test_errors_name_file_line_value_rule_and_cure(
+    old: str, new: str, line: int, parts: tuple[str, ...], tmp_path: Path
+) -> None:
+    tail = "size: 20\ndeformations:\n  - type: lattice\n  - type: bend\n    origin: [100, 5, 5]\n    axis: [1, 0, 0]\n"
+    head = HEAD + tail + "    length: 40\n    angle: [0, 100]\n"
+    load_scene(write_bar(tmp_path, head=head))
+    assert head.count(old) == 1
+    path = write_bar(tmp_path, head=head.replace(old, new))
+    with pytest.raises((ValueError, FileNotFoundError)) as caught:
+        load_scene(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}:{line}: ")
+    assert all(part in text for part in parts), text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("deformations: &d [*d]\n", ":9: this value contains itself by an alias; it must end: spell it out"),
+        ("a: &a {<<: *a}\n", ":9: this value contains itself"),
+        (
+            "a0: &a0 [1,1,1,1,1,1,1,1,1]\n"
+            + "".join(f"a{i}: &a{i} [{','.join(9 * [f'*a{i - 1}'])}]\n" for i in range(1, 30)),
+            "values; at most 100000 can be read: use fewer aliases",
+        ),
+        ("deformations: " + "[" * 3000 + "]" * 3000, "is nested too deeply"),
+        ("deformations: " + "[" * 90 + "]" * 90, "...; it must be a block of keys"),
+        ("source: 2001-99-99\n", "has a value that YAML cannot read (month must be in 1..12): put it in quotes"),
+        ("size: !!bool 3\n", "has a value that YAML cannot read ('3'): put it in quotes"),
+    ],
+)
+def test_documents_without_an_end_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError) as caught:
+        load_scene(write_bar(tmp_path, text))
+    assert str(caught.value).startswith(str(tmp_path)) and message in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("text", ["", "just words", "- a\n- b\n", "\x00", "a: [1"])
+def test_what_is_no_mapping_is_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"a\.yaml.*(`key: value`|not YAML)"):
+        load_scene(path)
+    with pytest.raises(FileNotFoundError, match="b.yaml does not exist"):
+        load_scene(tmp_path / "b.yaml")
+
+
+def test_unknown_names_say_what_a_file_would_be() -> None:
+    with pytest.raises(ValueError, match="'hare' is unknown; it must be one of .*rope.*, or a file of your own"):
+        load_scene("hare")
+
+
+# --- Python -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_from_a_python_file(tmp_path: Path) -> None:
+    file = write_mesh(ball((0, 0, 0), 10.0), tmp_path / "ball.ply")
+    path = tmp_path / "mine.py"
+    path.write_text(CODE.format(name="mine", file=str(file)))
+    scene = load_scene(path)
+    assert (scene.name, scene.rest.names, scene.definition) == ("mine", ("ball",), path.read_text())
+    for wrong, message in (
+        (CODE.format(name=SCENES[0], file=str(file)), "built-in scene"),
+        ("def scene():\n    return 3\n", "returns a int"),
+        ("scene = (\n", "SyntaxError"),
+        ("x = 1\n", "must run and define a function scene"),
+    ):
+        path.write_text(wrong)
+        with pytest.raises(ValueError, match=message):
+            load_scene(path)
+    with pytest.raises(FileNotFoundError, match="none.py does not exist"):
+        load_scene(tmp_path / "none.py")
+
+
+def test_every_key_and_every_deformation_is_documented() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "own-object.md").read_text("utf-8")
+    assert [key for key in SceneFile.model_fields if f"| `{key}` |" not in text] == []
+    for block in get_args(AnyDeformation):
+        (kind,) = get_args(block.model_fields["type"].annotation)
+        row = next(line for line in text.splitlines() if line.startswith(f"| `{kind}` |"))
+        assert [key for key in block.model_fields if key not in ("type", "segments") and f"`{key}`" not in row] == []

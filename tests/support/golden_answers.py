@@ -1,0 +1,232 @@
+"""Golden answers: what the product said of frames that are made anew, and whether a working tree still says it.
+
+    python tests/support/golden_answers.py [OBJECT ...] [--write] [--processes 2]
+
+prints for each frame whether the answer is the same to the last bit, near, or another one, then the mean scores, and
+exits with 1 where any is another one. With --write it keeps the answers in ``golden/``. On the processor that kept them
+answers are the same; on others clean views are near, and noisy ones, whose fits decide between nearly equal states, are
+others of the same mean scores (``test_golden``).
+
+The frames: four views of each object with shipped weights, of training seed 1000, by three cameras; the four scans of
+the bunny; and the same views of two objects of one's own (``golden_objects``). Views 0 and 1 state the unit where the
+object has one, views 2 and 3 do not.
+"""
+
+import argparse
+import hashlib
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cache, partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from golden_objects import FOLDER, OWN, weights_of
+
+import mereo
+from mereo.evaluation.cases import grid_confusion, labels_on
+from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.metrics import intersection_over_union
+from mereo.evaluation.scans import SCANS, bunny_posed
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.transforms import fit_rigid
+from mereo.models.weights_place import shipped_names
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
+from mereo.synthesis.examples import sample_view
+
+SEED, VIEWS = 1000, 4
+CAMERAS: tuple[Sensor, ...] = ("paper", "structured-light", "time-of-flight")
+OBJECTS = (*shipped_names(), *OWN, "scans")
+RESOLUTION, CELLS, POSITIONS = 48, 60, 64
+
+NEAR_SIZE, NEAR_SHARE = 0.002, 0.01
+"""How far positions may differ, as a share of the object's size, and how far scores and shares."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Points that are answered, with their truth.
+
+    Attributes:
+        points: observed points.
+        truth: the segments, in the points' frame and unit.
+        axes: of both.
+        unit_m: metres per unit; None where the answer has to find it.
+    """
+
+    points: np.ndarray
+    truth: SegmentedMesh
+    axes: str = "camera"
+    unit_m: float | None = None
+
+
+def frames_of(name: str) -> Iterator[tuple[str, Frame]]:
+    """Frames of an object, by their names."""
+    if name == "scans":
+        for scan in SCANS:
+            posed = bunny_posed(scan)
+            yield scan, Frame(posed.cloud.points, posed.truth, posed.frame, 1.0)
+        return
+    scene = scene_of(name)
+    for camera in CAMERAS:
+        for index in range(VIEWS):
+            view = sample_view(scene.for_seed(SEED), GenerateConfig(sensor=SENSORS[camera]), example_rng(SEED, index))
+            points = view.depth.to_points().points
+            yield f"{camera} {index}", Frame(points, view.mesh, unit_m=scene.unit_m if index < 2 else None)
+
+
+@cache
+def scene_of(name: str) -> Scene:
+    """Scene of an object; its own files are written anew."""
+    if name not in OWN:
+        return mereo.load_scene(name)
+    return mereo.load_scene(str(OWN[name](Path(tempfile.mkdtemp(prefix="golden-")))))
+
+
+@cache
+def object_of(name: str) -> mereo.Object:
+    """Object that answers the frames of a name."""
+    weights = weights_of(name) if name in OWN else "bunny" if name == "scans" else name
+    scene = scene_of(name) if name in OWN else None
+    return mereo.load_object(weights, scene, device="cpu", precision="float32")
+
+
+def facts_of(name: str, frame: Frame) -> dict[str, Any]:
+    """What is kept of the answer to a frame."""
+    found = mereo.reconstruct(
+        frame.points, object_of(name), resolution=RESOLUTION, axes=frame.axes, unit_m=frame.unit_m
+    )
+    surfaces, registration = found.reconstruction.surfaces, found.registration
+    grid = truth_grid(frame.truth, CELLS)
+    labels = labels_on(surfaces, grid.grid)
+    model = object_of(name).network
+    assert model is not None
+    scores = intersection_over_union(grid_confusion(grid, labels, len(model.names)), model.segmented)
+    facts: dict[str, Any] = {
+        "answer": "network" if not found.taken or registration is None else registration.method,
+        "iou": round(scores.iou, 4),
+        "miou": round(scores.miou, 4),
+        "known": found.recognition.known,
+        "recognition": found.recognition.told,
+        "confidence": [round(float(segment.confidence), 3) for segment in found.reconstruction.segments],
+        "surfaces": digest(*(segment.vertices for segment in surfaces.segments)),
+    }
+    if registration is None:
+        return facts
+    rest = registration.model.rest_points
+    material, scene_unit = registration.material, registration.scene_unit
+    rows = np.linspace(0, len(material) - 1, POSITIONS).astype(int)
+    sure = registration.uncertainty
+    radii = None if sure is None else np.concatenate(sure.radii(material).vertices)
+    return facts | {
+        "explained": round(registration.explained, 4),
+        "believed": registration.accepted,
+        "ruled_out": None if registration.ruled_out is None else round(registration.ruled_out, 4),
+        "scene_unit": significant(scene_unit),
+        "unit_known": registration.unit_known,
+        "radius95": None if radii is None else [significant(value) for value in np.quantile(radii, (0.5, 0.95))],
+        "state": [round(float(value), 3) for value in registration.z[:12]],
+        "pose": [[round(float(value), 5) for value in row] for row in fit_rigid(scene_unit * rest, material)[:3]],
+        "size": significant(float(np.ptp(material, axis=0).max())),
+        "positions": [[significant(value) for value in row] for row in material[rows]],
+        "material": digest(material),
+    }
+
+
+def significant(value: float) -> float:
+    """A number to six digits."""
+    return float(f"{value:.6g}")
+
+
+def digest(*arrays: np.ndarray) -> str:
+    """Short digest of the exact values."""
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:12]
+
+
+def answers_of(name: str) -> dict[str, dict[str, Any]]:
+    """Answers to all frames of an object."""
+    import torch
+
+    torch.set_num_threads(1)
+    return {frame: facts_of(name, given) for frame, given in frames_of(name)}
+
+
+# --- comparison -------------------------------------------------------------------------------------------------------
+
+
+def difference(kept: dict[str, Any], now: dict[str, Any]) -> str | None:
+    """How an answer differs from the kept one beyond the precision of other processors; None where it does not."""
+    for fact in ("answer", "known", "believed", "unit_known"):
+        if kept.get(fact) != now.get(fact):
+            return f"{fact} was {kept.get(fact)}, is {now.get(fact)}"
+    for fact in ("iou", "miou", "explained", "ruled_out", "scene_unit", "confidence", "radius95"):
+        before, after = (np.asarray(facts.get(fact) or 0.0, dtype=float) for facts in (kept, now))
+        scale = abs(before) if fact in ("scene_unit", "radius95") else 1.0
+        if (abs(after - before) > NEAR_SHARE * scale).any():
+            return f"{fact} was {kept.get(fact)}, is {now.get(fact)}"
+    if "positions" in kept:
+        away = np.linalg.norm(np.asarray(now["positions"]) - kept["positions"], axis=1).max() / kept["size"]
+        if away > NEAR_SIZE:
+            return f"positions moved by up to {away:.2%} of the object's size"
+    return None
+
+
+def mean_score(answers: dict[str, dict[str, Any]], score: str) -> float:
+    """Mean score of an object's views."""
+    return float(np.mean([facts[score] for facts in answers.values()]))
+
+
+def is_same(kept: dict[str, Any], now: dict[str, Any]) -> bool:
+    """Whether two answers have the same bits."""
+    return all(kept.get(fact) == now.get(fact) for fact in ("surfaces", "material"))
+
+
+def kept_of(name: str) -> dict[str, dict[str, Any]]:
+    """Kept answers to the frames of an object."""
+    kept: dict[str, dict[str, Any]] = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
+    return kept
+
+
+def write(name: str, answers: dict[str, dict[str, Any]]) -> None:
+    """Keep the answers of an object, one line a frame."""
+    lines = ",\n".join(f"{json.dumps(frame)}: {json.dumps(facts)}" for frame, facts in answers.items())
+    (FOLDER / f"{name}.json").write_text(f"{{\n{lines}\n}}\n", "utf-8")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("objects", nargs="*", help="by default all")
+    parser.add_argument("--write", action="store_true", help="keep these answers")
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args()
+    names = options.objects or OBJECTS
+    counts = {"same": 0, "near": 0, "another": 0}
+    with ProcessPoolExecutor(options.processes, get_context("spawn")) as pool:
+        for name, answers in zip(names, pool.map(partial(answers_of), names), strict=True):
+            if options.write:
+                write(name, answers)
+                print(f"{name}: {len(answers)} answers kept", flush=True)
+                continue
+            kept = kept_of(name)
+            for frame, now in answers.items():
+                why = difference(kept[frame], now)
+                verdict = "another" if why else "same" if is_same(kept[frame], now) else "near"
+                counts[verdict] += 1
+                print(f"{name:8} {frame:20} {verdict}{': ' + why if why else ''}", flush=True)
+            for score in ("iou", "miou"):
+                before, after = mean_score(kept, score), mean_score(answers, score)
+                print(f"{name:8} mean {score:15} {before:.4f} -> {after:.4f}", flush=True)
+    if not options.write:
+        print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+    return 1 if counts["another"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Theorems on the fit of the modes: what it must find, and what it must say, of frames whose truth is known."""
+
+import numpy as np
+import pytest
+from fit_cases import IN_FRONT, said, seen, shown
+
+from mereo.fitting.problem.residuals import Surface
+from mereo.fitting.registration.fit import fit_correspondences
+from mereo.geometry.transforms import transform_points
+from mereo.scenes.statistical_model import StatisticalModel
+
+
+@pytest.fixture(scope="module")
+def model(toy_model: StatisticalModel) -> StatisticalModel:
+    return toy_model
+
+
+def test_more_noise_never_makes_the_residual_smaller(model: StatisticalModel) -> None:
+    """The same directions of noise, more and more of it."""
+    points, material = shown(model, 0.5)
+    noise = np.random.default_rng(0).normal(size=(len(points), 1)) * points / np.linalg.norm(points, axis=1)[:, None]
+    residuals = []
+    for std in (0.0, 0.05, 0.1, 0.2, 0.4, 0.8):
+        registration = fit_correspondences(points + std * noise, said(model, material), model, 1.0)
+        assert registration.residual is not None
+        residuals.append(registration.residual)
+    assert (np.diff(residuals) > 0).all()
+    assert residuals[0] < 0.05 and residuals[-1] > 0.3
+
+
+@pytest.mark.parametrize(("excess", "outside"), [(0.5, False), (1.5, True), (2.0, True)])
+def test_a_state_outside_the_bounds_is_said_to_be_outside(
+    model: StatisticalModel, excess: float, outside: bool
+) -> None:
+    """A state that no seed of the scene can have: the cloud shows it, and the registration says so."""
+    points, material = shown(model, excess)
+    registration = fit_correspondences(points, said(model, material), model, 1.0)
+    if outside:
+        assert registration.beyond_states > 0.2
+    else:
+        assert registration.beyond_states == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_modes_reproduce_their_own_states(model: StatisticalModel, seed: int) -> None:
+    """A state of the library, in any pose, is expressed in modes without loss, and seen in a frame it is found."""
+    material = transform_points(IN_FRONT, model.material(model.library[seed]))
+    T, z = model.project(material)
+    np.testing.assert_allclose(transform_points(T, model.material(z)), material, atol=1e-2)
+    registration = fit_correspondences(seen(model.mesh(material)), said(model, material, 1e-3), model, 1.0)
+    assert np.median(np.linalg.norm(registration.material - material, axis=1)) < 0.1
+    assert registration.beyond_states < 0.02
+
+
+@pytest.fixture(scope="module")
+def at_rest(model: StatisticalModel) -> Surface:
+    return Surface.through(model, transform_points(IN_FRONT, model.rest_points))
+
+
+def test_noise_along_the_lines_of_sight_says_nothing_of_where_the_surface_is(
+    model: StatisticalModel, at_rest: Surface
+) -> None:
+    """By its lines of sight, a cloud lies on a ball as far in front of it as behind; by the nearest places in front."""
+    faces = model.faces[at_rest.facing]
+    middle = at_rest.material[faces[model.labels[faces[:, 0]] == model.labels.max()]].mean(axis=1)
+    _, face, place = at_rest.along_sight(middle, np.inf)
+    toward = place / np.linalg.norm(place, axis=1, keepdims=True)
+    slant = -np.einsum("pi,pi->p", at_rest.normals[face], toward)
+    points = middle[(np.linalg.norm(middle - place, axis=1) < 1e-3) & (slant > 0.5)]  # seen, and not at the rim
+    noise = 0.8 * points / np.linalg.norm(points, axis=1, keepdims=True)
+    noisy = np.concatenate([points - noise, points + noise])
+    _, face, place = at_rest.along_sight(noisy, np.inf)
+    assert abs(np.einsum("pi,pi->p", noisy - place, at_rest.normals[face]).mean()) < 1e-5
+    assert at_rest.offsets(noisy).mean() > 0.01
+
+
+def test_what_a_line_of_sight_misses_or_meets_far_off_is_compared_with_the_nearest_place(at_rest: Surface) -> None:
+    """Beside the object, and behind it."""
+    low, high = at_rest.material.min(axis=0), at_rest.material.max(axis=0)
+    beside, middle = high + np.array([1.0, 1.0, 0.0]), (low + high) / 2 + np.array([0.0, 0.0, 4.0])
+    points = np.stack([beside, middle])
+    for found, nearest in zip(at_rest.along_sight(points, 0.5), at_rest.nearest(points), strict=True):
+        np.testing.assert_array_equal(found, nearest)
+    distance, face, place = at_rest.along_sight(points, 100.0)
+    np.testing.assert_allclose(np.cross(place[1], middle), 0.0, atol=1e-9 * np.linalg.norm(middle) ** 2)
+    offset = np.einsum("i,i->", at_rest.normals[face[1]], middle - place[1])
+    assert distance[1] == pytest.approx(abs(offset)) and distance[1] > at_rest.nearest(points)[0][1]
