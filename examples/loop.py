@@ -1,16 +1,16 @@
-"""The whole path in nine seconds, as a moving picture: an object bends, a camera sees its depth, mereo fills the rest.
+"""The whole path in nine seconds, as a moving picture: a model, a depth frame of it bent, and where its segments are.
 
     python examples/loop.py --output loop.webp
 
-The bunny goes once round a circle through states of a test seed, none of which was ever trained on (needs the asset
-`bunny/bunny.off`). Every depth image, cloud and reconstruction is computed for its own frame with the shipped weights;
-nothing is drawn that the network has not answered. While the object rests its cloud turns, which shows that the back
-is empty, and the segments fill it from the seen side to the hidden one.
+The bunny goes once round a circle through states of a test seed (needs the asset `bunny/bunny.off`). mereo gets the
+meshes of the model at rest and the depth images; no network is loaded. It searches the frame in which the object comes
+to rest, and follows the object from there. While the object rests its cloud turns, which shows that the back is empty,
+and the segments fill it from the seen side to the hidden one.
 """
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -19,14 +19,14 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
-from mereo.api.reconstruct import reconstruct
+from mereo.api.objects import load_object
+from mereo.api.tracker import Tracker
 from mereo.deformation.maps import turn
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import mesh_of, solid_of
 from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
 from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.models.weights import load_model
 from mereo.scenes.draw_recorder import Recorder
 from mereo.scenes.parameters import Played, play, random_state, turned
 from mereo.scenes.registry import load_scene
@@ -45,18 +45,17 @@ SECONDS, STILL, FILL, MOVE = 9.0, 2.8, 4.9, 6.3
 FADE, BLINK = 0.7, 0.3
 """Seconds in which the segments become the first cloud again, and in which one caption becomes the next."""
 
-REST = 0.33
-"""Where on the circle of states the object rests."""
+REST = 0.12
+"""Where on the circle of states the object rests: bent, so that the model at rest beside it is another shape."""
 
-RESOLUTION, SENSOR_PIXELS, VIEW_UNITS, DISTANCE = 112, 100, 37.0, 120.0
-"""Of the answers, and of the camera: pixels and scene units across its picture, and its distance from ``MIDDLE``."""
+SENSOR_PIXELS, VIEW_UNITS, DISTANCE = 100, 37.0, 120.0
+"""Of the camera: pixels and scene units across its picture, and its distance from ``MIDDLE``."""
 
 MIDDLE, UP = np.array([-1.5, -0.3, 0.0]), np.array([0.0, 1.0, 0.0])
 AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(-15.0), np.deg2rad(15.0)
 SIDE, GAP, HEAD, FOOT = 300, 15, 42, 34
 """In pixels: each of the three pictures, between them, the captions above them, and the names below."""
 
-CLAY = (196, 188, 178)
 INNER = np.array([0.70, 0.71, 0.74])
 """The inner side of the shell of points, which nothing has seen."""
 
@@ -195,7 +194,7 @@ def arrow() -> Image.Image:
     return plate.resize((GAP, 24), Image.Resampling.LANCZOS)
 
 
-def names(mesh: SegmentedMesh, strength: float) -> Image.Image:
+def names(mesh: SegmentedMesh) -> Image.Image:
     """A dot and a name for each segment, in the middle of one line."""
     texts = [segment.name.replace("_", " ") for segment in mesh.segments]
     lengths = [24 + int(font(13).getlength(text)) for text in texts]
@@ -205,14 +204,15 @@ def names(mesh: SegmentedMesh, strength: float) -> Image.Image:
         pen.ellipse((x, y - 5, x + 10, y + 5), fill=segment.color)
         pen.text((x + 14, y), text, fill=INK, font=font(13), anchor="lm")
         x += length
-    return Image.blend(Image.new("RGB", plate.size, "white"), plate, strength)
+    return plate
 
 
 class Loop:
-    """All frames, each a picture of its time alone."""
+    """All frames, drawn in the order of time: an answer follows from the one before."""
 
     def __init__(self) -> None:
-        self.scene, self.model = load_scene(SCENE), load_model(SCENE)
+        self.scene = load_scene(SCENE)
+        self.tracker = Tracker(load_object(self.scene), "modes")
         self.played = random_state(self.scene, SEED)
         start = moment(self.scene, self.played, 0.0).depth
         seen = start.depth[start.valid]
@@ -223,14 +223,14 @@ class Loop:
         return moment(self.scene, self.played, turn)
 
     @cache  # noqa: B019
-    def surfaces(self, turn: float) -> SegmentedMesh:
-        return reconstruct(self.moment(turn).depth, self.model, "network", resolution=RESOLUTION).surfaces
+    def surfaces(self, turn: float, time: float) -> SegmentedMesh:
+        return self.tracker.follow(self.moment(turn).depth, time).surfaces
 
-    def inferred(self, time: float) -> Picture:
+    def registered(self, time: float) -> Picture:
         """The segments, up to the depth to which they have filled the cloud, and the rest of the cloud."""
         now = turn_at(time)
         canvas = Canvas.empty(orbit(yaw_at(time)), (SIDE, SIDE))
-        surfaces = self.surfaces(now)
+        surfaces = self.surfaces(now, max(time, MOVE))  # it rests until then
         low, high = surfaces.bounds[:, 2]
         behind = low + (high - low + 0.1) * ramp(time, FILL, MOVE - FILL)
         canvas.draw_triangles(Triangles.of(cut(surfaces, behind) if time < MOVE else surfaces))
@@ -248,18 +248,17 @@ class Loop:
         """The cloud, the segments that fill it, and in the end the cloud again."""
         if time <= FILL:
             return Image.fromarray(self.measured(time))
-        segments, back = Image.fromarray(self.inferred(time)), ramp(time, SECONDS - FADE, FADE)
+        segments, back = Image.fromarray(self.registered(time)), ramp(time, SECONDS - FADE, FADE)
         return Image.blend(segments, Image.fromarray(self.measured(time)), back) if back > 0 else segments
 
     def frame(self, time: float) -> Image.Image:
         """All three pictures with their captions."""
         now = self.moment(turn_at(time))
-        clay = Canvas.empty(Viewpoint.through(camera()), (SIDE, SIDE))
-        shown = Triangles.of(now.mesh, [CLAY] * len(now.mesh.segments))
-        clay.draw_triangles(replace(shown, owner=np.zeros_like(shown.owner)))
+        model = Canvas.empty(orbit(2 * np.pi * time / SECONDS), (SIDE, SIDE))
+        model.draw_triangles(Triangles.of(self.scene.rest.transformed(inverse_rigid(camera_pose()))))
         depth = Image.fromarray(depth_to_rgb(now.depth, self.limits)).resize((SIDE, SIDE), Image.Resampling.NEAREST)
-        pictures = (Image.fromarray(clay.picture()), depth, self.result(time))
-        captions = ([("a deformable object", 1.0)], [("one depth image", 1.0)], titles(time))
+        pictures = (Image.fromarray(model.picture()), depth, self.result(time))
+        captions = ([("your model at rest", 1.0)], [("a depth frame: the object bends", 1.0)], titles(time))
         sheet = Image.new("RGB", (4 * GAP + 3 * SIDE, HEAD + SIDE + FOOT), "white")
         for index, (picture, texts) in enumerate(zip(pictures, captions, strict=True)):
             x = GAP + index * (SIDE + GAP)
@@ -267,8 +266,7 @@ class Loop:
             sheet.paste(picture, (x, HEAD))
             if index > 0:
                 sheet.paste(arrow(), (x - GAP, HEAD + SIDE // 2 - 12))
-        strength = ramp(time, FILL, MOVE - FILL) - ramp(time, SECONDS - FADE, FADE)
-        sheet.paste(names(self.scene.rest, strength), (3 * GAP + 2 * SIDE, HEAD + SIDE))
+        sheet.paste(names(self.scene.rest), (GAP, HEAD + SIDE))
         return sheet
 
 
@@ -278,7 +276,7 @@ def yaw_at(time: float) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Draw the path from a bending object to its segments as a loop.")
+    parser = argparse.ArgumentParser(description="Draw the path from a model and a frame to all segments as a loop.")
     parser.add_argument("--output", type=Path, default=Path("loop.webp"), help="the animated WebP to write")
     parser.add_argument("--fps", type=float, default=20.0, help="frames per second")
     parser.add_argument("--force", action="store_true", help="replace the file where it exists")
